@@ -66,13 +66,13 @@ pub enum Error {
         count: usize,
     },
     /// Order grid without candidates.
-    #[error("the order grid has no candidate: {why}; widen the intervals or refine the step")]
+    #[error("the order grid has no candidate: {why}; widen the intervals of the orders, or use a smaller increment")]
     EmptyOrderGrid {
         /// Condition that no combination of orders satisfies.
         why: String,
     },
     /// Order grid with too many candidates.
-    #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
+    #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; use a larger increment of the order grid, narrower intervals of the orders, or fixed orders", format_search_time(*count))]
     OrderGridTooLarge {
         /// Number of candidates. If the candidates were not enumerated, the number of all tuples of orders.
         count: u128,
@@ -80,7 +80,7 @@ pub enum Error {
         limit: u128,
     },
     /// Bank of regressors that exceeds the memory limit.
-    #[error("{columns} regressors of {m} pulses and their products need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
+    #[error("{columns} regressors of {m} pulses and their products need {bytes} bytes, more than the limit of {limit}; use a smaller m, a larger increment of the order grid, or narrower intervals of the orders")]
     BankTooLarge {
         /// Number of regressors.
         columns: usize,
@@ -92,7 +92,7 @@ pub enum Error {
         limit: u128,
     },
     /// Working memory that exceeds its limit.
-    #[error("{what} need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step, narrower intervals, fewer or shorter runs, or raise the memory limit")]
+    #[error("{what} need {bytes} bytes, more than the limit of {limit}; use a smaller m, a larger increment of the order grid, narrower intervals of the orders, fewer or shorter runs, or raise the memory limit")]
     Memory {
         /// Description of the data that need the memory.
         what: String,
@@ -110,7 +110,7 @@ pub enum Error {
         remedy: String,
     },
     /// Response or estimate that overflows.
-    #[error("the {what} is not finite from index {index} on; the model is unstable on this record")]
+    #[error("the {what} is not finite from index {index} on; the model is unstable on this record, so change its orders or coefficients")]
     Diverged {
         /// Name of the computation that overflows.
         what: String,

@@ -116,7 +116,7 @@ impl Instruction {
             "power" => Self::Power(value),
             _ => match Function::ALL.into_iter().find(|function| function.name() == name) {
                 Some(function) => Self::Apply(function),
-                None => return refuse(format!("instruction '{name}' ({value})"), "use those of an expression"),
+                None => return refuse(format!("instruction '{name}' ({value})"), "use an instruction of expressions"),
             },
         })
     }
@@ -165,12 +165,14 @@ impl Expression {
                 Instruction::Channel(channel) if *channel >= channels => {
                     return refuse(format!("channel {channel} of {channels}"), "number them from 0");
                 }
-                _ if depth < needed => return refuse(format!("{instruction:?} without a value"), "give its arguments"),
+                _ if depth < needed => {
+                    return refuse(format!("{instruction:?} without a value"), "give its arguments before it")
+                }
                 _ => depth = depth + 1 - needed,
             }
         }
         if depth != 1 {
-            return refuse(format!("{depth} values"), "give a program that leaves one");
+            return refuse(format!("{depth} values"), "give a program whose result is one value");
         }
         Ok(Self { program, channels })
     }
@@ -269,7 +271,10 @@ impl DerivedSignal {
     /// [`Error::Structure`] for a wrong number of channels, or an order that is negative or above 10.
     pub fn new(expression: Expression, channels: Vec<(usize, f64)>) -> Result<Self> {
         if expression.channels() != channels.len() {
-            return refuse(format!("{} channels for {}", channels.len(), expression.channels()), "give all of them");
+            return refuse(
+                format!("{} channels for {}", channels.len(), expression.channels()),
+                "give one (signal, order) pair per channel",
+            );
         }
         if let Some((_, order)) = channels.iter().find(|(_, order)| !(0.0..=MAX_ORDER).contains(order)) {
             return refuse(format!("a derivative of order {order}"), "give an order from 0 to 10");

@@ -34,7 +34,7 @@ impl<'a> System<'a> {
             if outputs[..i].contains(output) {
                 return Err(Error::Structure {
                     what: format!("two equations have signal {output} as their output"),
-                    remedy: "give one equation an output".into(),
+                    remedy: "give each output one equation".into(),
                 });
             }
         }

@@ -8,7 +8,7 @@ import ast as _ast
 import importlib as _importlib
 from pathlib import Path as _Path
 
-#: Module of each public name; "" of a public module.
+#: Module that defines each public name; "" for a name that is itself a public module.
 _MODULE_BY_NAME = {
     alias.name: (node.module or "").removeprefix("ftlm").removeprefix(".")
     for node in _ast.parse(_Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body
@@ -27,7 +27,10 @@ __all__ = list(
 
 
 def __getattr__(name: str) -> object:
-    """Return a public name or module, such as `ftlm.rig`, which is imported on first use."""
+    """Import the public object or module `name`, such as `ftlm.rig`, on first use, and return it.
+
+    Raise AttributeError for other names.
+    """
     if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
     module = _MODULE_BY_NAME[name]
@@ -39,5 +42,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Return all public names, imported or not."""
+    """Return all names of the package, including public names that are not imported yet."""
     return sorted({*globals(), *_MODULE_BY_NAME})

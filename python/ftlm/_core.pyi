@@ -1,6 +1,7 @@
-"""The compiled core: series algebra, estimators, searches and simulation, on arrays checked once at this boundary.
+"""Compiled core in Rust: series algebra, estimators, order searches and simulation on arrays.
 
-Arrays are float64. A signal is a vector of pulse means unless it says samples; a record holds one signal a row.
+Arrays are float64, and are checked when they are passed to the core. A signal is a vector of block-pulse means unless
+its name contains "samples". A record has one signal per row.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -92,17 +93,20 @@ _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
 _Matrix: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 _Floats: TypeAlias = NDArray[np.float64]
 
-#: (which signals' sensors may have held something, where each signal began, answers of the filter to impulses as rows)
+#: Initial state of a record: (flags of signals with a sensor-filter transient, initial levels of the signals, responses
+#: of the filter to an impulse and its derivatives as rows, or None).
 _Begun: TypeAlias = tuple[Sequence[bool], Sequence[float], _Floats | None]
-#: (step [s], signals as rows, series of the sensor filter or None[, how a run in motion begins])
+#: (step [s], signals as rows, series of the sensor filter or None), followed by the initial state of a run with nonzero
+#: initial conditions.
 _Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Floats, _Floats | None, _Begun]
-#: (output, alpha, [(signal, order), ...]); signals by row of the record
+#: (output, alpha, [(signal, order) of each term]). Signals are row indices of the record.
 _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]
-#: a structure and one coefficient a term
+#: (structure, coefficient of each term)
 _Equation: TypeAlias = tuple[_Structure, Sequence[float]]
-#: instructions (name, number) of an expression, and (signal, order of the derivative) of its channels
+#: Expression as a signal: (name, number) of each instruction, and (signal, order of the derivative) of each channel.
 _Derived: TypeAlias = tuple[Sequence[tuple[str, float]], Sequence[tuple[int, float]]]
-#: (whether Caputo's powers, else these exponents; terms of an offset: 1 a constant, 2 a ramp too)
+#: Initial terms: (True for Caputo's powers, exponents otherwise). Then optionally the offset (0 for none, 1 for a
+#: constant, 2 for a constant and a ramp, 3 for an output level) and the number of impulses of a filter transient.
 _Initial: TypeAlias = (
     tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int] | tuple[bool, Sequence[float], int, int]
 )
@@ -110,73 +114,76 @@ _Initial: TypeAlias = (
 class _Options(TypedDict):
     criterion: str
     norm: str
-    #: 0 for least squares
+    #: Innovation length; 0 for least squares.
     innovation_length: int
     prior_covariance: float | None
     haar_rows: bool
     top: int
     threads: int
     pruning: bool
-    #: of instrumental variables; 0 without them
+    #: Number of iterations of instrumental variables; 0 for another method.
     iterations: int
-    #: [bytes]
+    #: Memory limit [bytes].
     memory: int
 
-#: (output, values of alpha, [(signal, values, interchangeable), ...])
+#: Order grid: (output, values of alpha, [(signal, values of the order, whether the terms of the signal are
+#: interchangeable) of each term]).
 _Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
-#: (constant, weight of each free order)
+#: Affine function of the free orders: (constant, weight of each free order).
 _Affine: TypeAlias = tuple[float, Sequence[float]]
-#: (output, alpha, [(signal, order), ...])
+#: (output, alpha, [(signal, order) of each term]) with orders that follow from the order law.
 _LawEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine]]]
-#: (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between)
+#: Nonuniform samples: (sample times in pulses, (times in pulses, sizes) of the jumps of each signal with zero-order
+#: hold, or None for other signals).
 _OwnTimes: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
 
 class _Experiment(TypedDict):
     record: _Record
     pulses_per_sample: int
-    #: one row an output
+    #: Measured samples, one row per output.
     samples: _Floats
-    #: series of the filter of the simulated outputs, and which outputs pass it
+    #: (series of the sensor filter, whether each output passes it); None without a filter.
     filter: tuple[_Floats, Sequence[bool]] | None
-    #: one an output
+    #: One weight per output.
     weights: Sequence[float]
-    #: values of each signal at the samples, and whether they are held
+    #: (values at the samples or None, whether it has a zero-order hold) of each signal.
     signals: Sequence[tuple[_Floats | None, bool]]
-    #: one row an output
+    #: Robust weights of the samples, one row per output; None without a robust loss.
     robust_weights: _Floats | None
     sample_times: _OwnTimes | None
 
 class _Channel(TypedDict):
     name: str
     samples: _Floats
-    #: at the nonuniform times of the run
+    #: Samples at the nonuniform sample times of the run.
     nonuniform: _Floats | None
-    #: zoh, foh, output or derived
+    #: "zoh" or "foh" for an input, "output", or "derived".
     role: str
-    #: [s]
+    #: Known delay [s]; None without one.
     delay: float | None
-    #: (law, value), in the order in which they act; None if it is free
+    #: (law, value) of each saturation and dead zone, in the sequence in which they act. The value is None if it is
+    #: free.
     limits: Sequence[tuple[str, float | None]]
-    #: whether it passed the sensor filter
+    #: Whether the signal was measured through the sensor filter.
     filtered: bool
-    #: whether it enters an equation of another output
+    #: Whether the signal enters the equation of another output.
     enters_others: bool
 
 class _Run(TypedDict):
     name: str
     step: float
-    #: nonuniform sample times [s]
+    #: Nonuniform sample times [s]; None for a regular grid.
     times: _Floats | None
     signals: Sequence[_Channel]
-    #: signals that equations simulate
+    #: Indices of the signals that are outputs of equations.
     outputs: Sequence[int]
-    #: (coefficient, order) of numerator and denominator
+    #: (coefficient, order) of the terms of numerator and denominator of the sensor filter; None without a filter.
     filter: tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]] | None
     filter_states: int
     at_rest: bool
     coupled: bool
     friction: bool
-    #: signal and law of each free delay or limit
+    #: (signal, law) of each free delay, saturation or dead zone.
     free: Sequence[tuple[int, str]]
 
 @final
@@ -201,7 +208,7 @@ class Experiment:
 
 _Progress: TypeAlias = Callable[[int, int, int], object]
 
-#: (coefficients, initial terms per record, their exponents, dropped (record, position) pairs)
+#: (coefficients, initial terms of each record, exponents of the initial terms, (record, position) of each omitted one)
 _Estimate: TypeAlias = tuple[list[float], list[list[float]], list[float], list[tuple[int, int]]]
 
 _Counts = TypedDict(
@@ -216,7 +223,7 @@ _Part: TypeAlias = tuple[
 ]
 _Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float, int], bool, _Part]
 
-#: equation, first candidate, the one behind the last, limit
+#: (equation, first candidate, last candidate plus one, limit of the score)
 _Span: TypeAlias = tuple[int, int, int, float]
 
 class _FoundRow(TypedDict):
@@ -225,15 +232,15 @@ class _FoundRow(TypedDict):
     alpha: float
     orders: list[float]
     coefficients: list[float]
-    #: initial terms by record
+    #: Initial terms of each record.
     initial: list[list[float]]
 
 class _Found(TypedDict):
     rows: list[_FoundRow]
     counts: _Counts
-    #: excluded in whole boxes, among those excluded by a bound
+    #: Number of candidates that were excluded as parts of boxes, among those excluded by a bound.
     boxed: int
-    #: (index, alpha, orders, reason)
+    #: (index, alpha, orders, reason) of each failed candidate.
     failures: list[tuple[int, float, list[float], Literal["singular", "diverged"]]]
 
 class _InstrumentalFit(TypedDict):
@@ -252,12 +259,13 @@ class _Certified(TypedDict):
     open: int
 
 class _FoundStage(TypedDict):
-    #: (index, score, free orders, per equation (score, alpha, orders, coefficients, initial terms per record))
+    #: (index, score, free orders, equations) of each row. An equation is (score, alpha, orders, coefficients, initial
+    #: terms of each record).
     rows: list[tuple[int, float, list[float], list[tuple[float, float, list[float], list[float], list[list[float]]]]]]
     counts: _Counts
-    #: (index, free orders, reason), the first hundred
+    #: (index, free orders, reason) of the first hundred failed candidates.
     failures: list[tuple[int, list[float], Literal["singular", "diverged"]]]
-    #: distinct candidates of each equation
+    #: Number of distinct candidates of each equation.
     distinct: list[int]
 
 __version__: Final[str]
@@ -348,9 +356,10 @@ def has_unstable_pole(alpha: float, own_terms: Sequence[tuple[float, float]]) ->
 
 # ----------------------------------------------------------------------------------------------------------- joint fits
 
-#: (constant, weight of each free order by name)
+#: Affine function of the free orders: (constant, [(name, weight) of each free order]).
 _Order: TypeAlias = tuple[float, Sequence[tuple[str, float]]]
-#: (output, order, (signal, order, coefficient, factor) of each term, (factor, coefficient) of fc, fs and vs)
+#: (output, order, [(signal, order, coefficient, factor) of each term], [(factor, coefficient) of fc, fs and vs] or
+#: None). A coefficient is a name if it is free, otherwise a number.
 _NamedEquation: TypeAlias = tuple[
     int,
     _Order,
@@ -368,15 +377,16 @@ class _Hints(TypedDict):
 class _Named(TypedDict):
     signals: Sequence[str]
     equations: Sequence[_NamedEquation]
-    #: least and largest value of orders that were given some
+    #: (name, (minimum, maximum)) of each order with bounds.
     bounds: Sequence[tuple[str, tuple[float, float]]]
     coupled: bool
     delayed: bool
     initial: _Initial
     history: bool
-    #: name, signal, law, bounds
+    #: (name, signal, law, bounds) of each free delay, saturation or dead zone.
     inputs: Sequence[tuple[str, int, str, tuple[float, float]]]
-    #: coefficient, sign, factors
+    #: (coefficient, sign, factors) of each coefficient law: the coefficient is the sign times the product of the
+    #: factors.
     laws: Sequence[tuple[str, float, Sequence[str]]]
     hints: _Hints
 
@@ -394,21 +404,23 @@ class _JointFit(TypedDict):
     settled: bool
     covariance: _Matrix
     noise: list[float]
-    #: residuals over the noise by run, a row an output; NaN where none was read
+    #: Residuals of each run divided by the noise standard deviation, one row per output; NaN for a missing sample.
     left: list[_Matrix]
-    #: residuals that count less, outliers, and all
+    #: (number of down-weighted residuals, number of outliers, number of residuals); None without a robust loss.
     robust: tuple[int, int, int] | None
     on_grid: _Vector
-    #: of each run with friction
+    #: Estimated initial states of each run, for models with friction.
     states: list[list[float]]
     cost: float
     status: str
     initial_terms: int
-    #: cost per residual and origin
+    #: (cost per residual, origin) of each initial guess.
     starts: list[tuple[float, str]]
-    #: cost per residual and parameters of the distinct best candidates
+    #: (cost per residual, parameters) of the distinct best candidates.
     survivors: list[tuple[float, list[float]]]
-    #: whether it is kept, by what share the other one leaves more, whether that is at a limit
+    #: Choice between an unstable and a stable optimum: (whether the unstable one is kept, relative excess of the
+    #: residuals of the stable one, whether the stable one is at the stability limit); None if there was no such
+    #: choice.
     growth: tuple[bool, float, bool] | None
 
 @final
@@ -539,7 +551,8 @@ def richardson_limit(
     grids: Sequence[tuple[_Floats, Sequence[float]]], owners: Sequence[int]
 ) -> tuple[_Matrix, _Vector, list[float]]: ...
 
-#: whether coefficients are fitted, (exponent, coefficient) by equation, whether levels are fitted as well
+#: Initial terms: (whether their coefficients are fitted, [(exponent, coefficient) of each term] of each equation,
+#: whether output levels are also fitted).
 _Terms: TypeAlias = tuple[bool, Sequence[Sequence[tuple[float, float]]], bool]
 
 @final

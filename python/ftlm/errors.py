@@ -1,6 +1,6 @@
 """Exception classes of ftlm.
 
-Messages name the object, the first bad index, the number of errors and a remedy.
+A message names the argument or file, what was found (with the first index and the count), and a remedy.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class ConvergenceError(FtlmError):
 
 
 class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
-    """Error for a fault of the rig; `run` has the samples recorded until then, if there are at least three."""
+    """Error for a fault of the rig; `run` contains the samples recorded up to the fault, None for fewer than three."""
 
     run: Any = None
 
 
 class InternalError(FtlmError):
-    """Error for a defect of ftlm itself; please report it with its message."""
+    """Error for a defect of ftlm itself; please report it with the message."""

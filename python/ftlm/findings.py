@@ -1,4 +1,4 @@
-"""Findings about data, fits and models, and the catalogue of their messages."""
+"""Findings about data, fits and models, and the catalogue of their texts (file findings.toml)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ftlm.errors import ModelError
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.validation import short_repr
 
-#: Severity levels: the model must not be used, must be used with care, has a property worth knowing, or its data have a
-#: note on how they were read.
+#: Severity levels. The model must not be used; it must be used with care; it has a noteworthy property; or there is a
+#: note on how the data were read.
 LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE = "do not use", "with care", "fact", "note"
 FINDING_LEVELS = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, LEVEL_FACT, LEVEL_NOTE)
-#: Maximum number of groups of findings in a summary.
+#: Maximum number of finding groups in a summary.
 MAX_SUMMARY_FINDINGS = 3
-#: Codes of residuals that are not white.
+#: Codes of findings that residuals are not white.
 NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
-#: Codes of residuals that show what a model leaves out.
+#: Codes of findings that residuals indicate a missing part of the model.
 LEFT_OUT_CODES = (
     "residuals_follow_input",
     "coupling_missing",
@@ -32,28 +32,28 @@ LEFT_OUT_CODES = (
     "residuals_not_white",
     "output_not_white",
 )
-#: Fields of the subject of a finding.
+#: Fields of a finding that name its subject.
 SUBJECT_FIELDS = ("run", "output", "input", "parameter", "method")
-#: Role of findings on runs that a model was not identified from.
+#: Value of `Finding.role` for findings on validation runs.
 VALIDATION_ROLE = "validation"
 
 
 @dataclass(frozen=True)
 class Topic:
-    """Topic that groups findings with the same remedy; a summary shows them together.
+    """Topic of findings that have the same remedy; a summary merges findings of one topic.
 
     Parameters
     ----------
     what
-        Summary of the findings of this topic.
+        Common statement of the findings of this topic.
     remedy
         Template of the recommended action.
     alternative, method
-        Template of an action that uses another method, and the name of that method. The action is omitted if the
-        finding is about a fit by that method.
+        Template of an alternative action with another estimation method, and the name of that method. The action is
+        omitted if the finding is about a fit by that method.
     has_rule
-        Whether rules of the verdict decide when findings of this topic are reasons. A whiteness test may fail only
-        because of rounding, for example.
+        Whether special rules of the verdict decide if a finding of this topic lowers the verdict. An example is a
+        whiteness test that fails because of rounding only.
     """
 
     what: str
@@ -63,41 +63,41 @@ class Topic:
     has_rule: bool = False
 
 
-#: Texts of Python and of the command line by name, for templates.
+#: (text for Python, text for the command line) by name, for templates.
 INTERFACE_TEXTS = {
     "validate": ("validate(run)", "--validation FILE"),
     "validate response": ("validate(load_frequency(file))", "--validation FILE"),
 }
-#: Reason of a kind whose sentence is the reason of a verdict.
+#: Value of `FindingKind.reason` if the whole sentence of the finding is the reason of the verdict.
 SAME_REASON = "{sentence}"
-#: Remedies that say no more than the finding itself.
+#: Remedy of topics that is not shown, because it adds nothing to the sentence of the finding.
 _PLAIN_REMEDY = "see the warning"
 
 
 @dataclass(frozen=True)
 class FindingKind:
-    """Entry of the catalogue for one code: topic, level and templates of the sentences.
+    """Entry of the catalogue for one finding code: topic, level and templates of the texts.
 
     Parameters
     ----------
     topic
-        Name of its topic.
+        Name of the topic.
     level
         ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``.
     template
-        Template of the sentence after the prefix. A bar marks the end of its first clause, and ``{remedy}`` is replaced
-        by the remedy.
+        Template of the sentence without the prefix. The character ``|`` marks the end of the first clause, and
+        ``{remedy}`` is replaced by the remedy.
     reason
-        Template of the reason in a verdict, in which ``{sentence}`` is the sentence. If it is empty, the reason
-        consists of topic and first clause.
+        Template of the reason in a verdict; ``"{sentence}"`` selects the whole sentence. If it is empty, the reason
+        is the statement of the topic, followed by the first clause.
     remedy
-        Template of the remedy; empty for that of the topic.
+        Template of the remedy; if it is empty, the remedy of the topic applies.
     prefix
-        Template of the beginning of the sentence, which names the run. It is omitted on a page about that run.
+        Template of the beginning of the sentence, which names the run. It is omitted if the finding names no run.
     names_missing_part
-        Whether the finding names a missing part of the model. It is reported before findings on residuals.
+        Whether the finding names a missing part of the model. Such a finding precedes findings on residuals.
     judges_whole_run
-        Whether the finding is about the simulation of a whole run, which diverges for an unstable plant.
+        Whether the finding is based on the simulation of a whole run, which diverges for an unstable plant.
     """
 
     topic: str
@@ -116,14 +116,14 @@ class FindingKind:
 
 
 class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topics and kinds of findings, as read from the catalogue file.
+    """Catalogue of findings: topics and kinds, as read from the catalogue file.
 
     Parameters
     ----------
     topics
-        Topics by name, most serious first within a level.
+        Topics by name. Within a level, findings are shown in the sequence of their topics.
     kinds
-        Kinds by code.
+        Entries by finding code.
     """
 
     topics: dict[str, Topic]
@@ -132,12 +132,15 @@ class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def finding_catalogue() -> Catalogue:
-    """Return the catalogue of findings, which is read from its file at the first call."""
+    """Return the catalogue of findings; the file findings.toml is read at the first call only."""
     return msgspec.toml.decode(resources.files("ftlm").joinpath("findings.toml").read_bytes(), type=Catalogue)
 
 
 class _Reference:
-    """Formatter of references to parameters in templates, such as ``{ask[offset]}`` or ``{ask[offset is none]}``."""
+    """Mapping for templates, from ``{ask[offset]}`` or ``{ask[offset is none]}`` to the text of a parameter.
+
+    The text is that of :func:`ftlm.utils.parameters.parameter`, for Python or for the command line.
+    """
 
     def __getitem__(self, key: str) -> str:
         name, _, value = key.partition(" is ")
@@ -145,37 +148,37 @@ class _Reference:
 
 
 class _Choice:
-    """Formatter of texts in templates that differ between Python and command line, such as ``{choose[validate]}``."""
+    """Mapping for templates, from ``{choose[validate]}`` to its text for Python or for the command line."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
 class _Sentence(string.Formatter):
-    """Formatter of templates, which inserts numbers that were stored as text (such as inf) unchanged."""
+    """Formatter of templates that inserts text unchanged, such as "inf", also where the template formats a number."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return value if isinstance(value, str) else str(format(value, format_spec))
 
 
 class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Finding about data, a fit or a model: a code with the subjects and numbers of its sentence.
+    """Finding about data, a fit or a model: a code, its subjects, and the numbers of its sentence.
 
     Parameters
     ----------
     code
-        Code of the finding in the catalogue.
+        Code of the finding, a key of the catalogue.
     run, output, input, parameter, method
-        Names that the finding is about, empty if not applicable; several names are joined by commas.
+        Names of the subjects of the finding; empty if not applicable. Several names are joined by commas.
     role
-        ``"validation"`` for a run that the model was not identified from.
+        ``"validation"`` if the run is a validation run, otherwise empty.
     numbers
-        Numbers and texts by name, which are inserted into the sentence.
+        Numbers and texts that are inserted into the sentence, by name.
 
     Raises
     ------
     ModelError
-        If the catalogue has no such code.
+        If `code` is not in the catalogue.
     """
 
     code: str
@@ -195,38 +198,38 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def kind(self) -> FindingKind:
-        """Entry of the code in the catalogue."""
+        """Entry of the catalogue for the code."""
         return finding_catalogue().kinds[self.code]
 
     @property
     def topic(self) -> Topic:
-        """Topic of the finding, which groups findings with the same remedy."""
+        """Topic of the finding, from the catalogue."""
         return finding_catalogue().topics[self.kind.topic]
 
     @property
     def level(self) -> str:
-        """Level: ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``."""
+        """Severity level: ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``."""
         return self.kind.level
 
     @property
     def signal(self) -> str:
-        """Name of the output or input that the finding is about; empty if it is about the whole run."""
+        """Name of the output that the finding is about, or else of the input; empty without either."""
         return self.output or self.input
 
     @property
     def sentence(self) -> str:
-        """Sentence of the finding, without the name of the run."""
+        """Sentence of the finding without the prefix that names the run."""
         return self._render(self.kind.template.replace("|", ""))
 
     @property
     def text(self) -> str:
-        """Sentence of the finding, with the name of the run if it is about a single run."""
+        """Sentence of the finding, with a prefix that names the run if the finding is about a run."""
         prefix = "validation run {run}: " if self.role == VALIDATION_ROLE else self.kind.prefix if self.run else ""
         return self._render(prefix) + self.sentence
 
     @property
     def reason(self) -> str:
-        """Sentence of the finding as a reason of a verdict."""
+        """Text of the finding as the reason of a verdict."""
         kind = self.kind
         if kind.reason == SAME_REASON:
             return self.sentence
@@ -234,7 +237,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def remedy(self) -> str:
-        """Remedy that suits the method of the fit; empty if the catalogue has none."""
+        """Remedy for the method of the fit, as text; empty if the catalogue has none."""
         if self.kind.remedy:
             return self._render(self.kind.remedy)
         topic = self.topic
@@ -250,15 +253,15 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
                 words["remedy"] = self.remedy
             return _Sentence().vformat(template, (), words)
         except (KeyError, ValueError, TypeError):
-            # A file may lack a number of the sentence.
+            # A finding from a file may lack a number of the sentence.
             return self.code
 
     def to_file(self) -> Finding:
-        """Return the finding as a file stores it, with nonfinite numbers as text."""
+        """Return a copy of the finding for a file, with nonfinite numbers as text."""
         return msgspec.structs.replace(self, numbers={n: _storable(v) for n, v in self.numbers.items()})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the finding as a dictionary for JSON."""
+        """Return the finding as a dictionary for JSON, with its level, text and remedy."""
         subject = {n: v for n in (*SUBJECT_FIELDS, "role") if (v := getattr(self, n))}
         numbers = {n: _storable(v) for n, v in self.numbers.items()}
         head = {"code": self.code, "level": self.level}
@@ -269,25 +272,28 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
 
 def _storable(value: float | str) -> float | int | str:
-    """Return a value for JSON; a nonfinite number is returned as text."""
+    """Return a Python value that JSON can represent: a finite number, an integer, or text for a nonfinite number."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else str(float(value))
     return value if isinstance(value, str) else int(value)
 
 
 def make_finding(code: str, **words: Any) -> Finding:
-    """Return a finding with a code of the catalogue; keyword arguments give its subjects and numbers."""
+    """Return the finding with the given code; keyword arguments are its subjects and numbers by name.
+
+    Raise ModelError if the code is not in the catalogue.
+    """
     subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
     return Finding(code, **subject, numbers=words)
 
 
 def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
-    """Return the sentences of findings."""
+    """Return the sentence of every finding, with the name of its run."""
     return tuple(f.text for f in findings)
 
 
 def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings without repetitions."""
+    """Return findings in their sequence, without repetitions."""
     selection: list[Finding] = []
     for item in findings:
         if item not in selection:
@@ -309,18 +315,18 @@ class FindingGroup:
 
     @property
     def first_finding(self) -> Finding:
-        """First finding of the group."""
+        """First finding of the group, whose sentence a summary shows."""
         return self.findings[0]
 
     @property
     def count(self) -> str:
-        """Text on the number of findings after the first; empty for a single finding."""
+        """Text such as " (and 2 more alike)" on the findings after the first; empty for a single finding."""
         more = len(self.findings) - 1
         return f" (and {more} more alike)" if more else ""
 
     @property
     def remedy(self) -> str:
-        """Remedy of the group; empty if the sentence contains it."""
+        """Remedy of the first finding; empty if its sentence contains the remedy, or the topic has none of its own."""
         return (
             ""
             if self.first_finding.kind.states_remedy or self.first_finding.topic.remedy == _PLAIN_REMEDY
@@ -329,17 +335,23 @@ class FindingGroup:
 
 
 def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
-    """Return findings grouped by topic, most serious first; each finding of the topic "other" forms a group."""
+    """Return findings grouped by level and topic, most serious first.
+
+    Each finding of the topic "other" forms its own group.
+    """
     order = list(finding_catalogue().topics)
     by: dict[tuple[int, int, int], list[Finding]] = {}
     for place, item in enumerate(unique(findings)):
         alone = place if item.kind.topic == "other" else 0
         by.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), alone), []).append(item)
-    # Findings with a specific remedy precede those with the remedy of their topic.
+    # Within a group, findings with their own remedy precede those with the remedy of their topic.
     return tuple(FindingGroup(tuple(sorted(by[key], key=lambda item: not item.kind.remedy))) for key in sorted(by))
 
 
 def hidden_findings_text(groups: Sequence[FindingGroup]) -> str:
-    """Return text on the number of findings that a summary omits; empty if it omits none."""
+    """Return text such as "2 more warnings" on the findings that a summary of groups omits; empty if it omits none.
+
+    A summary shows the first finding of at most `MAX_SUMMARY_FINDINGS` groups.
+    """
     count = sum(len(g.findings) for g in groups) - len(groups[:MAX_SUMMARY_FINDINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

@@ -23,7 +23,7 @@ def fractional_integral(
 ) -> NDArray[np.float64]:
     """Return the Riemann-Liouville fractional integral of uniformly sampled signals.
 
-    Its lower limit is the first sample.
+    The lower limit of the integral is the time of the first sample.
 
     Parameters
     ----------
@@ -32,13 +32,18 @@ def fractional_integral(
     order
         Order of the integral, in [0, 10].
     step
-        Sampling step or pulse width [s], positive.
+        Sampling interval or pulse width [s], positive.
     rule
-        Quadrature rule. ``"block-pulse"``: from means to means by equations (31)-(32) of the paper, second order in the
-        step. ``"trapezoidal"``: point samples, exact for the linear interpolant (doi:10.1023/A:1016592219341), second
-        order. ``"grunwald-letnikov"``: point samples, equation (2) with a negative order, first order.
+        Quadrature rule.
+
+        - ``"block-pulse"``: block-pulse means of the integral, by equations (31)-(32) of the paper. The error is of
+          second order in the step.
+        - ``"trapezoidal"``: point samples of the integral of the linear interpolant (doi:10.1023/A:1016592219341). The
+          error is of second order.
+        - ``"grunwald-letnikov"``: point samples, by equation (2) of the paper with a negative order. The error is of
+          first order.
     axis
-        Axis of time.
+        Time axis of ``x``.
 
     Returns
     -------
@@ -50,11 +55,11 @@ def fractional_integral(
     DataError
         Values that are not finite real numbers (with the first index and the count).
     ModelError
-        An order outside [0, 10], a step that is not positive, a rule that is not known.
+        An order outside [0, 10], a step that is not positive, or an unknown rule.
 
     Notes
     -----
-    O(n log n) for n samples.
+    The cost is O(n log n) for n samples.
     """
     eta, width = real_number("order", order), real_number("step", step)
     return apply_along_axis("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
@@ -70,26 +75,33 @@ def fractional_derivative(
     initial: ArrayLike | None = None,
     axis: int = -1,
 ) -> NDArray[np.float64]:
-    """Return the fractional derivative of uniformly sampled signals; its lower limit is the first sample.
+    """Return the fractional derivative of uniformly sampled signals.
+
+    The lower limit of the derivative is the time of the first sample.
 
     Parameters
     ----------
     x
-        Point samples along ``axis``.
+        Point samples of the signals along ``axis``.
     order
         Order of the derivative, in [0, 3].
     step
-        Sampling step [s], positive.
+        Sampling interval [s], positive.
     definition
-        ``"grunwald-letnikov"``: equation (2) of the paper, first order in the step for signals that start at zero.
-        ``"caputo"``: equation (5) with m = ceil(order), by the L1 formula on the highest integer derivative
-        (second-order differences), order min(2, 2 - frac). ``"riemann-liouville"``: equation (3), Caputo's derivative
-        plus power functions of the initial values; infinite at the first sample if an initial value is not zero.
+        Definition of the derivative.
+
+        - ``"grunwald-letnikov"``: equation (2) of the paper. The error is of first order in the step for signals that
+          start at zero.
+        - ``"caputo"``: equation (5) of the paper with m = ceil(order). The L1 formula is applied to the highest integer
+          derivative, from second-order differences. The error is of order min(2, 2 - frac), where frac is the
+          fractional part of ``order``.
+        - ``"riemann-liouville"``: equation (3) of the paper, computed as Caputo's derivative plus power functions of
+          the initial values. It is infinite at the first sample if an initial value is not zero.
     initial
         Known initial values x(0), x'(0), ... along the last axis. The other axes are those of ``x`` without its time
-        axis, or there is one set for all signals. Missing values are estimated by one-sided differences.
+        axis. A one-dimensional array applies to all signals. Missing values are estimated by one-sided differences.
     axis
-        Axis of time.
+        Time axis of ``x``.
 
     Returns
     -------
@@ -101,11 +113,11 @@ def fractional_derivative(
     DataError
         Values that are not finite real numbers, or fewer than ceil(order) + 2 samples.
     ModelError
-        An order outside [0, 3], a step that is not positive, a definition that is not known.
+        An order outside [0, 3], a step that is not positive, or an unknown definition.
 
     Notes
     -----
-    O(n log n) for n samples.
+    The cost is O(n log n) for n samples.
     """
     values = as_floats("initial", [] if initial is None else initial)
     alpha, width = real_number("order", order), real_number("step", step)
@@ -123,16 +135,16 @@ def fractional_derivative(
 
 @check_arguments
 def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
-    """Return the Haar coefficients of block-pulse means, coarse to fine.
+    """Return the Haar coefficients of block-pulse means, from the coarsest to the finest wavelet.
 
-    The orthogonal matrix of equation (29) is applied in O(m) operations.
+    The orthogonal matrix of equation (29) of the paper is applied in O(m) operations for m means.
 
     Parameters
     ----------
     x
         Block-pulse means along ``axis``, whose length is a power of two.
     axis
-        Axis of time.
+        Time axis of ``x``.
 
     Returns
     -------
@@ -156,7 +168,7 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     x
         Haar coefficients along ``axis``, whose length is a power of two.
     axis
-        Axis of the coefficients, coarse to fine.
+        Axis of the coefficients, from the coarsest to the finest wavelet.
 
     Returns
     -------
@@ -183,7 +195,7 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
     Returns
     -------
     numpy.ndarray
-        Matrix of shape (m, m), coarse to fine by row.
+        Matrix of shape (m, m), whose rows are the wavelets from coarsest to finest.
 
     Raises
     ------
@@ -195,9 +207,10 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
 
 @check_arguments
 def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
-    """Return the fractional integration matrix of block pulses, equation (32) of the paper; it is upper triangular.
+    """Return the fractional integration matrix of block pulses, equation (32) of the paper.
 
-    A row vector of block-pulse means, multiplied by this matrix, gives the means of the fractional integral.
+    The matrix is upper triangular. A row vector of block-pulse means, multiplied by this matrix, gives the means of the
+    fractional integral.
 
     Parameters
     ----------
@@ -216,7 +229,7 @@ def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float
     Raises
     ------
     ModelError
-        An order, m or step out of range.
+        If the order, m or the step is out of range.
     """
     m = check_pulses(m)
     return _core.block_pulse_matrix(real_number("order", order), m, real_number("step", step))
@@ -226,7 +239,7 @@ def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float
 def operational_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
     """Return the fractional integration matrix of Haar wavelets, equation (37) of the paper.
 
-    The two-sided fast Haar transform takes O(m^2) operations.
+    It is computed from the matrix of block pulses by fast Haar transforms from both sides, in O(m^2) operations.
 
     Parameters
     ----------
@@ -245,7 +258,7 @@ def operational_matrix(order: float, m: int, *, step: float) -> NDArray[np.float
     Raises
     ------
     ModelError
-        An order, m or step out of range.
+        If the order, m or the step is out of range.
     """
     m = check_pulses(m)
     return _core.operational_matrix(real_number("order", order), m, real_number("step", step))

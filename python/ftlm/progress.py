@@ -1,4 +1,4 @@
-"""Progress of long computations on standard error, as bars on terminals, and cancellation."""
+"""Progress bars for long computations on standard error, and cancellation of such computations."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from ftlm.utils.formatting import EscapedStream, escape_controls, escape_standar
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
-#: Work that ends sooner shows no bar.
+#: Time after which a progress bar appears; shorter work shows no bar.
 BAR_DELAY_S = 1.0
-#: Work that takes longer [s] is announced with its estimated duration.
+#: Minimum estimated duration of work that is announced before its start.
 ANNOUNCEMENT_THRESHOLD_S = 2.0
-#: Minimum width of a bar and of its label, and terminal width from which the count of candidates is shown [columns].
+#: Minimum width of a bar, minimum width of its label, and minimum width of a terminal that shows the total count
+#: [columns].
 MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS, WIDE_TERMINAL_COLUMNS = 10, 12, 100
 
 
 class ShareTotal(int):
-    """Total for which the bar shows a percentage instead of a count."""
+    """Total number of parts for which a progress bar shows only a percentage, without counts."""
 
 
-#: Total of work without a natural count.
+#: Total number of parts of work that has no natural units to count.
 TOTAL_PARTS = ShareTotal(1000)
 
 
 def format_time_left(seconds: float) -> str:
-    """Return a remaining time [s] as text with one digit."""
+    """Return text on a remaining time [s], such as "about 3 min left", with one significant digit."""
     if seconds < 90:
         return f"about {round_coarsely(seconds):g} s left"
     if seconds < 5400:
@@ -40,7 +41,7 @@ def format_time_left(seconds: float) -> str:
 
 
 def format_duration_estimate(least: float, most: float) -> str:
-    """Return an estimated duration [s] as text: about one value, a range, or an upper bound."""
+    """Return text on an estimated duration between `least` and `most` [s]: one value, a range, or an upper bound."""
     low, high = format_time_left(least).split(" ")[1:3], format_time_left(most).split(" ")[1:3]
     if low == high:
         return f"about {' '.join(high)}"
@@ -56,12 +57,12 @@ def round_coarsely(value: float) -> float:
 
 
 class ShareTracker:
-    """Fraction of completed work with independent parts, which never decreases.
+    """Tracker of the completed fraction of work that consists of several parts. The fraction never decreases.
 
     Parameters
     ----------
     listener
-        Callback with (parts done, ``TOTAL_PARTS``); None for no reports.
+        Callback that is called with (completed parts, ``TOTAL_PARTS``); None for no reports.
     """
 
     def __init__(self, listener: Callable[[int, int], None] | None) -> None:
@@ -70,7 +71,7 @@ class ShareTracker:
         self._reported_parts = -1
 
     def advance_to(self, share: float) -> None:
-        """Report that a fraction of the whole work is done."""
+        """Report that the fraction `share` of the whole work is completed; a decrease is ignored."""
         self.reached = max(self.reached, min(share, 1.0))
         parts = round(TOTAL_PARTS * self.reached)
         if self._listener is not None and parts > self._reported_parts:
@@ -78,9 +79,10 @@ class ShareTracker:
             self._listener(parts, TOTAL_PARTS)
 
     def subtask(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
-        """Return a callback (done, total) for a part of the work; the part ends at a fraction `share` of the whole.
+        """Return a callback (done, total) for a part of the work that ends at the fraction `share` of the whole.
 
-        If the part restarts its count, each pass takes the fraction `sweep` of the remainder.
+        The part may count from 0 to its total several times. Each such pass then covers the fraction `sweep` of the
+        remaining work of the part.
         """
         first, last = self.reached, 0.0
 
@@ -96,7 +98,7 @@ class ShareTracker:
 
 
 def _start_bar() -> RichProgress:
-    """Return a progress bar on the terminal, without label, total and figures."""
+    """Start a progress bar on standard error without label and numbers, and return it."""
     from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
     from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
@@ -114,20 +116,20 @@ def _start_bar() -> RichProgress:
     bar.add_task("", total=None, counted="", pruned="", left="")
     bar.start()
     if escaped:
-        # The display has put streams of its own in place, which print above the bar.
+        # The bar replaced the standard streams. The new ones must escape control characters as well.
         escape_standard_streams()
     return bar
 
 
 class Progress:
-    """Progress bar: a context manager that is called with (done, total) or (done, total, pruned).
+    """Progress bar: a context manager and a callback with (done, total) or (done, total, pruned).
 
     Parameters
     ----------
     label
         Description of the work.
     quiet
-        Whether to show nothing.
+        Whether nothing is shown. Without a terminal nothing is shown in any case.
     """
 
     def __init__(self, label: str, *, quiet: bool = False) -> None:
@@ -141,12 +143,12 @@ class Progress:
         return self
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Show ``count`` of ``total`` candidates, ``pruned`` of them excluded early."""
+        """Show that ``count`` of ``total`` candidates are completed, of which ``pruned`` were excluded early."""
         if self._quiet or time.monotonic() - self._start < BAR_DELAY_S or total == 0:
             return
         passed = max(time.monotonic() - self._start, 1e-9)
         text = f"{100 * count // total:.0f} %"
-        # For work without countable units only the fraction is shown.
+        # For work without natural units, only the percentage is shown.
         if not isinstance(total, ShareTotal):
             text += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
             text += f" {count / passed:,.0f}/s"
@@ -154,11 +156,11 @@ class Progress:
         time_left = format_time_left(passed * (total - count) / count) if 0 < count < total else ""
         self._show(text, share, time_left, completed=count, total=total)
         if count >= total:
-            # The next search of the same job starts a bar of its own.
+            # The next search of the same job starts a new bar.
             self._stop()
 
     def so_far(self, count: int, total: int) -> None:
-        """Show the progress of work whose total number may still increase."""
+        """Show that ``count`` of ``total`` parts are completed, for work whose total may still increase."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < BAR_DELAY_S:
             return
@@ -170,7 +172,7 @@ class Progress:
         return self._quiet
 
     def expect(self, what: str, least: float, most: float | None = None) -> None:
-        """Show the estimated duration [s], or its range, of long work."""
+        """Print the estimated duration of the work `what`, from `least` to `most` [s], if it is long."""
         most = least if most is None else most
         if not self._quiet and most >= ANNOUNCEMENT_THRESHOLD_S:
             print(f"{what} takes {format_duration_estimate(least, most)}; Ctrl-C ends it", file=sys.stderr)
@@ -186,13 +188,13 @@ class Progress:
             print(label, file=sys.stderr)
 
     def _current_bar(self) -> RichProgress:
-        """Return the bar, which is created when the first figures are shown."""
+        """Return the progress bar, which is created at the first call."""
         with self._lock:
             self._bar = self._bar or _start_bar()
             return self._bar
 
     def _show(self, text: str, pruned: str = "", time_left: str = "", **state: Any) -> None:
-        """Show figures; the label is truncated to the width of the line."""
+        """Update the texts of the bar; the label is truncated to the width of the terminal."""
         bar, columns = self._current_bar(), len(text) + len(pruned) + len(time_left) + 3
         room = max(bar.console.width - columns - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
         label = escape_controls(self._label)
@@ -211,14 +213,15 @@ class Progress:
 
 
 class Stoppable(Progress):
-    """Progress callback that another thread calls, and that can cancel the work of that thread.
+    """Progress callback for work in another thread, which can also cancel this work.
 
     Parameters
     ----------
     listener
-        Receiver of the reports.
+        Callback that receives the reports; None for no reports.
     stop
-        Event that ends the work with KeyboardInterrupt at its next report. Signals reach only the main thread.
+        Event that cancels the work: its next report raises KeyboardInterrupt. An event is required because signals
+        reach only the main thread.
     """
 
     def __init__(self, listener: Callable[[int, int], None] | None, stop: threading.Event) -> None:
@@ -227,7 +230,7 @@ class Stoppable(Progress):
         self._ended = stop
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Forward a report to the listener, or raise KeyboardInterrupt if the work is cancelled."""
+        """Forward a report to the listener; raise KeyboardInterrupt if the stop event is set."""
         if self._ended.is_set():
             raise KeyboardInterrupt
         if isinstance(self._listener, Progress):

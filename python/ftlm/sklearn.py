@@ -24,7 +24,7 @@ except ImportError:
     raise ModelError("scikit-learn is not installed; pip install 'ftlm[sklearn]'") from None
 
 
-#: Maximum deviation of a step of a data frame's index from the median step, relative to it.
+#: Maximum deviation of a step of a data frame's index from the median step, as a fraction of the median step.
 MAX_INDEX_JITTER_SHARE = 0.02
 
 
@@ -35,31 +35,32 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
     ----------
     structure
         Equation as text, structure, or ``"auto"`` for D^alpha y0 = a0 y0 + b0_0 u0 + b0_1 u1 … with one alpha for all
-        outputs. Columns of several inputs or outputs are selected by name from a data frame, otherwise in the sequence
-        in which the signals appear in the structure. ``"auto"`` uses columns in their sequence.
+        outputs. The columns of a data frame with several inputs or outputs are assigned to the signals by name. Columns
+        of arrays are assigned in the sequence of the signals in the structure. ``"auto"`` uses columns in their
+        sequence.
     step
-        Time between rows [s].
+        Sampling interval, the time between rows [s].
     orders
-        Values of free orders by name: a number fixes the order, ``"0.5:1.5:0.05"`` is its grid; see
-        :func:`ftlm.equation`.
+        Values of free orders by name. A number fixes the order, and text such as ``"0.5:1.5:0.05"`` defines its grid;
+        see :func:`ftlm.equation`.
     method
         Name of a method, or a method with its options, such as :class:`ftlm.OutputError`; see :func:`ftlm.identify`.
     offset
         Offset as in :func:`ftlm.identify`. It is estimated for the fitted rows and is not part of a prediction.
     continues
-        Whether predicted rows follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` without ``gap`` do.
-        The simulation then begins with the fitted inputs. The fitted rows themselves are predicted from their start. If
-        False, every prediction starts from rest. A gap in the index of a data frame raises an error. Arrays have no
-        index, so ``gap`` must be 0 with them.
+        Whether the rows to predict follow the fitted rows without a gap, as those of ``TimeSeriesSplit`` with
+        ``gap=0``. The simulation then starts at the first fitted row, with the fitted inputs. If the rows to predict
+        are the fitted rows, only these are simulated. If False, every prediction has zero initial conditions. A gap in
+        the index of a data frame raises an error. A gap between arrays cannot be detected.
     threads
-        Number of threads of a fit; one by default, because scikit-learn runs several fits in parallel.
+        Number of threads of a fit; 1 by default, because scikit-learn runs several fits in parallel.
 
     Attributes
     ----------
     identification_ : Identification
-        Identification, whose ``verdict`` states whether the model can be trusted.
+        Result of the identification. Its ``verdict`` states whether the model can be used.
     model_ : Model
-        The model.
+        Identified model.
     n_features_in_ : int
         Number of inputs.
     """
@@ -86,21 +87,21 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
 
     @check_arguments
     def fit(self, X: Any, y: Any) -> FractionalRegressor:
-        """Identify the structure from rows ordered in time.
+        """Identify the model from rows in ascending time, and return the estimator itself.
 
         Parameters
         ----------
         X
-            Inputs, shape (n, inputs), one row per sample. The index of a data frame, of numbers or dates, must increase
-            by the step.
+            Inputs, shape (n, inputs), one row per sample. If a data frame has an index of numbers or dates, it must
+            increase by equal steps.
         y
             Outputs, shape (n,) or (n, outputs).
 
         Raises
         ------
         ValueError
-            If scikit-learn rejects an array, the number of columns differs from that of the structure, or the names of
-            several columns do.
+            If scikit-learn rejects an array, the number of columns differs from the number of signals in the structure,
+            or the names of several columns differ from those of the signals.
         DataError, ModelError, ConvergenceError
             See :func:`ftlm.identify`.
         """
@@ -128,7 +129,11 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
 
     @check_arguments
     def predict(self, X: Any) -> Floats:
-        """Simulate n rows of inputs; return outputs of shape (n,) or (n, outputs), the same shape as y in ``fit``."""
+        """Simulate the model on n rows of inputs, and return the outputs.
+
+        The shape is (n,) if `y` in :meth:`fit` had one dimension, otherwise (n, outputs). Raise DataError if the index
+        of a data frame has a gap.
+        """
         _validation.check_is_fitted(self)
         as_array("X", X)
         index = _check_index(_index(X))
@@ -140,7 +145,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             rows_before = len(self._fit_inputs)
             X = np.concatenate([self._fit_inputs, X])
         rows = len(X)
-        # A simulation needs a few instants; what is held beyond the last row changes nothing before it.
+        # A simulation needs at least three samples. Repeating the last row does not change the earlier outputs.
         X = np.concatenate([X, np.repeat(X[-1:], max(3 - rows, 0), axis=0)])
         run = self._run(X, np.zeros((len(X), len(self._outputs))), "predict")
         free = self.model_.simulate(run, initial={o: {} for o in self._outputs})
@@ -148,7 +153,10 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         return out[:, 0] if self._flat else out
 
     def _structure(self, inputs: int, outputs: int) -> Structure:
-        """Return the structure with the requested orders."""
+        """Return the structure for the numbers of input and output columns, with the requested orders.
+
+        Raise ModelError for a structure that is neither text nor a Structure.
+        """
         if not isinstance(self.structure, (str, Structure)):
             raise ModelError(
                 f"structure is {type(self.structure).__name__}; give an equation in words or a structure, or 'auto'"
@@ -169,13 +177,16 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
 
 
 def _columns(table: Any) -> list[str] | None:
-    """Return the names of a data frame's columns; None for anything else."""
+    """Return the column names of a data frame; None for other objects, or if a name is not text."""
     names = list(getattr(table, "columns", ()))
     return names if names and all(isinstance(name, str) for name in names) else None
 
 
 def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the signal of each column, by name for several named columns, otherwise by position."""
+    """Return the name of the signal in each column: by column name for several named columns, otherwise by position.
+
+    Raise ValueError if the column names are not the signal names; `what` ("X" or "y") is named in the message.
+    """
     if columns is None or len(signals) < 2:
         return signals
     names = tuple(map(str, columns))
@@ -188,7 +199,7 @@ def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None
 
 
 def _index(table: Any) -> Floats | None:
-    """Return the index of a data frame as numbers; None without an index of numbers or dates."""
+    """Return the index of a data frame as numbers, with dates in ns; None without an index of numbers or dates."""
     index = getattr(table, "index", None)
     kind = getattr(getattr(index, "dtype", None), "kind", "")
     if kind == "M":
@@ -197,7 +208,10 @@ def _index(table: Any) -> Floats | None:
 
 
 def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
-    """Return the index of rows; raise DataError if it does not increase by one step."""
+    """Return the index unchanged; raise DataError unless it increases by equal steps.
+
+    `fit_rows` is the number of fitted rows at the start of the index, for the message.
+    """
     steps = np.diff(index) if index is not None else np.zeros(0)
     usual = float(np.median(steps)) if steps.size else 1.0
     bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))

@@ -267,10 +267,10 @@ pub fn fit(
     model.check(experiments)?;
     check_length("orders", model.model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.model.coordinates.len(), start.coefficients.len())?;
-    check_finite("orders of the start", &start.orders)?;
-    check_finite("coefficients of the start", &start.coefficients)?;
+    check_finite("orders of the initial guess", &start.orders)?;
+    check_finite("coefficients of the initial guess", &start.coefficients)?;
     check_length("inputs", model.model.inputs.len(), start.inputs.len())?;
-    check_finite("inputs of the start", &start.inputs)?;
+    check_finite("inputs of the initial guess", &start.inputs)?;
     let orders: Vec<f64> =
         start.orders.iter().zip(&model.model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     model.check_orders(&orders)?;
@@ -289,7 +289,7 @@ pub fn fit(
             .collect::<Result<_>>()?;
     }
     for values in &states {
-        check_finite("states of the start", values)?;
+        check_finite("states of the initial guess", values)?;
     }
     let problem = OutputError { model, experiments, stop };
     let found = minimize(&problem, Point { orders, coefficients, inputs, states }, settings)?;

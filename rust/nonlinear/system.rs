@@ -66,7 +66,7 @@ impl NonlinearSystem {
             }
             if self.equations[..i].iter().any(|other| other.structure.output == output) {
                 let what = format!("two equations have signal {output} as their output");
-                return refuse(what, "give one equation an output");
+                return refuse(what, "give each output one equation");
             }
         }
         match self.derived.iter().flat_map(|d| &d.channels).find(|(signal, _)| *signal >= self.recorded) {
@@ -84,7 +84,10 @@ impl NonlinearSystem {
             if place >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == place) {
                 return Err(Error::Structure {
                     what: format!("friction in equation {place}"),
-                    remedy: format!("there are {} equations; give each one friction law at most", self.equations.len()),
+                    remedy: format!(
+                        "give each of the {} equations at most one friction law, and number equations from 0",
+                        self.equations.len()
+                    ),
                 });
             }
         }
@@ -100,10 +103,15 @@ impl NonlinearSystem {
                 );
             }
             if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
-                return refuse("friction", force, "[0, ∞)", "friction dissipates energy");
+                return refuse(
+                    "friction",
+                    force,
+                    "[0, ∞)",
+                    "give a coefficient of at least 0, because friction dissipates energy",
+                );
             }
             if speed <= 0.0 {
-                let remedy = "it is the speed at which friction falls";
+                let remedy = "give the positive speed below which friction increases";
                 return refuse("speed of Stribeck friction", speed, "(0, ∞)", remedy);
             }
         }
@@ -119,7 +127,7 @@ impl NonlinearSystem {
             {
                 let rubs = self.frictions.iter().any(|f| f.0 == i);
                 let name =
-                    if rubs { "order of a term of a body with friction" } else { "order of a term that drives a body" };
+                    if rubs { "order of a term of a body with friction" } else { "order of an input term of a body" };
                 return refuse(name, term.order, "below that of the body", "reduce it");
             }
         }

@@ -212,7 +212,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let experiment = match &argument.sample_times {
         None => joint::Experiment::new(record, argument.pulses_per_sample, samples, weights)?,
         Some((places, jumps)) => {
-            let readings = SampleInterpolation::new(vector("times of readings", places)?, record.m())?;
+            let readings = SampleInterpolation::new(vector("times of nonuniform samples", places)?, record.m())?;
             let jumps = (jumps.iter())
                 .map(|near| {
                     let Some((places, sizes)) = near else { return Ok(None) };

@@ -246,10 +246,10 @@ pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], fre
     let runs = Recordings::new(runs.iter().map(|run| recording::Recording::clone(&run.get().inner)).collect())?;
     if let Some(run) = runs.runs().first() {
         check_length("signals of a run", signals, run.channels().len())?;
-        check_length("free numbers of inputs of a run", free, run.free_inputs.len())?;
+        check_length("free input parameters of a run", free, run.free_inputs.len())?;
         if run.outputs() != outputs {
             let what = format!("the run has outputs {:?}, but the problem has outputs {outputs:?}", run.outputs());
-            return Err(Error::Structure { what, remedy: "make both from one structure".into() });
+            return Err(Error::Structure { what, remedy: "create the run and the problem from one structure".into() });
         }
     }
     Ok(runs)

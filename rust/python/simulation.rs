@@ -144,7 +144,7 @@ pub fn interpolate_samples<'py>(
     means: PyReadonlyArray2<'py, f64>,
     places: PyReadonlyArray1<'py, f64>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let (means, places) = (rows(&means)?, vector("times of readings", &places)?);
+    let (means, places) = (rows(&means)?, vector("times of nonuniform samples", &places)?);
     let m = means.first().map_or(0, Vec::len);
     let read = run_detached(py, || {
         let readings = SampleInterpolation::new(places, m)?;
@@ -163,7 +163,7 @@ pub fn kink_correction<'py>(
     order: f64,
     step: f64,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-    let places = vector("times of readings", &places)?;
+    let places = vector("times of nonuniform samples", &places)?;
     let readings = SampleInterpolation::new(places, m)?;
     let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
     let lacking = run_detached(py, || Ok(readings.kink_corrections(&jumps, order, step)))?;

@@ -275,7 +275,7 @@ impl VirtualArm {
         for (command, noise) in commands.outer_iter().zip(noise.outer_iter()) {
             let late = self.wait(py)? + self.plant.delay();
             if !self.plant.sampling() {
-                guard.inner.fail(Fault::Rig("the board handed over no sample: samples were lost".into()));
+                guard.inner.fail(Fault::Rig("the board returned no sample: samples were lost".into()));
                 self.write(output, [0.0; 2])?;
                 break;
             }

@@ -36,10 +36,14 @@ impl Recordings {
     pub fn new(runs: Vec<Recording>) -> Result<Self> {
         for pair in runs.windows(2) {
             check_length("signals of a run", pair[0].channels().len(), pair[1].channels().len())?;
-            check_length("free numbers of inputs of a run", pair[0].free_inputs.len(), pair[1].free_inputs.len())?;
+            check_length("free input parameters of a run", pair[0].free_inputs.len(), pair[1].free_inputs.len())?;
             if pair[0].outputs() != pair[1].outputs() {
-                let what = format!("outputs {:?} of a run after {:?}", pair[1].outputs(), pair[0].outputs());
-                return Err(Error::Structure { what, remedy: "make both from one structure".into() });
+                let what =
+                    format!("the runs have different outputs, {:?} and {:?}", pair[1].outputs(), pair[0].outputs());
+                return Err(Error::Structure {
+                    what,
+                    remedy: "create the run and the problem from one structure".into(),
+                });
             }
         }
         Ok(Self { runs, memory: usize::MAX })

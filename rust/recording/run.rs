@@ -45,7 +45,7 @@ impl Sampling {
     /// ```
     pub fn check(self) -> Result<()> {
         for (name, number) in
-            [("pulses a sample interval", self.pulses_per_sample), ("samples that become one", self.decimation)]
+            [("pulses per sampling interval", self.pulses_per_sample), ("decimation factor", self.decimation)]
         {
             check_points(name, number)?;
             if number == 0 {
@@ -339,7 +339,7 @@ impl Recording {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn with_free_inputs(&self, values: &[f64]) -> Result<Self> {
-        check_length("free numbers of inputs", self.free_inputs.len(), values.len())?;
+        check_length("free input parameters", self.free_inputs.len(), values.len())?;
         let mut copy = self.clone();
         self.free_inputs.iter().try_for_each(|(signal, _)| self.channel(*signal).map(drop))?;
         for (&(signal, law), &value) in self.free_inputs.iter().zip(values) {

@@ -116,7 +116,7 @@ impl RunningSumSystem {
     pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
         for source in lists.iter().flatten() {
             if source.series.len() < m {
-                check_length("series that drives", m, source.series.len())?;
+                check_length("forcing series", m, source.series.len())?;
             }
         }
         if self.n > 1 {

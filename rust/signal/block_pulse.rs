@@ -150,7 +150,7 @@ pub(crate) fn check_pulses(m: usize) -> Result<()> {
         name: "m".into(),
         value: 0.0,
         range: "[1, ∞)".into(),
-        remedy: "ask for at least one pulse".into(),
+        remedy: "give at least one pulse".into(),
     })
 }
 
@@ -274,13 +274,17 @@ impl SampleInterpolation {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn new(places: Vec<f64>, m: usize) -> Result<Self> {
         if m < STENCIL_PULSES {
-            return Err(Error::Length { name: "pulses around a reading".into(), expected: STENCIL_PULSES, found: m });
+            return Err(Error::Length {
+                name: "pulses around a nonuniform sample".into(),
+                expected: STENCIL_PULSES,
+                found: m,
+            });
         }
-        check_finite("times of readings", &places)?;
+        check_finite("times of nonuniform samples", &places)?;
         if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
-            let remedy = "remove readings before or after the time span of the inputs".into();
+            let remedy = "remove samples before or after the time span of the inputs".into();
             return Err(Error::OutOfRange {
-                name: "time of a reading".into(),
+                name: "time of a nonuniform sample".into(),
                 value,
                 range: format!("[0, {m}]"),
                 remedy,

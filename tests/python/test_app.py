@@ -721,7 +721,7 @@ def test_fields_become_arguments():
         ({"columns": "x"}, "not a list"),
         ({"columns": [3]}, "not an object"),
         ({"columns": [{"name": "a", "role": "boss"}]}, "'boss' of column 'a'"),
-        ({"columns": [{"name": n, "role": "time"} for n in "ab"]}, "both the time"),
+        ({"columns": [{"name": n, "role": "time"} for n in "ab"]}, "both have the role time"),
         (
             {"columns": [{"name": n, "role": r, "signal": "s"} for n, r in (("a", "input"), ("b", "output"))]},
             "two columns",

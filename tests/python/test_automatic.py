@@ -194,7 +194,7 @@ def test_the_command_line_says_which_signals_drive_an_output(tmp_path: Path) -> 
         assert "D^1 z = a0_z z + b0_z y" in found.output, found.output
         wrong = CliRunner().invoke(app, [command, *words, "--structure", "auto", "--driven-by", "z=v,u"])
         assert wrong.exit_code == 2
-        assert "--driven-by: 'v' cannot drive z" in wrong.output
+        assert "--driven-by: 'v' cannot be an input of z" in wrong.output
         idle = CliRunner().invoke(app, [command, *words, "--structure", "D y = a y + b u", "--driven-by", "z=y"])
         assert idle.exit_code == 2
         assert "--driven-by is used with" in idle.output

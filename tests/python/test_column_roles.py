@@ -79,7 +79,7 @@ def test_names_that_options_give_win(tmp_path):
 def test_inspect_needs_no_names(tmp_path):
     shown = run_command("inspect", write(tmp_path / "a.csv", ["t", "u", "y"]))
     assert shown.returncode == 0, shown.stderr
-    assert "'u' drives 'y', by their names" in shown.stdout
+    assert "'u' is an input of 'y', by their names" in shown.stdout
 
 
 def test_open_writes_a_columns_file_that_loads_the_same_run(tmp_path):
@@ -111,7 +111,7 @@ def test_a_file_with_outputs_alone_is_a_free_response(tmp_path):
     path.write_text("time,angle\n" + "\n".join(f"{t:.12g},{y:.12g}" for t, y in zip(time, angle, strict=True)) + "\n")
     run = ftlm.load(path)
     assert (run.inputs, run.outputs) == ((), ("angle",))
-    assert any("nothing drives 'angle', the only signal" in w for w in run.warnings)
+    assert any("there is no input of 'angle', the only signal" in w for w in run.warnings)
 
 
 @pytest.mark.parametrize(

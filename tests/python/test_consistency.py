@@ -196,7 +196,7 @@ def test_words_where_nothing_can_be_compared():
     for parts in (1, 0, -2, 1.5, True, "2"):
         with pytest.raises(ftlm.ModelError, match="is not a whole number of at least 2"):
             ftlm.consistency(run, SECOND, segments=parts)
-    with pytest.raises(ftlm.ModelError, match="2 runs are segments by themselves; leave segments= out"):
+    with pytest.raises(ftlm.ModelError, match="2 runs are given, and each is a segment; leave segments= out"):
         ftlm.consistency([run, changing([40.0], seed=1)], SECOND, segments=2)
     for parts in (200, 10**9):
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):

@@ -265,7 +265,7 @@ def test_designs_are_made_over_the_intervals():
 
 def test_intervals_too_wide_for_a_loop_are_refused_in_words():
     with pytest.raises(
-        ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 samples .*known least is the coeff"
+        ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 samples .*the most uncertain is the coeff"
     ):
         control.fractional_pid(uncertain(HUB, {2: 300.0}), crossover=40.0, samples=40)
 
@@ -395,7 +395,7 @@ def test_what_cannot_be_realised_is_refused(options, words):
 @pytest.mark.parametrize(
     ("numbers", "words"),
     [
-        ({"kp": math.nan}, "kp = nan is not a finite number"),
+        ({"kp": math.nan}, "kp = nan is not finite; give a finite number"),
         ({"ki": "2"}, "ki = '2' is not a number"),
         ({"kd": 1 + 1j}, "kd = .* is not a number"),
         ({"kd": np.array([1.0, 2.0])}, "kd = .* is not a number"),

@@ -186,8 +186,8 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
         (3.0, {}, "float is not a system"),
         (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
         (control.tf([0], [1, 1]), {}, "order 0"),
-        (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
-        (control.tf([1], [1, 1]), {"inputs": ["y"]}, "name of an input and of an output"),
+        (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 names are given"),
+        (control.tf([1], [1, 1]), {"inputs": ["y"]}, "name of both an input and an output"),
         (control.tf([1], [1, 1]), {"inputs": ["a b"]}, "a b"),
         (control.frd([1, 2, 3], [1, 2, 3]), {}, "FrequencyData"),
         (control.tf([1], np.poly(-np.arange(1, 12))), {}, "order 11"),
@@ -199,7 +199,7 @@ def test_systems_that_are_no_equations_are_refused(system, options, words):
 
 
 def test_a_poor_approximation_warns_about_margins():
-    with pytest.warns(UserWarning, match="a gain or phase margin smaller than that means nothing"):
+    with pytest.warns(UserWarning, match="smaller gain and phase margins are meaningless"):
         system = model(ONE).to_control(band=(1e-4, 1e4), order=1)
     assert system.approximation.warnings
     assert "warning" in str(system.approximation)

@@ -147,7 +147,7 @@ def test_the_arm_s_hub_and_its_filtered_link(tmp_path) -> None:
 
 def test_what_was_filtered_and_drives_a_body_that_sticks_is_refused() -> None:
     words = "D^2 x = a q - b D x + g u - fc*sign(D x)"
-    with pytest.raises(ModelError, match=r"q, which drives it, passed the sensor filter.*coupling='simulated'"):
+    with pytest.raises(ModelError, match=r"q, an input of it, passed the sensor filter.*coupling='simulated'"):
         ftlm.equation(words, sensor_filter=behind("q"))
     ftlm.equation(words, sensor_filter=behind("x"))
 

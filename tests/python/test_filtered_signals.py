@@ -465,7 +465,7 @@ def test_the_arm_of_real_files_is_its_deflections():
     assert StructureOptions().structure("arm:2").outputs == ("theta22",)
     with pytest.raises(ftlm.ModelError, match="cross_damping=True needs the measured other deflection"):
         ftlm.flexible_link(cross_damping=True)
-    with pytest.raises(ftlm.ModelError, match="hub=False drives the deflection by the measured hub"):
+    with pytest.raises(ftlm.ModelError, match="hub=False makes the measured hub angle an input of the deflection"):
         ftlm.flexible_link(hub=False, form="published")
 
 

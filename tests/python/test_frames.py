@@ -178,7 +178,7 @@ def test_groups_of_an_hdf5_file_have_a_time_each(tmp_path, units):
         assert (run.step, run.length) == (step, rows)
         group = ftlm.load(tmp_path / "two.h5" / f"run{rows}")
         assert (group.name, group.step, list(group.inputs), list(group.outputs)) == (f"run{rows}", step, ["u"], ["y"])
-    with pytest.raises(ftlm.DataError, match=r"holds 2 runs, each in a group with its own time; .*two\.h5/run40"):
+    with pytest.raises(ftlm.DataError, match=r"contains 2 runs, each in a group with its own time; .*two\.h5/run40"):
         ftlm.load(tmp_path / "two.h5")
     with pytest.raises(ftlm.DataError, match=r"the group 'run41' is not in the file.*did you mean 'run40'"):
         ftlm.load(tmp_path / "two.h5" / "run41")

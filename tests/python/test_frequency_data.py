@@ -441,7 +441,7 @@ DEGREES = np.degrees(np.angle(Z))
 DECIBELS = 20 * np.log10(np.abs(Z))
 #: Header, columns, how it is written, what must be said; all hold the same spectrum.
 STRANGERS = {
-    "Zreal Zimag": (("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {}, "'Freq' taken for Hz"),
+    "Zreal Zimag": (("Freq", "Zreal", "Zimag"), (F, Z.real, Z.imag), {}, "'Freq' are assumed to be in Hz"),
     "Zreal Zimg": (("Freq/Hz", "Zreal/Ohm", "Zimg/Ohm"), (F, Z.real, Z.imag), {}, None),
     "potentiostat": (
         ("freq/Hz", "Re(Z)/Ohm", "-Im(Z)/Ohm", "|Z|/Ohm", "Phase(Z)/deg"),
@@ -470,7 +470,7 @@ STRANGERS = {
         "decimal commas",
     ),
     "kilohertz": (("f [kHz]", "Re", "Im"), (F / 1e3, Z.real, Z.imag), {}, None),
-    "scatter": (("w", "real", "imag", "sigma"), (W, Z.real, Z.imag, 1e-3 * np.abs(Z)), {}, "taken for rad/s"),
+    "scatter": (("w", "real", "imag", "sigma"), (W, Z.real, Z.imag, 1e-3 * np.abs(Z)), {}, "assumed to be in rad/s"),
 }
 
 
@@ -519,7 +519,7 @@ def test_the_command_says_what_python_says(tmp_path):
         (["--structure", ARC, "--weights", "deviation"], 3, "states no standard deviation; use --weights relative"),
         (["--structure", "arm:1"], 2, "a frequency response needs an equation"),
         (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
-        (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is asked for"),
+        (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is given"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
         (["--equation", ARC], 2, "--structure takes equations in words"),
     ):
@@ -540,8 +540,8 @@ def test_what_cannot_be_a_response_is_refused_in_words():
         (lambda: make([1.0, 2.0], [1, 2, 3]), r"response has shape \(3,\), frequency \(2,\)"),
         (lambda: make([], []), r"there is no frequency, 0 rows"),
         (lambda: make([[1.0]], [[1.0]]), r"frequency has shape \(1, 1\); give a vector"),
-        (lambda: make(["a"], [1.0]), r"frequency holds <U1 values; give real numbers"),
-        (lambda: make([1.0], ["a"]), r"response holds <U1 values; give numbers"),
+        (lambda: make(["a"], [1.0]), r"frequency has <U1 values; give real numbers"),
+        (lambda: make([1.0], ["a"]), r"response has <U1 values; give numbers"),
         (
             lambda: make([1.0], [1.0], frequency_unit="hz"),
             r"frequency_unit='hz' is unknown; the known ones are rad/s, Hz",
@@ -637,7 +637,7 @@ def test_columns_that_cannot_be_told_are_refused(heads, words, tmp_path):
 def test_what_is_said_of_a_file_is_checked(tmp_path):
     path = written(tmp_path / "x.csv", ("f", "gain", "phase"), [(1, -2, 3), (2, 3, 4), (3, 4, 5)])
     for options, words in (
-        ({}, r"column 'gain': a magnitude is negative, first at row 0, 1 in all; say magnitude_unit='dB'"),
+        ({}, r"column 'gain': a magnitude is negative, first at row 0, 1 in all; give magnitude_unit='dB'"),
         ({"magnitude_unit": "db"}, r"magnitude_unit='db' is unknown \(did you mean 'dB'\?\)"),
         ({"magnitude_unit": "dB", "phase_unit": "turns"}, r"phase_unit='turns' is unknown"),
         (
@@ -652,7 +652,7 @@ def test_what_is_said_of_a_file_is_checked(tmp_path):
             ftlm.load_frequency(path, **options)
     data = ftlm.load_frequency(path, magnitude_unit="dB", negated=True)
     np.testing.assert_allclose(data.response[0], 10 ** (-0.1) * np.exp(-1j * np.radians(3)))
-    assert any("the phase 'phase' is taken for degrees; otherwise phase_unit='rad'" in w for w in data.warnings)
+    assert any("the phase 'phase' is assumed to be in degrees; otherwise phase_unit='rad'" in w for w in data.warnings)
     ftlm.Run.from_arrays(step=1.0, inputs={"u": [0.0, 1, 2]}, outputs={"y": [0.0, 1, 2]}).to_csv(tmp_path / "run.csv")
     with pytest.raises(ftlm.DataError, match=r"run.csv is a run over time that ftlm wrote; load it with ftlm.load"):
         ftlm.load_frequency(tmp_path / "run.csv")
@@ -661,7 +661,7 @@ def test_what_is_said_of_a_file_is_checked(tmp_path):
 def test_an_inductive_spectrum_is_said_not_guessed(tmp_path):
     path = written(tmp_path / "x.csv", ("Hz", "Z'", "Z''"), np.stack([F, Z.real, -Z.imag], axis=1))
     data = ftlm.load_frequency(path)
-    assert any("if it holds -Z'', say negated=True" in w for w in data.warnings)
+    assert any("if it contains -Z'', give negated=True" in w for w in data.warnings)
     np.testing.assert_allclose(ftlm.load_frequency(path, negated=True).response, Z, rtol=1e-7)
 
 

@@ -262,7 +262,7 @@ def test_a_negative_coefficient_is_refused() -> None:
     ("options", "said"),
     [
         ({"initial": "history"}, "initial='caputo'"),
-        ({"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "u, which drives it, passed the sensor filter"),
+        ({"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "u, an input of it, passed the sensor filter"),
     ],
 )
 def test_what_a_march_does_not_know_is_refused(options, said: str) -> None:

@@ -176,7 +176,10 @@ def test_what_is_printed_is_read(structure):
         ("D y = k (u - y)", "k at character 7 multiplies a sum"),
         ("y = 1/(T s + 1) u", "T multiplies the highest derivative"),
         ("D y = a y + b u(t - Td)", "the delay Td of u is free"),
-        ("y = e^(-L s)/(s + 1) u", "an exponential at character 5 is a delay: a number, as in e^(-0.1 s), or bounds"),
+        (
+            "y = e^(-L s)/(s + 1) u",
+            "an exponential at character 5 is a delay; write a number, as in e^(-0.1 s), or bounds",
+        ),
         ("D y = a y + u + 0.5 u(t - 0.1)", "u has two delays"),
         ("y = 1/(s + 1) u + 2/(s + 1) u", "u occurs twice"),
         ("y = (a s + b)/((s + 1) (c s + 2)) u", "c multiplies the highest derivative; write"),

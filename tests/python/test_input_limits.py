@@ -263,7 +263,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
         ("D y = a y + b sat(u, 1", {}, "expected '\\)'"),
         ("D y = a y + b sat(D u, 1)", {}, "the name of a signal"),
         ("D y = a y + b sat(u, 1) + c u", {}, "with and without its limit"),
-        ("D y = a y + b sat(u, 1) + d D^0.5 sat(u, 2)", {}, "two limits of one kind"),
+        ("D y = a y + b sat(u, 1) + d D^0.5 sat(u, 2)", {}, "two saturations or two dead zones"),
         ("D y = a y + b dead(sat(u, 1), 0.1)", {}, "a dead zone acts before a saturation"),
         ("D y = a sat(y, 1) + b u", {}, "limited input"),
         ("D y = a y + b u", {"saturation": {"v": 1.0}}, "limited input"),

@@ -234,8 +234,8 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.integrate([1.0, 2.0], 11.0, step=STEP), "order"),
         (lambda: kernels.integrate([1.0, 2.0], 0.5, step=0.0), "step"),
         (lambda: kernels.integrate(np.ones((2, 4)), np.ones(3), step=STEP), r"x \(2,\) and order \(3,\) do not"),
-        (lambda: kernels.integrate(1.0, 0.5, step=STEP), "no axis of time"),
-        (lambda: kernels.toeplitz_apply(np.ones(3), np.ones(4)), "3 terms and x 4"),
+        (lambda: kernels.integrate(1.0, 0.5, step=STEP), "no time axis"),
+        (lambda: kernels.toeplitz_apply(np.ones(3), np.ones(4)), "3 values and x has 4"),
         (lambda: kernels.toeplitz_solve([0.0, 1.0], [1.0, 1.0]), "kernel 0 of 1 begins with 0"),
         (lambda: kernels.block_pulse_kernel([0.5, -0.1], 4, step=STEP), r"order = -0.1"),
         (lambda: kernels.block_pulse_kernel([0.5, np.inf], 4, step=STEP), r"order is not finite at index 1"),
@@ -257,7 +257,10 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.errors(np.ones(3), np.ones(4)), r"\(3,\), predicted \(4,\)"),
         (lambda: kernels.block_pulse_kernel(0.5, 0, step=STEP), "m"),
         (lambda: kernels.Candidates(np.ones(4), [0], step=STEP), r"signals has shape \(4,\)"),
-        (lambda: kernels.Candidates(np.ones((2, 4)), [2], step=STEP), "terms = 2 is not a row of 2 signals"),
+        (
+            lambda: kernels.Candidates(np.ones((2, 4)), [2], step=STEP),
+            "terms = 2 is not the row index of one of 2 signals",
+        ),
         (lambda: kernels.Candidates(np.ones((2, 4)), [], step=STEP), "terms is empty|terms. is empty"),
         (lambda: PAIR.coefficients([0.5, 0.1]), r"orders has shape \(2,\); give \(N, 2\)"),
         (lambda: PAIR.coefficients([[0.5, 0.1], [0.5, 0.6]]), r"orders 1 of 2 are \[0.5, 0.6\] \(1 such"),
@@ -316,7 +319,7 @@ def test_a_start_in_motion_is_a_term_of_a_recursion():
     [
         (
             lambda: kernels.Recursion([1.0, 0.0], [2], step=STEP, hold=[False, True]),
-            "terms = 2 is not a row of 2 signals",
+            "terms = 2 is not the row index of one of 2 signals",
         ),
         (lambda: kernels.Recursion([1.0], [1], step=STEP, hold=[False, True]), r"orders has shape \(1,\); give \(2,\)"),
         (lambda: kernels.Recursion([2.5, 0.0], [1], step=STEP, hold=[False, True]), r"outside \[0, 2\]"),

@@ -120,7 +120,7 @@ def test_bad_layouts_are_refused(tmp_path, case):
 
 OPEN = {
     "commas between numbers alone": ("0,5\n1,6\n2,7\n", ["line 1", "'0,5'", "separator='comma'", "decimal='comma'"]),
-    "pairs of commas": ("1,5, 2,5\n1,6, 2,6\n1,7, 2,7\n", ["line 1", "'1,5, 2,5'", "between cells or before decimals"]),
+    "pairs of commas": ("1,5, 2,5\n1,6, 2,6\n1,7, 2,7\n", ["line 1", "'1,5, 2,5'", "cell separators or decimal marks"]),
     "thousands": ("t;u;y\n1;1,234;5\n2;2,345;6\n3;12,345;7\n", ["line 2", "'1,234'", "thousands", "decimal='comma'"]),
     "mixed separators": ("t;u,y\n0;1,2\n1;1,3\n2;0,4\n", ["line 1", "commas and semicolons", "separator='semicolon'"]),
     "mixed lines": ("t;u;y\n0;1;2\n1;1;3\n2,1,4\n3;1;2\n", ["line 4 has 1 cells", "that line has commas"]),
@@ -518,7 +518,7 @@ def test_a_cell_that_holds_a_duration_has_its_unit_in_itself(tmp_path, title):
     run = ftlm.load(sheet(tmp_path, lines), **SIGNALS)
     assert run.step == pytest.approx(0.01)
     assert "time counted from 'PT0.000000S' on" in run.warnings
-    messages(["time_unit='ms'", "holds dates"], lambda: ftlm.load(tmp_path / "x.xlsx", **SIGNALS, time_unit="ms"))
+    messages(["time_unit='ms'", "has dates"], lambda: ftlm.load(tmp_path / "x.xlsx", **SIGNALS, time_unit="ms"))
 
 
 def test_durations_in_words_of_iso_8601():

@@ -227,7 +227,9 @@ def test_designs_are_made_over_the_intervals_or_refused_in_words():
     low, high = good.margin_interval("phase")
     assert low < good.nominal.phase < high
     assert "over the intervals (40 samples, 100 % stable)" in str(good)
-    with pytest.raises(ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 .*known least is the coeff"):
+    with pytest.raises(
+        ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 .*the most uncertain is the coeff"
+    ):
         control.lqg(uncertain(text, {2: 300.0, 4: 0.3}), **options)
 
 
@@ -270,7 +272,7 @@ REFUSED = [
         {"max_deviation": {"hub": 0.0}},
         r"max_deviation\['hub'\] = 0.0 is not positive and finite; give a number above 0",
     ),
-    ({"max_deviation": {"bend": 0.01}}, "allow for deviations of every output that integrates"),
+    ({"max_deviation": {"bend": 0.01}}, "state a maximum deviation of every output that integrates"),
     ({"max_input": -1.0}, "max_input = -1.0"),
     ({"max_input": "1"}, "max_input = '1' is not a number"),
     ({"process_noise": math.inf}, "process_noise = inf"),
@@ -279,7 +281,7 @@ REFUSED = [
     ({"noise": 1e-4}, "noise = 0.0001 is not a mapping"),
     ({"measured": "hub"}, "measured = 'hub' is not a list"),
     ({"measured": ["hubb"]}, "did you mean 'hub'"),
-    ({"measured": ["hub", "hub"]}, "is not a list of outputs, each once"),
+    ({"measured": ["hub", "hub"]}, "is not a list of different outputs"),
     ({"measured": [["hub"], "bend"]}, r"measured = \['hub'\] is not one of the outputs"),
     ({"measured": ["h" * 9999]}, "measured = 'h{59}… is not one of the outputs"),
     ({"noise": {("hub",): 1e-4}}, r"\('hub',\): …}: this is not a measured output"),
@@ -327,7 +329,7 @@ def test_what_is_no_model_or_no_loop_is_refused_by_name():
             control.lqg(wrong, max_deviation=DEAR, max_input=1.0)
         with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
             control.observer(wrong, process_noise=1.0)
-        with pytest.raises(ftlm.ModelError, match=r"design is a .*, no PidDesign or LqgDesign"):
+        with pytest.raises(ftlm.ModelError, match=r"design is a .*, not a PidDesign or an LqgDesign"):
             control.inverse_dynamics(wrong, control.point_to_point(0.3, 0.5))
 
 

@@ -127,7 +127,7 @@ def test_a_record_is_the_run_of_its_pulse_means(runs):
             "D y = a sqrt(y) + b u",
             "sqrt(y) of run 'run' is not finite in 95 pulses, first at 3.15 s, where y = -0.00839674; use",
         ),
-        ("D y = a y + b D^0.5 (u*D u)", "holds u between its samples: its jumps have no derivative"),
+        ("D y = a y + b D^0.5 (u*D u)", "has a zero-order hold for u, whose jumps have no derivative"),
         ("D y = a y + b exp(1000 y)", "exp(1000*y) of run 'run' is not finite"),
     ],
 )

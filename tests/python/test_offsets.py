@@ -225,7 +225,7 @@ def test_words_say_an_offset_and_are_printed_back():
     [
         (lambda: ftlm.equation("D y = -a y + 3.7"), "an offset is unknown: write '\\+ c'"),
         (lambda: ftlm.equation("D y = -a y + 3.7 + b u"), "3.7 at character 14 is a constant without a signal"),
-        (lambda: ftlm.equation("D y = -a y - c"), "has a sign, but an unknown constant has its own"),
+        (lambda: ftlm.equation("D y = -a y - c"), "has a sign, but the estimate of the constant includes the sign"),
         (lambda: ftlm.equation("D y = -a y + c + c0"), "occurs twice"),
         (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
         (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
@@ -342,12 +342,12 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
         run, structure, truth = loops.offset_run(kind, constant, 1)
         found = ftlm.identify(run, structure, offset="auto")
         assert found.model.structure.offset == "constant"
-        assert found.settings["offset_test"].startswith("constant, since the runs ask for one (chi-squared")
+        assert found.settings["offset_test"].startswith("constant, because the test is significant (chi-squared")
         for name, value in truth.items():
             low, high = found.intervals[name]
             # Three standard errors: 95 % would fail one number in twenty.
             assert abs(found.parameters[name].value - value) < 3 * (high - low) / 3.92
-        assert "offset found by test: constant, since the runs ask for one" in found.details()
+        assert "offset found by test: constant, because the test is significant" in found.details()
         # Estimated anew on the run that the model is judged on, and said.
         other, _, _ = loops.offset_run(kind, -2.0, 2)
         checked = found.validate(other)
@@ -362,13 +362,13 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
     told = json.loads(said.stdout)
     assert told["settings"]["offset"] == "constant"
     assert told["settings"]["offset_test"].startswith("constant")
-    assert "since the runs ask for one" in (tmp_path / "r.html").read_text()
+    assert "because the test is significant" in (tmp_path / "r.html").read_text()
 
 
 def test_auto_leaves_a_record_without_an_offset_as_it_was():
     run, structure, _ = loops.offset_run("motor", 0.0, 3)
     plain, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="auto")
-    assert found.settings["offset_test"].startswith("none, since the runs ask for none (chi-squared")
+    assert found.settings["offset_test"].startswith("none, because the test is not significant (chi-squared")
     assert found.comparison.offsets == ()
     assert found.parameters == plain.parameters
     assert found.standard_errors == plain.standard_errors

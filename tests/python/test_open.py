@@ -244,7 +244,7 @@ def test_what_is_opened_is_a_record(tmp_path):
 
 
 def test_several_inputs_drive_and_one_drives(tmp_path):
-    for header, verb in (("t,u,y", "'u' drives 'y'"), ("t,u1,u2,y", "'u1', 'u2' drive 'y'")):
+    for header, verb in (("t,u,y", "'u' is an input of 'y'"), ("t,u1,u2,y", "'u1', 'u2' are inputs of 'y'")):
         cells = header.count(",")
         (tmp_path / "run.csv").write_text(header + "\n" + "".join(f"{k}{f',{k % 3}' * cells}\n" for k in range(9)))
         assert any(verb in a.words for a in ftlm.open_file(tmp_path / "run.csv").assumed)

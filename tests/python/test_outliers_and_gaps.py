@@ -103,7 +103,7 @@ def test_an_input_goes_on_as_it_behaves_between_rows() -> None:
     linear = run_of(u, y, missing="hold", intersample={"u": "foh"})
     assert linear["u"].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
     assert linear.warnings == (
-        "input u: 2 of 5 rows hold no value, the first is row 2; a straight line was drawn, which is a guess",
+        "input u: 2 of 5 rows have no value, the first is row 2; a straight line was drawn, which is a guess",
     )
 
 
@@ -114,7 +114,7 @@ def test_what_was_not_read_is_nan_and_said() -> None:
     assert np.array_equal(run.missing_samples["y"], np.isnan(holes(y)))
     assert run_of(u, y).missing_samples == {}
     (said,) = run.warnings
-    assert said.startswith(f"output y: {np.isnan(holes(y)).sum()} of 400 rows hold no value")
+    assert said.startswith(f"output y: {np.isnan(holes(y)).sum()} of 400 rows have no value")
     assert np.array_equal(run.window(3.0, 9.0)["y"], holes(y)[30:90], equal_nan=True)
     assert len(run.advice()) == len(
         ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": interpolate_gaps(run["y"])}, step=STEP).advice()
@@ -170,13 +170,13 @@ def test_methods_that_cannot_leave_samples_out_refuse_them() -> None:
     u, y = noisy(1)
     run = run_of(u, holes(y), missing="weight")
     for method in ("instrumental-variables", "least-squares", "multi-innovation"):
-        with pytest.raises(ftlm.DataError, match=r"output 'y' of run 'run' holds no value in .* method='output-error'"):
+        with pytest.raises(ftlm.DataError, match=r"output 'y' of run 'run' has no value in .* method='output-error'"):
             ftlm.identify(run, ftlm.equation(FREE), method=method)
     with pytest.raises(ftlm.DataError, match=r"requires all samples"):
         ftlm.search_orders(run, ftlm.equation("D^alpha y = a y + b u"))
     pair = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"x": holes(y), "y": y}, step=STEP, missing="weight")
     driven = ftlm.equation("D^2 y = c D y + a y + b x")
-    with pytest.raises(ftlm.DataError, match=r"signal 'x' .* drives the equation of y as measured"):
+    with pytest.raises(ftlm.DataError, match=r"signal 'x' .* enters the equation of y as measured"):
         ftlm.identify(pair, driven)
 
 

@@ -231,7 +231,10 @@ def test_two_signals_that_drive_alike_are_named() -> None:
     (signal,) = run.inputs
     u = run[signal]
     twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": u, "v": -2.5 * u}, outputs={"y": run["y"]})
-    words = "v is -2.5 times u on every run, which no run tells apart: leave out the term of c or that of b, fix one of"
+    words = (
+        "v is -2.5 times u on every run, so their effects are not separately identifiable: leave out the term of c or "
+        "that of b, fix one of"
+    )
     with pytest.raises(ftlm.ConvergenceError, match=words):
         ftlm.identify(twice, ftlm.equation("D^alpha y = a1 D^mu y + a0 y + b u + c v"))
     # At another order, or with a share that differs, they can be told apart.

@@ -815,7 +815,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
     assert "−50.00" in below.svg
     assert "–" in below.svg
     for bad, message in (
-        ([], "at least one model"),
+        ([], "compared is empty"),
         ([("one", [("estimation", own)]), ("two", [("validation", own)])], "give comparisons on the same runs"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):

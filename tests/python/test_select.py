@@ -292,7 +292,7 @@ def test_auto_is_of_outputs_that_something_drives(runs):
     assert str(IntegerOrderForm(1, 0, delayed=True).structure(second)) == "D^1 z = a0_z z + b0_z y"
     for asked, words in (
         ({"x": ["u"]}, "'x' is not an output"),
-        ({"z": ["z"]}, "'z' cannot drive z"),
+        ({"z": ["z"]}, "'z' cannot be an input of z"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             automatic_problems(pair, driven_by=asked)

@@ -138,7 +138,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         "of other runs": lambda: ftlm.select([runs[0], motor(3, rows=200)], [SECOND, FIRST], store=place),
         "with other validation data": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
     }.items():
-        with pytest.raises(ftlm.DataError, match=f"holds a selection {words}; choose another file"):
+        with pytest.raises(ftlm.DataError, match=f"contains a selection {words}; choose another file"):
             other()
     judged = ftlm.select(runs[0], [FIRST], validation=runs[1], store=tmp_path / "judged.ftlm")
     assert judged.winner.failed is None
@@ -238,7 +238,10 @@ def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path)
         )
     ]
     wrong += [
-        (f"holds a fit with {words} in record .*; choose another file", RECORD_ENCODER.encode(StoredAnswer(b"0", one)))
+        (
+            f"contains a fit with {words} in record .*; choose another file",
+            RECORD_ENCODER.encode(StoredAnswer(b"0", one)),
+        )
         for words, each in fits.items()
         for one in each
     ]
@@ -274,7 +277,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
             place = _forged(tmp_path / f"{what} {held}.ftlm", request, RECORD_ENCODER.encode(StoredAnswer(key, answer)))
             with (
                 Store(place, request) as kept,
-                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} is expected; choose another file"),
+                pytest.raises(ftlm.DataError, match=f"contains {held} where {what} is expected; choose another file"),
             ):
                 ask(kept, what)
 

@@ -217,7 +217,7 @@ def test_words_are_read_and_written() -> None:
         (f"{BLOCK} {NEAR.replace('fs', 'fs2')}", "Stribeck friction of D y occurs twice"),
         ("D^2 y = u - fc*sign(D y) + fs*exp(-(D y/vs)^2)*sign(D y)", "it is subtracted"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D u)", "velocity of the output of the equation"),
-        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D y)", "follows one velocity"),
+        ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D y)", "use the same velocity in both"),
         ("D^2 y = u - fc*sign(D y) - fs*exp((D y/vs)^2)*sign(D y)", r"expected -\(D y/vs\)\^2"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^3)*sign(D y)", "expected '2'"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(y/vs)^2)*sign(D y)", "D and the name of a signal"),

@@ -51,8 +51,8 @@ def test_figures_of_a_perfect_and_of_a_diverged_prediction():
         (np.ones((2, 2)), np.ones((2, 2)), "measured has shape (2, 2)"),
         (1.0, 1.0, "measured has shape ()"),
         ([1.0, np.nan, 2.0, np.inf], np.ones(4), "measured is not finite at index 1 (2 such values in all)"),
-        (["a"], ["b"], "measured holds <U1 values; give real numbers"),
-        ([1.0], [1j], "predicted holds complex128 values"),
+        (["a"], ["b"], "measured has <U1 values; give real numbers"),
+        ([1.0], [1j], "predicted has complex128 values"),
     ],
 )
 def test_figures_of_what_cannot_be_compared_are_refused(measured, predicted, message):

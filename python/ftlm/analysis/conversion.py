@@ -423,7 +423,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     twice = sorted(set(signals) & set(results))
     if twice:
         raise ModelError(
-            f"{', '.join(twice)}: each is the name of an input and of an output; pass {parameter('inputs')} and "
+            f"{', '.join(twice)}: each is the name of both an input and an output; pass {parameter('inputs')} and "
             f"{parameter('outputs')} with other names"
         )
     rows = zip(results, parts, strict=True)
@@ -438,7 +438,9 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
     """
     order = bottom.size - 1
     if not 0 < order <= MAX_ORDER:
-        raise ModelError(f"{output} is of order {order}; an equation has an order from 1 to {MAX_ORDER:g}")
+        raise ModelError(
+            f"the equation of {output} would be of order {order}; an equation has an order from 1 to {MAX_ORDER:g}"
+        )
     terms = [(-c, output, order - k) for k, c in enumerate(bottom) if k > 0]
     for name, top in zip(inputs, tops, strict=True):
         if top.size > bottom.size:
@@ -513,7 +515,7 @@ def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
-            raise ModelError(f"{what}: {len(names)} given, the system has {count}; give {count} names")
+            raise ModelError(f"{what}: {len(names)} names are given, but the system has {count}; give {count} names")
         return names
     names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
     plain = [_LABEL_PATTERN.fullmatch(n) for n in names]

@@ -229,7 +229,8 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     if np.any(bad):
         at = int(np.argmax(bad))
         raise DataError(
-            f"w is {omega[at]} at index {at} ({int(np.sum(bad))} such values in all); give rad/s, finite, >= 0"
+            f"w is {omega[at]} at index {at} ({int(np.sum(bad))} such values in all); give finite frequencies "
+            "of at least 0 rad/s"
         )
     inputs = response_inputs(model, coupled=coupled)
     out = np.zeros((len(model.outputs), len(inputs), omega.size), dtype=np.complex128)

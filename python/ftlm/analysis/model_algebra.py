@@ -47,7 +47,9 @@ class Ratio:
         """
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:
-            raise ModelError(f"the {'denominator' if top else 'numerator'} is 0; there is no such model")
+            raise ModelError(
+                f"the {'denominator' if top else 'numerator'} is 0, so the result is not a model; change an operand"
+            )
         # Powers below 0 are integrals of a signal; a multiplication by a power of s removes them from the equation.
         shift = -min(0.0, *bottom, *top)
         highest = max(bottom)
@@ -174,7 +176,9 @@ def parallel(first: Model, second: Model) -> Model:
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:
     """Return the closed loop of two models; see :meth:`ftlm.Model.feedback`."""
     if sign not in (-1, 1):
-        raise ModelError(f"{parameter('sign', sign)}; give -1 for negative feedback or 1")
+        raise ModelError(
+            f"{parameter('sign', sign)} is neither -1 nor 1; give -1 for negative feedback, or 1 for positive feedback"
+        )
     a, output, signal = _ratio(forward, "feedback")
     if isinstance(back, Model):
         b, _, _ = _ratio(back, "feedback")

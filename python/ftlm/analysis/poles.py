@@ -220,8 +220,8 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
     if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
         decades = int(MAX_LOG_FREQUENCY / math.log(10))
         raise ModelError(
-            f"the {what} overflow, outside of 1e-{decades} to 1e{decades} rad/s: change the unit of time"
-            " or the coefficients"
+            f"the {what} overflow, outside of 1e-{decades} to 1e{decades} rad/s; change the unit of time "
+            "or the coefficients"
         )
     poles = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
     if roots_in_base(polynomial) is None:

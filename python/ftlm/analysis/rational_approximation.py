@@ -312,14 +312,14 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
     if not (worst_gain <= MAX_GAIN_ERROR_DB and worst_phase <= MAX_PHASE_ERROR_DEGREES):
         words.append(
-            f"over {low:g} to {high:g} rad/s the approximation is off by up to {worst_gain:.2g} dB "
-            f"and {worst_phase:.2g} degrees: a gain or phase margin smaller than that means nothing; raise order, or "
+            f"from {low:g} to {high:g} rad/s the error of the approximation is up to {worst_gain:.2g} dB "
+            f"and {worst_phase:.2g} degrees, so smaller gain and phase margins are meaningless; raise order, or "
             "change the band"
         )
     if stability(model).unstable_poles != np.sum(roots.real > ORIGIN_POLE_RATIO * low):
         words.append(
-            "the approximation does not have as many unstable poles as the model: no stability margin of it holds for "
-            "the model; raise order, or move the band"
+            "the approximation and the model have different numbers of unstable poles, so its stability margins do not "
+            "apply to the model; raise order, or move the band"
         )
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 

@@ -1,4 +1,4 @@
-// The page asks its own server for parts of itself and puts them in place; what files and people say comes escaped.
+// The page requests parts of its HTML from its own server and inserts them. The server escapes all text of files and users.
 const $ = (id) => document.getElementById(id);
 const said = $("said"), ask = $("ask"), files = $("files"), models = $("models");
 const most = Number(document.body.dataset.most);
@@ -8,7 +8,7 @@ function say(words, bad) {
   said.textContent = words;
   said.classList.toggle("bad", Boolean(bad));
   clearTimeout(silence);
-  // What went wrong stays until something else is said.
+  // An error message stays until the next message.
   if (!bad) silence = setTimeout(() => { said.textContent = ""; }, 6000);
 }
 
@@ -22,7 +22,7 @@ async function request(path, options) {
   const text = await answer.text();
   if (answer.ok) return text;
   let words = text;
-  try { words = JSON.parse(text).error; } catch { /* as it is */ }
+  try { words = JSON.parse(text).error; } catch { /* the text is not JSON and is shown unchanged */ }
   throw new Error(words || `refused (${answer.status})`);
 }
 
@@ -30,7 +30,7 @@ const send = (path, body) => request(path, {
   method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body),
 });
 
-// A part in the place of the one with its id, or first; folds stay as they were, and so does the focus.
+// Replace the element of the same id by a new one, or insert it first. Open details and the focus are kept.
 function put(parent, html, first) {
   const made = document.createElement("template");
   made.innerHTML = html;
@@ -89,7 +89,7 @@ document.addEventListener("drop", (event) => {
   upload([...event.dataTransfer.files]);
 });
 
-// What the fields of a file say; a new layout may have other columns, so it is read for itself.
+// Values of the form fields of a file. A new layout may have other columns, so the columns are then omitted.
 function told(card, layout) {
   const form = card.querySelector("form"), out = Object.fromEntries(new FormData(form));
   for (const name of Object.keys(out)) if (/-\d+$/.test(name)) delete out[name];
@@ -130,7 +130,7 @@ document.addEventListener("click", async (event) => {
       put(models, await send(`models/${key}/${button.dataset.do}`, {})).querySelector("button")?.focus();
       soon();
     } else {
-      // Nobody is to ask any more for what is about to go.
+      // No request for an element may follow its removal.
       gone.add(place);
       looking.abort();
       await request(place, { method: "DELETE" });
@@ -166,7 +166,7 @@ function refill(select, entries) {
   if (entries.some(([value]) => value === was)) select.value = was;
 }
 
-// The form, as the files allow it.
+// Update the form for the files that are available.
 function arrange() {
   const runs = facts().filter((file) => file.run);
   $("ask-section").hidden = !runs.length;

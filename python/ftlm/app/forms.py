@@ -1,4 +1,4 @@
-"""Fit requests from form fields: their execution, the equivalent Python script, and suggested structures."""
+"""Fit requests of the web app: parsing of form fields, fit, equivalent Python script, and suggested structures."""
 
 from __future__ import annotations
 
@@ -25,44 +25,45 @@ from ftlm.structure_selection.select import select
 from ftlm.utils.resources import estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, is_run_name
 
-#: Structures with a name of their own, as Python calls.
+#: Functions that return named structures, by the Python call that is shown in scripts.
 NAMED_STRUCTURES: dict[str, Callable[[], Structure]] = {
     "flexible_link(stage=1)": lambda: flexible_link(stage=1),
     "flexible_link(stage=2)": lambda: flexible_link(stage=2),
 }
-#: Origin of the structure: fit as given, selected inside one, selected among several, or automatic.
+#: Selection modes: fit the given structure, select terms within one structure, select among several, or automatic.
 SELECTION_MODES = ("fit", "inside", "offered", "auto")
 METHOD_NAMES = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
 OFFSET_KINDS = ("none", "level", "constant", "ramp", "auto")
 LOSS_NAMES = ("squares", "huber")
-#: Progress phase of a structure selection.
+#: Name of the progress phase of a structure selection.
 SELECTION_PHASE = "choosing a structure"
-#: Longest line of a script.
+#: Maximum length of a line of a generated script [characters]; longer calls have one argument per line.
 MAX_SCRIPT_LINE_CHARACTERS = 100
 
 
 class ProgressListener(Protocol):
-    """Protocol of a receiver of progress reports."""
+    """Protocol for receivers of progress reports."""
 
     def phase(self, words: str) -> None:
-        """Report the start of the next phase."""
+        """Report the start of the phase that `words` describes."""
 
     def __call__(self, count: int, total: int) -> None:
-        """Report that ``count`` of ``total`` parts are done."""
+        """Report that ``count`` of ``total`` parts of the current phase are done."""
 
 
 @dataclass(frozen=True)
 class RunSource:
-    """File of the page, with the arguments of `ftlm.load` that load it as a run.
+    """File in the web app, with the arguments of `ftlm.load` that load it as a run.
 
     Parameters
     ----------
     file
-        File name on the page.
+        File name that the web app shows.
     options
-        Arguments of `ftlm.load`, as `ftlm.open_file` returns them; the layout is a dictionary.
+        Keyword arguments of `ftlm.load`, as `ftlm.open_file` returns them; the layout is a dictionary.
     path
-        Path under which the page stores the file; "" for its name in the working folder.
+        Path at which the web app stores the file. If it is empty, the file has the name `file` in the working
+        folder.
     """
 
     file: str
@@ -70,7 +71,7 @@ class RunSource:
     path: str = ""
 
     def run(self) -> Run:
-        """Load the run and name it after the uploaded file."""
+        """Load the run; a run that has the name of the stored file is renamed after the uploaded file."""
         run = load(self.path or self.file, **self.options)
         if not self.path or run.name != base_name(Path(self.path)):
             return run
@@ -78,28 +79,30 @@ class RunSource:
         return run._with(name=name if is_run_name(name) else "run")
 
     def script(self, name: str) -> list[str]:
-        """Return the lines of a Python script that load the run into a variable."""
+        """Return the lines of a Python script that load the run into the variable `name`."""
         return format_call(name, "ftlm.load", [format_string(self.file)], self.options)
 
 
 @dataclass(frozen=True)
 class FitRequest:
-    """Complete definition of a fit: runs, structure and options.
+    """Request of a fit, which completely defines it: runs, structure and options.
 
     Parameters
     ----------
     estimation
         Run that the model is fitted to.
     validation
-        Validation run; None without validation, or if a part of the first run is used for it.
+        Validation run; None without validation, or if the end of the estimation run is used for it.
     share
-        Fraction of the run, at its end, that is used for validation, from 0 (none) to 0.8.
+        Fraction of the estimation run, at its end, that is used for validation, from 0 (none) to 0.8.
     structure
-        Equations, or keys of :data:`NAMED_STRUCTURES`: several for ``"offered"``, none for ``"auto"``.
+        Equations, or keys of :data:`NAMED_STRUCTURES`. The mode ``"offered"`` has several, ``"auto"`` has none, and the
+        other modes have one.
     way
-        Selection mode, one of :data:`SELECTION_MODES`.
+        Selection mode, one of :data:`SELECTION_MODES`: ``"fit"`` fits the structure as given, ``"inside"`` selects
+        terms of it, ``"offered"`` selects among several structures, and ``"auto"`` requires none.
     method, offset, loss
-        Method and offset of :func:`ftlm.identify` and loss of :class:`ftlm.OutputError`; "" for the defaults.
+        Method and offset of :func:`ftlm.identify`, and loss of :class:`ftlm.OutputError`; "" for the defaults.
     """
 
     estimation: RunSource
@@ -113,18 +116,18 @@ class FitRequest:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> FitRequest:
-        """Return the request from its dictionary; see :meth:`to_dict`."""
+        """Return the request from its dictionary, as :meth:`to_dict` returns it."""
         other = fields["validation"]
         parts = {**fields, "structure": tuple(fields["structure"]), "estimation": RunSource(**fields["estimation"])}
         return cls(**{**parts, "validation": None if other is None else RunSource(**other)})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the request as a dictionary for JSON."""
+        """Return the request as a dictionary of values that JSON can represent."""
         return asdict(self)
 
     @property
     def words(self) -> str:
-        """Structure of the request as one line of text."""
+        """Structure or selection mode of the request as one line of text."""
         return {
             "fit": "; ".join(self.structure),
             "inside": f"chosen inside {'; '.join(self.structure)}",
@@ -133,12 +136,12 @@ class FitRequest:
         }[self.way]
 
     def settings(self) -> dict[str, str]:
-        """Options of the fit that the user set, except runs and structure."""
+        """Return method, offset and loss by name; options at their defaults are omitted."""
         options = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in options.items() if value}
 
     def estimation_method(self) -> EstimationMethod:
-        """Return the method of estimation with its options."""
+        """Return the estimation method with its loss; output error by default."""
         return method_with_options(self.method or METHOD_NAMES[0], {"loss": self.loss} if self.loss else {})
 
     def identify_arguments(self) -> list[str]:
@@ -150,7 +153,7 @@ class FitRequest:
         return [*arguments, *([f"offset={format_string(self.offset)}"] if self.offset else [])]
 
     def structures(self) -> list[Structure]:
-        """Return the structures of the request.
+        """Return the structures of the request, parsed from text.
 
         Raises
         ------
@@ -161,11 +164,11 @@ class FitRequest:
 
     @property
     def is_choice(self) -> bool:
-        """Whether the request selects a structure, which takes so long that a checkpoint is useful."""
+        """Whether the request selects a structure. A selection takes so long that a checkpoint file is useful."""
         return self.way != "fit"
 
     def fit_model(self, listener: ProgressListener, store: str | None = None) -> FittedModel:
-        """Fit the model, and return it with its runs and a script.
+        """Read the runs, fit and validate the model, and return it with its runs and a script.
 
         Parameters
         ----------
@@ -190,7 +193,7 @@ class FitRequest:
         else:
             candidates = "auto" if self.way == "auto" else structures[0] if self.way == "inside" else structures
             choice = select(own, candidates, progress=listener, store=store)
-            # The selection started from rest, as its run does. Another run may not.
+            # The selection may have assumed zero initial conditions. Its structure allows others, which this fit tests.
             listener.phase("fitting what was chosen")
             result = identify(own, choice.winner.structure, progress=listener)
         listener.phase("validating")
@@ -199,7 +202,7 @@ class FitRequest:
         )
 
     def _time_estimate(self, run: Run, structure: Structure) -> str:
-        """Return an estimate of the duration of a fit as text; empty for a short fit."""
+        """Return the estimated duration of an output-error fit as text; empty for a short fit or another method."""
         numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
         seconds = estimate_duration(
             output_error_cost(run.length * len(structure.outputs), numbers), check_threads(None)
@@ -209,7 +212,7 @@ class FitRequest:
         return f", {format_time_left(seconds).removesuffix(' left')} in all"
 
     def _runs(self) -> tuple[Run, Run | None, float | None]:
-        """Return the estimation run, the validation run, and the time at which one run was split [s] (or None)."""
+        """Return the estimation run, the validation run (or None), and the split time of one run [s] (or None)."""
         run = self.estimation.run()
         if self.validation is not None:
             return run, self.validation.run(), None
@@ -219,7 +222,7 @@ class FitRequest:
         return run.window(None, cut), run.window(cut, None), cut
 
     def _script(self, cut: float | None) -> str:
-        """Return a Python script that repeats the whole fit; `cut` is the time at which the run is split [s]."""
+        """Return a Python script that repeats the fit; `cut` is the time at which the run is split [s], or None."""
         stem = Path(self.estimation.file).stem
         lines = [
             f'"""A model of {sanitize_for_docstring(self.estimation.file)}, as made by the page of ftlm '
@@ -258,7 +261,7 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """Model with its runs and the script that reproduces it."""
+    """Model of a fit with its estimation run, validation run, validation, structure selection and Python script."""
 
     result: Identification
     run: Run
@@ -269,12 +272,16 @@ class FittedModel:
 
 
 def structure_of(text: str) -> Structure:
-    """Return the structure that an equation or a key of :data:`NAMED_STRUCTURES` denotes."""
+    """Return the structure of a text, which is an equation or a key of :data:`NAMED_STRUCTURES`."""
     return NAMED_STRUCTURES[text]() if text in NAMED_STRUCTURES else equation(text)
 
 
 def parse_structures(recipe: FitRequest) -> list[Structure]:
-    """Return the structures of a request; raise ModelError if options contradict each other."""
+    """Return the structures of a request.
+
+    Raise ModelError if an option is unknown, the number of structures does not suit the selection mode, the options
+    contradict each other, or an equation is invalid.
+    """
     for name, value, choices in (
         ("way", recipe.way, SELECTION_MODES),
         ("method", recipe.method, ("", *METHOD_NAMES)),
@@ -298,17 +305,20 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
 
 
 def split_time(rows: int, step: float, share: float) -> float:
-    """Return the time [s] at which a run is split, so that the given fraction of its samples follows."""
+    """Return the time [s] that splits a run of `rows` samples so that the fraction `share` of them follows it."""
     return float(f"{round(rows * (1.0 - share)) * step:.9g}")
 
 
 def structure_expression(structure: str) -> str:
-    """Return the Python expression of a structure."""
+    """Return the Python expression of a structure that is given as text."""
     return f"ftlm.{structure}" if structure in NAMED_STRUCTURES else f"ftlm.equation({format_string(structure)})"
 
 
 def format_call(target: str, function: str, values: list[str], keywords: Mapping[str, Any]) -> list[str]:
-    """Return a Python call as lines of code, with one argument per line if one line would be too long."""
+    """Return the assignment of a function call to `target` as lines of Python code.
+
+    Each argument has its own line if a single line would be too long.
+    """
     parts = [*values, *(f"{name}={format_literal(value)}" for name, value in keywords.items())]
     line = f"{target} = {function}({', '.join(parts)})"
     if len(line) <= MAX_SCRIPT_LINE_CHARACTERS:
@@ -333,11 +343,11 @@ def format_string(text: str) -> str:
 
 
 def sanitize_for_docstring(text: str) -> str:
-    """Return a file name reduced to characters that are safe within a docstring."""
+    """Return a file name with characters that are unsafe in a docstring replaced by "?", at most 100 characters."""
     return "".join(c if c.isalnum() or c in " ._-()" else "?" for c in text)[:100]
 
 
-#: Form fields of a file's layout with integer values, and those with text values.
+#: Form fields of the layout of a text file: those with integer values, and those with text values.
 INTEGER_LAYOUT_FIELDS, TEXT_LAYOUT_FIELDS = (
     ("skip", "header"),
     ("encoding", "separator", "decimal", "thousands", "dates", "sheet"),
@@ -352,17 +362,17 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     texts
-        ``columns``: a list of name, role, signal and unit; ``step``, ``resample``, ``from``, ``to``: text of numbers;
-        ``time_unit``, ``missing`` and the fields of the layout: text.
+        Form fields by name. ``columns`` is a list of objects with name, role, signal and unit. ``step``, ``resample``,
+        ``from`` and ``to`` are numbers as text. ``time_unit``, ``missing`` and the fields of the layout are text.
 
     Raises
     ------
     DataError
-        If a field is unknown, or a number in it is invalid.
+        If a number is invalid, a field is not text, or the list of columns is invalid.
     """
 
     def read_fields(parse: Callable[[str, str], Any], *names: str) -> dict[str, Any]:
-        """Return the values of the nonempty fields by name."""
+        """Return the parsed values of the nonempty fields among `names`, by name."""
         return {name: parse(name, text) for name in names if (text := _text(texts, name))}
 
     options = read_fields(parse_number, "step", "resample") | read_fields(_plain_text, "time_unit", "missing")
@@ -376,7 +386,10 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _roles(columns: Any) -> dict[str, Any]:
-    """Return time, inputs, outputs and units from the list of columns of a form; {} without a list."""
+    """Return the arguments time, inputs, outputs and units from the list of columns of a form; {} for None.
+
+    Raise DataError for an invalid list, an unknown role, two time columns, or two signals of equal name.
+    """
     if columns is None:
         return {}
     if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
@@ -393,7 +406,7 @@ def _roles(columns: Any) -> dict[str, Any]:
             raise DataError(f"the role {role!r} of column {name!r} is not known; take time, input, output or none")
         if role == "time":
             if "time" in roles:
-                raise DataError(f"{roles['time']!r} and {name!r} are both the time; keep one of them")
+                raise DataError(f"{roles['time']!r} and {name!r} both have the role time; keep one of them")
             roles["time"] = name
         elif role:
             signals = roles.setdefault(f"{role}s", {})
@@ -406,7 +419,7 @@ def _roles(columns: Any) -> dict[str, Any]:
 
 
 def parse_number(name: str, text: str) -> float:
-    """Return the number in a form field; raise DataError if there is none."""
+    """Return the number in the text of the form field `name`; raise DataError for other text."""
     try:
         return float(text)
     except ValueError:
@@ -418,7 +431,7 @@ def _plain_text(_: str, text: str) -> str:
 
 
 def _parse_line_count(name: str, text: str) -> int:
-    """Return the number of lines in a form field; raise DataError if it is invalid."""
+    """Return the number of lines in the text of the form field `name`; raise DataError for other text."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise DataError(f"{name}: {text[:40]!r} is not a number of lines; write one such as 2")
     return int(text)
@@ -433,16 +446,17 @@ def _text(texts: Mapping[str, Any], name: str) -> str:
     return str(value).strip() if name not in ("name",) else str(value)
 
 
-#: Outputs and inputs for which structures are suggested; longer lists are not readable.
+#: Maximum number of outputs, and of inputs, for which structures are suggested; longer lists are not readable.
 MAX_SUGGESTED_SIGNALS = 6
-#: Maximum delay that is searched where one is suggested, as a share of the run.
+#: Upper bound of the delay in a suggested structure, as a fraction of the duration of the run.
 MAX_DELAY_SHARE = 0.1
 
 
 def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: float) -> list[dict[str, str]]:
-    """Return suggested structures for each output of a run, each with name, purpose, equation and output.
+    """Return suggested structures for the outputs of a run.
 
-    `duration` is that of the run [s].
+    Each suggestion is a dictionary with the keys "name", "why" (purpose), "structure" and "output". `duration` is that
+    of the run [s], which determines the range of delays.
     """
     suggestions: list[dict[str, str]] = []
     driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]

@@ -1,4 +1,4 @@
-"""HTTP server on 127.0.0.1: socket, start and shutdown."""
+"""HTTP server of the web app on 127.0.0.1: socket, start and shutdown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ftlm.app.session import Session
 from ftlm.errors import DataError, ModelError
 from ftlm.utils.parameters import setting, use_interface
 
-#: Default address and port, limit of connections, and chunk size of files read from disk.
+#: Default port, loopback address, maximum number of connections, and chunk size of files that are read from disk.
 DEFAULT_PORT, LOOPBACK_ADDRESS = 8347, "127.0.0.1"
 MAX_CONNECTIONS = 100
 READ_CHUNK_BYTES = 1 << 20
@@ -32,26 +32,31 @@ def check_installed() -> None:
 
 
 def open_socket(port: int | None) -> tuple[socket.socket, str]:
-    """Open a socket on the loopback address, and return it with a note on its port.
+    """Open a listening socket on the loopback address.
 
     Parameters
     ----------
     port
-        Port number; None for the default port, or for any free one if the default is in use.
+        Port number. None selects the default port, or a free port if the default port is in use.
+
+    Returns
+    -------
+    tuple
+        The socket, and a note for the user if the default port is in use (otherwise empty).
 
     Raises
     ------
     ModelError
         If the port is out of range.
     DataError
-        If the port is in use or not allowed.
+        If the given port is in use, or a port cannot be opened.
     """
     if port is not None and not 0 <= port <= 65535:
         raise ModelError(f"{setting('port')} {port} is not a valid port; take one from 1024 to 65535, or 0 for any")
     number = DEFAULT_PORT if port is None else port
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":
-        # There it would let two programs share the port.
+        # On Windows, this option would let two programs share the port.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         sock.bind((LOOPBACK_ADDRESS, number))
@@ -69,23 +74,23 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
 
 
 def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool = True) -> None:
-    """Run the web application until Ctrl-C.
+    """Run the web application until Ctrl-C; files of the session are removed at the end.
 
     Parameters
     ----------
     files
         Files to open at the start.
     port
-        Port on 127.0.0.1.
+        Port on 127.0.0.1; None for the default port, or a free port if it is in use.
     browser
-        Whether to open a browser.
+        Whether the address is opened in a browser.
 
     Raises
     ------
     DataError
         If a file does not exist, or the port is in use.
     ModelError
-        If the server package is not installed.
+        If a package of the server is not installed, or the port is out of range.
     """
     check_installed()
     paths = [Path(file) for file in files]
@@ -95,7 +100,7 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)
-    # The page turns parameters of Python into labels of its fields.
+    # Messages name Python parameters, which the page replaces by labels of its form fields.
     with sock, use_interface("python"), contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(sock, paths, browser))
     print("\nftlm app has ended; its files are removed", file=sys.stderr)
@@ -141,14 +146,14 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         await server.serve(sockets=[sock])
         del opener
     finally:
-        # Ctrl-C cancels the next await, which must not skip the cleanup.
+        # Ctrl-C cancels the next await. This one is cancelled in place of the cleanup.
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.sleep(0)
         await desk.close()
 
 
 async def _read_chunks(path: Path) -> AsyncIterator[bytes]:
-    """Yield the content of a local file in chunks."""
+    """Yield the content of a local file in chunks of `READ_CHUNK_BYTES` bytes."""
     with open(path, "rb") as stream:
         while piece := stream.read(READ_CHUNK_BYTES):
             yield piece

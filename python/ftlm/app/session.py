@@ -1,4 +1,4 @@
-"""State of a browser session: files in a private folder, a queue of models, and the limits of both."""
+"""State of a session of the web app: files in a private folder, a queue of fits, and limits of both."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ from ftlm.progress import format_time_left
 from ftlm.structure.structure import Structure
 from ftlm.utils.validation import nearest, real_number
 
-#: Limits: bytes of one file and of all files, number of files, of models and of queued models, time to open a file.
+#: Maximum size of one file and of all files, maximum number of files, of models and of queued models, and maximum time
+#: to open a file.
 MAX_FILE_BYTES, MAX_TOTAL_BYTES = 256 << 20, 1 << 30
 MAX_FILES, MAX_MODELS, MAX_QUEUED_MODELS = 20, 40, 8
 OPEN_TIMEOUT_S = 600.0
-#: Time after which the page is told that a file is still being read.
+#: Time after which an upload is answered although its file is still being read.
 OPEN_REPLY_TIMEOUT_S = 2.0
-#: Files that are opened at the same time.
+#: Maximum number of files that are opened at the same time.
 MAX_CONCURRENT_OPENS = 2
-#: Longest file name [bytes].
+#: Maximum length of a file name in UTF-8 [bytes]; longer names are truncated.
 MAX_NAME_BYTES = 200
-#: Characters that Windows refuses in file names.
+#: Characters that are not allowed in file names on Windows.
 _RESERVED_CHARACTERS = ':*?"<>|' if os.name == "nt" else ""
 STATE_WAITING, STATE_RUNNING, STATE_MADE, STATE_FAILED, STATE_STOPPED = (
     "waiting",
@@ -51,15 +52,17 @@ class File:
     Parameters
     ----------
     key, name, size
-        Identifier on the page and in the folder, name on the page, and size in bytes.
+        Identifier in addresses and in the folder, displayed name, and size in bytes.
     user_options
-        Options set by the user, as arguments of `ftlm.open_file`.
+        Options that the user set, as keyword arguments of `ftlm.open_file`.
     preview
-        Description of the file; None while it is read or if it cannot be read.
+        Description of the file from the worker process; None while it is read or if it cannot be read.
     error
         Reason why the file cannot be read; empty otherwise.
     version
-        Number of changes.
+        Number of completed readings, by which the page detects changes.
+    task
+        Worker process that reads the file; None if it is not being read.
     """
 
     key: str
@@ -73,7 +76,7 @@ class File:
 
     @property
     def stored_name(self) -> str:
-        """File name in the folder: the key and the original extensions, by which readers recognize formats."""
+        """File name in the folder: the key with the original extension, from which readers recognize the format."""
         suffixes = re.search(r"(\.[A-Za-z0-9]{1,10}){0,2}\Z", self.name)
         return self.key + (suffixes[0] if suffixes else "")
 
@@ -83,32 +86,38 @@ class File:
         return self.preview is not None and not self.preview["problem"]
 
     def run_source(self, folder: Path) -> RunSource:
-        """Return the file with all arguments of `ftlm.load`."""
+        """Return the source of the run: the file in `folder`, and all arguments of `ftlm.load`.
+
+        The file must have a preview.
+        """
         assert self.preview is not None
         return RunSource(self.name, self.preview["options"], str(folder / self.stored_name))
 
 
 @dataclass
 class Model:
-    """Model that was requested in the session.
+    """Model that was requested in the session, with the state of its fit.
 
     Parameters
     ----------
     key, number, recipe
-        Identifier on the page, serial number, fit request.
+        Identifier in addresses, serial number, and fit request.
     state
         ``"waiting"``, ``"running"``, ``"made"``, ``"failed"`` or ``"stopped"``.
-    phase, share, started_at, phase_started_at, time_left, took
-        Current phase, finished fraction of it, start times of the fit and of the phase, remaining time as text, and
-        duration [s].
+    phase, share, time_left
+        Current phase of the fit, completed fraction of the phase (or None), and remaining time as text.
+    started_at, phase_started_at, took
+        Start times of the fit and of the phase on a monotonic clock, and total duration [s].
     description
-        Content of the page about the model.
+        Content of the page about the model; None without a model.
     error
-        Reason why there is no model.
+        Reason why the fit failed; empty otherwise.
     version
-        Number of changes of state.
+        Number of changes of `state`, by which the page detects changes.
+    task
+        Worker process of the fit; None if it is not running.
     files
-        Keys of the files of its runs.
+        Keys of the files that contain its runs.
     """
 
     key: str
@@ -134,7 +143,7 @@ class Model:
 
 
 class Session:
-    """State of one browser session; only the server's thread may use it.
+    """State of one session of the web app. It is not thread-safe: only the thread of the server may use it.
 
     Parameters
     ----------
@@ -154,7 +163,10 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------ files
 
     def check_room(self, name: str, size: int | None) -> str:
-        """Return the name under which the page shows a file; raise DataError if the file exceeds a limit."""
+        """Return a unique displayed name for a new file; raise DataError if a limit on number or size is exceeded.
+
+        `size` is the announced size in bytes; None if it is unknown.
+        """
         if len(self.files) >= MAX_FILES:
             raise DataError(f"{MAX_FILES} files are open, the maximum number; remove one")
         if size is not None:
@@ -164,8 +176,7 @@ class Session:
     def _check_size(self, name: str, size: int, own: File | None = None) -> None:
         if size > MAX_FILE_BYTES:
             raise DataError(
-                f"{safe_name(name)!r} is larger than {MAX_FILE_BYTES >> 20} MB, the most that the page takes; load "
-                "it in "
+                f"{safe_name(name)!r} is larger than {MAX_FILE_BYTES >> 20} MB, the maximum size; load it in "
                 "Python, or take fewer rows"
             )
         if size + sum(f.size for f in self.files.values() if f is not own) > MAX_TOTAL_BYTES:
@@ -181,14 +192,14 @@ class Session:
         return free
 
     async def take(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
-        """Store a file that arrives in chunks, start to read its preview, and return it.
+        """Store an uploaded file from its chunks, start to read its preview, and return the file.
 
-        Most previews are ready on return.
+        The method waits up to `OPEN_REPLY_TIMEOUT_S` for the preview, which is sufficient for most files.
 
         Raises
         ------
         DataError
-            If the file exceeds a size limit or there are too many files.
+            If the file exceeds a size limit, there are too many files, or the file cannot be written.
         """
         free = self.check_room(name, size)
         # The name is reserved here, so that a second upload of the same name gets another one.
@@ -211,14 +222,14 @@ class Session:
         return file
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a background task, keep a reference to it, and return it."""
+        """Start a background task, store a reference to it until it ends, and return it."""
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
         return job
 
     async def open(self, file: File) -> None:
-        """Read the preview of a file with the user's options; an earlier reading of the file is stopped."""
+        """Read the preview of a file with the options of the user; a reading in progress is stopped first."""
         if file.task is not None:
             file.task.stop()
         request = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}
@@ -234,7 +245,7 @@ class Session:
         file.version += 1
 
     def remove_file(self, key: str) -> None:
-        """Remove a file; models that were identified from it remain.
+        """Remove a file from the session and the folder; models that were identified from it remain.
 
         Raises
         ------
@@ -253,12 +264,13 @@ class Session:
     # ----------------------------------------------------------------------------------------------------------- models
 
     def parse_request(self, fields: Mapping[str, Any]) -> FitRequest:
-        """Return the fit request that the form of the page defines.
+        """Return the fit request of the form fields, after all checks that need no computation.
 
         Raises
         ------
         DataError, ModelError
-            If a file is missing, still being read or not a run, an option is unknown, or an equation is invalid.
+            If a file is missing, still being read or not a run. Also if an option is unknown, an equation is invalid,
+            or a run lacks a signal of a structure.
         """
         other = str(fields.get("validation") or "")
         share = real_number("share", fields.get("share", 0))
@@ -296,12 +308,12 @@ class Session:
         return file.run_source(self.folder)
 
     def start(self, recipe: FitRequest) -> Model:
-        """Add a model to the queue, and return it.
+        """Add a model to the queue of fits, and return it.
 
         Raises
         ------
         DataError
-            If there are too many models, or too many in the queue.
+            If there are `MAX_MODELS` models, or `MAX_QUEUED_MODELS` of them are queued or running.
         """
         if len(self.models) >= MAX_MODELS:
             raise DataError(f"{MAX_MODELS} models are kept, the maximum number; remove one")
@@ -318,9 +330,9 @@ class Session:
             raise DataError(f"{MAX_QUEUED_MODELS} models are already in the queue; stop one of them, or wait")
 
     def resume(self, key: str) -> Model:
-        """Continue the computation of a stopped model, and return the model.
+        """Queue a stopped or failed model again, and return it; other models are returned unchanged.
 
-        A structure selection continues from its checkpoint, a fit from the beginning.
+        A structure selection continues from its checkpoint file. A fit starts from the beginning.
 
         Raises
         ------
@@ -368,7 +380,7 @@ class Session:
             model.version += 1
 
     def stop(self, key: str) -> None:
-        """Stop a queued or running model; files that it has written remain."""
+        """Stop the fit of a queued or running model; its files, such as a checkpoint file, remain."""
         model = self.models[key]
         if model.is_busy:
             model.state = STATE_STOPPED
@@ -377,7 +389,7 @@ class Session:
                 model.task.stop()
 
     def remove_model(self, key: str) -> None:
-        """Remove a model and its files."""
+        """Stop the fit of a model, and remove the model and its files."""
         self.stop(key)
         del self.models[key]
         for suffix in (".json", ".html", ".ftlm", ".ftlm-journal"):
@@ -387,7 +399,7 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------- both
 
     def without_paths(self, words: str) -> str:
-        """Return a message in which local paths are replaced by the names of files on the page."""
+        """Return a message in which paths of the folder are replaced by displayed file names."""
         folder = str(self.folder)
         words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
         for file in self.files.values():
@@ -395,7 +407,7 @@ class Session:
         return words
 
     def _with_names(self, answer: Any) -> Any:
-        """Return the answer of a task with :meth:`without_paths` applied to all its text."""
+        """Return the answer of a worker process, with :meth:`without_paths` applied to all text in it."""
         if isinstance(answer, dict):
             return {key: self._with_names(value) for key, value in answer.items()}
         if isinstance(answer, list):
@@ -403,7 +415,7 @@ class Session:
         return self.without_paths(answer) if isinstance(answer, str) else answer
 
     async def close(self) -> None:
-        """Stop all work and remove the folder."""
+        """Stop all worker processes and remove the folder."""
         for file in self.files.values():
             if file.task is not None:
                 file.task.stop()
@@ -417,13 +429,13 @@ class Session:
 
 
 def _check_signals(structure: Structure, reading: RunSource) -> None:
-    """Raise an error if the run lacks a signal of the structure, before a process is started."""
+    """Raise ModelError if the run lacks a signal of the structure, before a worker process is started."""
     names = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
     for name in structure.signals:
         if name not in names:
             raise ModelError(
-                f"{reading.file!r} has no signal {name!r}{nearest(name, names)}; it has {', '.join(names)}, as its "
-                "columns are named above"
+                f"{reading.file!r} has no signal {name!r}{nearest(name, names)}; its signals are {', '.join(names)}, "
+                "as the columns above name them"
             )
 
 
@@ -432,25 +444,25 @@ def _file_names(recipe: FitRequest) -> set[str]:
 
 
 def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
-    """Store a progress report of a worker process in its model."""
+    """Store a progress report of the worker process in the model: a new phase, or the completed part of the phase."""
     if "phase" in message:
         model.phase, model.share, model.time_left = str(message["phase"]), None, ""
         model.phase_started_at = time.monotonic()
     elif message.get("total") and model.phase.startswith(SELECTION_PHASE):
-        # Fits add candidates, so a fraction of the known ones could decrease.
+        # A selection adds candidates during its work, so that a completed fraction could decrease.
         model.time_left = f"{message['done']} of {message['total']} candidates known so far are fitted"
     elif message.get("total"):
         share = min(max(float(message["done"]) / float(message["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.phase_started_at
         model.share = share
         if share > 0.02 and passed > 1.0:
-            # The measured rate replaces the estimate made before the start.
+            # The remaining time from the measured rate replaces the estimate in the name of the phase.
             model.phase = model.phase.partition(", about")[0]
             model.time_left = format_time_left(passed * (1.0 - share) / share)
 
 
 def safe_name(name: str) -> str:
-    """Return a file name without folders and without characters that a file system rejects."""
+    """Return a file name without folders and forbidden characters, truncated to `MAX_NAME_BYTES` bytes."""
     last = re.split(r"[/\\]", name)[-1]
     bare = "".join(c if c.isprintable() and c not in _RESERVED_CHARACTERS else "_" for c in last).strip(" .") or "file"
     stem, dot, suffix = bare.rpartition(".")

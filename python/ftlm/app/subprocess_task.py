@@ -1,4 +1,4 @@
-"""Worker processes that the server starts: start, messages and end."""
+"""Worker processes of the server: start, messages and end."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ftlm.io.isolated_reader import describe_crash
 from ftlm.utils.resources import python_child
 
 _WORKER_PATH = Path(__file__).with_name("worker.py")
-#: Longest line of a task's answer. A page of charts takes some hundred kilobytes.
+#: Maximum length of a message of a worker process; a model with its charts takes some hundred kilobytes.
 MAX_ANSWER_LINE_BYTES = 64 << 20
 
 
 class TaskError(DataError):
-    """Error of a task that ended without an answer, with a message for the page."""
+    """Error of a worker process that ended without an answer; the message is shown on the page."""
 
 
 class Task:
@@ -30,9 +30,9 @@ class Task:
     Parameters
     ----------
     request
-        Task for :mod:`ftlm.app.worker`, as JSON.
+        Task for :mod:`ftlm.app.worker`, a JSON object.
     listener
-        Callback for each progress report.
+        Callback that is called with each progress report, a JSON object.
     """
 
     def __init__(self, request: Mapping[str, Any], listener: Callable[[Mapping[str, Any]], None]) -> None:
@@ -42,7 +42,7 @@ class Task:
         self._ended = False
 
     async def answer(self, seconds: float | None = None) -> dict[str, Any]:
-        """Run the task and return its answer.
+        """Run the task in a worker process, and return its answer.
 
         Parameters
         ----------
@@ -56,7 +56,7 @@ class Task:
         """
         if self._ended:
             raise TaskError("stopped")
-        # A session of its own: Ctrl-C is for the parent, and what it starts itself ends with it.
+        # The process has a new session: Ctrl-C does not reach it, and killing its group also kills its children.
         child = python_child(_WORKER_PATH)
         process = await asyncio.create_subprocess_exec(
             *child.pop("args"),
@@ -80,7 +80,10 @@ class Task:
             await process.wait()
 
     async def _read_answer(self, process: asyncio.subprocess.Process) -> dict[str, Any]:
-        """Return the answer of the process, after its progress reports are passed to the listener."""
+        """Send the request to the process, pass its progress reports to the listener, and return its answer.
+
+        Raise TaskError if the process reports an error or exits without an answer, or a message is too long.
+        """
         assert process.stdin is not None
         assert process.stdout is not None
         with contextlib.suppress(ConnectionError):
@@ -104,12 +107,12 @@ class Task:
             self._listener(message)
 
     def stop(self) -> None:
-        """Kill the process; :meth:`answer` then raises TaskError."""
+        """Kill the worker process; :meth:`answer` then raises TaskError."""
         self._ended = True
         self._kill()
 
     def _kill(self) -> None:
-        """Kill the process and its children."""
+        """Kill the worker process and its children, if it is running."""
         process = self._process
         if process is None or process.returncode is not None:
             return
@@ -121,7 +124,7 @@ class Task:
 
 
 def _describe_exit(code: int) -> str:
-    """Return text on the exit of a process that gave no answer."""
+    """Return an error message for a process that exited with `code` without an answer."""
     if code >= 0:
         return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"
     return f"the process that worked on it crashed ({describe_crash(code)}); the page and all models are still here"

@@ -1,4 +1,4 @@
-"""HTML of the page and of its files and models; templates escape all text from files and users."""
+"""HTML of the web app: whole page, files, models and comparison. All text from files and users is escaped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ftlm.svg.html_page import read_resource, style_sheet, templates
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.formatting import finite
 
-#: Label of the form field of each Python argument.
+#: Label of the form field for each Python argument.
 _FIELD_LABELS = {
     "step": "Step",
     "resample": "Put on the step",
@@ -42,7 +42,7 @@ _FIELD_LABELS = {
     "sheet": "Sheet",
     "window": "From” and “To",
 }
-#: Python argument with its value, or with a placeholder in capitals.
+#: Pattern of a Python argument in a message, with its value or a placeholder in capitals.
 _ARGUMENT_PATTERN = re.compile(
     r"\b(resample|time_unit|missing|step|time|window)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b|\([^()]*\))?|layout=dict\((\w+)=[^)]*\)"
 )
@@ -54,7 +54,7 @@ _VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}
 
 
 def _field_label(match: re.Match[str]) -> str:
-    """Return the label of the form field of a matched argument, with its value."""
+    """Return the label of the form field for an argument that `_ARGUMENT_PATTERN` matched, with its value."""
     name, value = match[1] or match[4], match[2] or match[3]
     label = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
     return f"{label} {value}" if value else label
@@ -73,27 +73,27 @@ def _render_template(template: str, **context: Any) -> str:
 
 @cache
 def script() -> str:
-    """Return the JavaScript of the page and its charts."""
+    """Return the JavaScript code of the page and its charts."""
     return f"{read_resource('charts.js')}\n{read_resource('app.js', 'ftlm.app')}"
 
 
 @cache
 def style() -> str:
-    """Return the style sheet of the page and of reports."""
+    """Return the CSS style sheet of the page, which includes that of reports."""
     return f"{style_sheet()}\n{chart_css()}\n{read_resource('app.css', 'ftlm.app')}"
 
 
 def page_words(text: str) -> str:
-    """Return an error message in which Python arguments are replaced by form labels."""
+    """Return an error message in which Python arguments are replaced by the labels of form fields."""
     for pattern, words in _PHRASE_REPLACEMENTS:
         text = pattern.sub(words, text)
     return _ARGUMENT_PATTERN.sub(_field_label, text)
 
 
 def page(desk: Session) -> str:
-    """Return the HTML of the whole page in its current state."""
+    """Return the HTML of the whole page for the current state of the session `desk`."""
     parts = {
-        "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # escaped by its template
+        "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # safe: its template escapes all text
         "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
         "comparison": Markup(comparison(desk)),
     }
@@ -110,7 +110,7 @@ def page(desk: Session) -> str:
 
 
 def file(item: File) -> str:
-    """Return the HTML of a file with its columns and assumptions."""
+    """Return the HTML element of a file with its columns, options and assumptions."""
     preview = item.preview
     options = {} if preview is None else preview["options"]
     facts = {
@@ -136,12 +136,12 @@ def file(item: File) -> str:
 
 
 def model(item: Model) -> str:
-    """Return the HTML of a model in any state."""
+    """Return the HTML element of a model, whether it is queued, running, finished or failed."""
     return _render_template("model.html.j2", model=item, description=item.description, recipe=item.recipe)
 
 
 def comparison(desk: Session) -> str:
-    """Return an HTML table of the models, the best verdicts first."""
+    """Return an HTML table of all finished models, sorted by verdict and then by worst fit, best first."""
     models = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
     models.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
     outputs = list(dict.fromkeys(f["output"] for m in models for f in (m.description or {})["fits"]))
@@ -150,13 +150,13 @@ def comparison(desk: Session) -> str:
 
 
 def _worst_fit(item: Model) -> float:
-    """Return the smallest fit of a model in percent, on validation data if there are any."""
+    """Return the smallest fit [%] of a model over its outputs, on validation data if there are any."""
     fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (item.description or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
 def state(desk: Session) -> dict[str, Any]:
-    """Return versions and progress of all files and models, which the page polls."""
+    """Return the versions of all files, and version, phase and progress of all models, by key. The page polls it."""
     return {
         "files": {f.key: f.version for f in desk.files.values()},
         "models": {
@@ -172,13 +172,16 @@ def state(desk: Session) -> dict[str, Any]:
     }
 
 
-#: Points per line of a chart, and charts per model or run.
+#: Maximum number of points per line of a chart, and maximum number of charts per model or run.
 MAX_CHART_POINTS = 1500
 MAX_FIGURES = 12
 
 
 def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
-    """Return the content of the page on a model; all text in its markup is escaped."""
+    """Return the description of a fitted model for the page, as values that JSON can represent.
+
+    All text in its HTML markup is escaped.
+    """
     result, checked = fitted_model.result, fitted_model.validation
     judgement = verdict(result, checked)
     warnings, rest = first_findings([*result.findings, *(checked.findings if checked else ())])
@@ -217,7 +220,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
 
 
 def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
-    """Return the markup of figures for wide and narrow screens."""
+    """Return title, caption, and SVG markup for wide and narrow screens of at most `MAX_FIGURES` figures."""
     return [
         {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.note}
         for f in figures[:MAX_FIGURES]
@@ -225,5 +228,5 @@ def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
 
 
 def run_figures(run: Run) -> list[dict[str, str]]:
-    """Return the markup of charts of a run's signals over time, outputs first."""
+    """Return the markup of charts of the signals of a run over time, outputs first; see :func:`figure_markup`."""
     return figure_markup(list(run.plot(*[*run.outputs, *run.inputs][:MAX_FIGURES])))

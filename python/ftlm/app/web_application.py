@@ -1,4 +1,4 @@
-"""Web application on starlette: checks of requests, routes, responses, and timeouts of connections."""
+"""Starlette application of the web app: request checks, routes, responses, and connection timeouts."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from ftlm.errors import FtlmError
 Item = TypeVar("Item", File, Model)
 Endpoint = Callable[[Request], Awaitable[Response]]
 
-#: Longest body of a request that uploads no file.
+#: Maximum size of the body of a request other than a file upload.
 MAX_BODY_BYTES = 64 << 10
-#: Allows only the page's own script, style and server, and no embedding in frames.
+#: Security policy that allows only scripts and styles of this server, requests to it, and no embedding in frames.
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
@@ -45,7 +45,7 @@ SECURITY_HEADERS = {
     "cross-origin-resource-policy": "same-origin",
 }
 MAX_QUERY_FIELDS = 10
-#: Name and media type of each file of a model; the page is a report that is shown.
+#: (file name of the download, media type) by the last part of the address. "page" displays the report in the browser.
 MODEL_FILES = {
     "report": ("report.html", "text/html"),
     "page": ("report.html", "text/html"),
@@ -55,17 +55,20 @@ MODEL_FILES = {
 
 
 def html_response(text: str) -> Response:
-    """Return an HTML response."""
+    """Return an HTML response with status 200."""
     return Response(text.encode("utf-8", "replace"), media_type="text/html")
 
 
 def json_response(content: object, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    """Return a JSON response of an object."""
+    """Return an object as a JSON response."""
     return Response(json.dumps(content), status, headers, "application/json")
 
 
 async def read_json(request: Request) -> dict[str, Any]:
-    """Return the body of a request as a JSON object; raise an HTTP error for other content."""
+    """Return the body of a request, a JSON object, as a dictionary.
+
+    Raise HTTPException for other content (status 400) or a body of more than `MAX_BODY_BYTES` (status 413).
+    """
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -81,18 +84,19 @@ async def read_json(request: Request) -> dict[str, Any]:
 
 
 class WebApplication:
-    """ASGI application of the page.
+    """ASGI application that serves one session of the web app.
 
     Parameters
     ----------
     desk
         Session to serve.
     token
-        Secret part of the address, without which requests are rejected.
+        Secret first part of every path; requests without it are rejected with status 404.
     hosts
-        Accepted host names with ports.
+        Accepted values of the header ``Host``, such as "127.0.0.1:8347".
     key
-        Secret of an address that can be used once, and redirects to the permanent address.
+        Secret of the address ``/open/KEY``, which works once and redirects to the permanent address. If it is empty,
+        there is no such address.
     """
 
     def __init__(self, desk: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
@@ -120,7 +124,7 @@ class WebApplication:
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Answer one HTTP request; errors become JSON responses with the key "error"."""
         if scope["type"] != "http":
             return
 
@@ -130,7 +134,7 @@ class WebApplication:
                 for name, value in SECURITY_HEADERS.items():
                     headers.setdefault(name, value)
                 if message["status"] in (403, 404, 413, 415):
-                    # The rest of a refused body is not read.
+                    # The connection is closed, so that the rest of a rejected body is not read.
                     headers["connection"] = "close"
             elif scope["method"] == "HEAD":
                 message["body"] = b""
@@ -138,7 +142,7 @@ class WebApplication:
 
         try:
             path = self._check_head(scope)
-            # The router raises what it refuses if there is an application.
+            # With the key "app" in the scope, the router raises an HTTPException for an unknown path.
             await self._router({**scope, "path": path, "app": self}, receive, send_secured)
             return
         except HTTPException as refused:
@@ -148,7 +152,7 @@ class WebApplication:
         except FtlmError as error:
             answer = json_response({"error": self._words(error)}, 400)
         except Exception as error:
-            # The page gets the type of the error only, because a traceback would contain paths of this machine.
+            # The response has the type of the error only, because a traceback would contain local paths.
             answer = json_response({"error": f"a fault in ftlm itself ({type(error).__name__})"}, 500)
         await answer(scope, receive, send_secured)
 
@@ -156,7 +160,10 @@ class WebApplication:
         return view.page_words(self._desk.without_paths(str(error)))
 
     def _check_head(self, scope: Scope) -> str:
-        """Check the head of a request, and return its path without the token; raise an HTTP error if it is invalid."""
+        """Check host, origin, token and query of a request, and return its path without the token.
+
+        Raise HTTPException for a request that is not allowed, and for redirections.
+        """
         headers = Headers(scope=scope)
         for name in ("host", "origin", "content-length"):
             if len(headers.getlist(name)) > 1:
@@ -182,13 +189,13 @@ class WebApplication:
         return f"{slash}{rest}"
 
     def _redirection(self) -> HTTPException:
-        """Return the redirection to the permanent address, as an HTTP error to raise."""
+        """Return the redirection to the permanent address as an HTTPException with status 303."""
         return HTTPException(303, headers={"location": f"/{self._token}/"})
 
     def _redeem_key(self, key: str) -> None:
-        """Redirect the first request with the one-time key; reject later requests with it.
+        """Raise the redirection for the first request with the one-time key, and status 404 for any other request.
 
-        The key is visible in the command line of the browser.
+        The key works once only, because it is visible in the command line of the browser process.
         """
         good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
         if not good:
@@ -199,7 +206,7 @@ class WebApplication:
         raise self._redirection()
 
     async def _check(self, request: Request) -> Response:
-        """Return the error message of a fit request, or "" if the request is valid."""
+        """Return JSON with the key "error": the message for an invalid fit request, or "" for a valid one."""
         request_body = await read_json(request)
         try:
             self._desk.parse_request(request_body)
@@ -211,7 +218,7 @@ class WebApplication:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
             raise HTTPException(415, "a file must be sent as application/octet-stream, not as a form")
         header = request.headers.get("content-length")
-        # Longer numbers are ignored. The received bytes are counted in any case.
+        # A longer number is ignored, because the received bytes are counted in any case.
         size = (
             int(header) if header is not None and header.isascii() and header.isdigit() and len(header) < 20 else None
         )
@@ -253,7 +260,10 @@ class WebApplication:
         return html_response(view.model(self._desk.resume(model.key)))
 
     async def _download(self, request: Request) -> Response:
-        """Return a file of a model; no part of its path comes from the request."""
+        """Return the response with a file of a model. No part of the file path is taken from the request.
+
+        Raise HTTPException (status 404) if the model is unknown or not finished, or its file is missing.
+        """
         model = _find(self._desk.models, request, "model")
         if model.state != STATE_MADE or model.description is None:
             raise HTTPException(404, "this model is not finished yet")
@@ -276,7 +286,7 @@ class WebApplication:
 
 
 def _view(make: Callable[[], str], media_type: str) -> Endpoint:
-    """Return the endpoint that responds with the text of a function, called for each request."""
+    """Return an endpoint that calls `make` for each request and responds with the returned text."""
 
     async def endpoint(_: Request) -> Response:
         return Response(make().encode("utf-8", "replace"), media_type=media_type)
@@ -285,23 +295,22 @@ def _view(make: Callable[[], str], media_type: str) -> Endpoint:
 
 
 def _find(items: Mapping[str, Item], request: Request, kind: str) -> Item:
-    """Return the file or model whose key is in the path; raise an HTTP error if there is none."""
+    """Return the file or model whose key is in the path; raise HTTPException (status 404) for an unknown key."""
     item = items.get(request.path_params["key"])
     if item is None:
         raise HTTPException(404, f"this {kind} is no longer on the page")
     return item
 
 
-#: Time that a client may take for a request head, between two parts of a body, and to read a part of an answer.
+#: Maximum time for a client to send a request head or the next part of a body, or to read a part of a response.
 CLIENT_TIMEOUT_S = 20.0
 
 
 class TimedConnection(H11Protocol):
-    """HTTP connection that closes itself if its client is inactive for :data:`CLIENT_TIMEOUT_S`.
+    """HTTP connection that is aborted if its client is inactive for :data:`CLIENT_TIMEOUT_S`.
 
-    The client is checked twice within this time.
-
-    The keep-alive limit of uvicorn applies only to connections that are idle after an answer.
+    Activity is checked twice within this time. The keep-alive limit of uvicorn is not sufficient, because it applies
+    only to connections that are idle after a response.
     """
 
     _since = 0.0
@@ -309,25 +318,25 @@ class TimedConnection(H11Protocol):
     _next: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the timeout of a new connection."""
+        """Start the inactivity timeout of a new connection."""
         super().connection_made(transport)
         self._since = self.loop.time()
         self._schedule_check()
 
     def data_received(self, data: bytes) -> None:
-        """Restart the timeout at each part of a request body, and at the end of a request head."""
+        """Process received data; restart the timeout at the end of a request head and at each part of a body."""
         state_before = self.conn.their_state
         super().data_received(data)
         if self.conn.their_state is not state_before or state_before is h11.SEND_BODY:
             self._since = self.loop.time()
 
     def on_response_complete(self) -> None:
-        """Restart the timeout for the next request head."""
+        """Complete a response, and restart the timeout for the next request head."""
         super().on_response_complete()
         self._since = self.loop.time()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the timeout."""
+        """Cancel the timeout of a closed connection."""
         if self._next is not None:
             self._next.cancel()
         super().connection_lost(exc)
@@ -336,14 +345,14 @@ class TimedConnection(H11Protocol):
         self._next = self.loop.call_later(CLIENT_TIMEOUT_S / 2, self._check_timeout)
 
     def _check_timeout(self) -> None:
-        """Abort the connection if the client sends nothing or does not read its answer."""
+        """Abort the connection if the client neither sent data nor read its response within the timeout."""
         unread, size_before = self.transport.get_write_buffer_size(), self._unread
         self._unread = unread
         if unread < size_before or (unread and not size_before):
             self._since = self.loop.time()
         owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
         if owes and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
-            # Not closed: that would wait for what was sent to be read.
+            # close() would wait until the client reads the remaining data.
             self.transport.abort()
         else:
             self._schedule_check()

@@ -1,11 +1,14 @@
-"""Worker process that opens a file or fits a model, separate from the server.
+"""Worker process of the web app, which opens a file or fits a model.
 
-Neither damaged files nor long fits can affect the server.
+A separate process protects the server from damaged files and long fits. `ftlm.utils.resources.python_child` runs this
+file by its path.
 
-`ftlm.utils.resources.python_child` runs this file by its path. The first line of standard input is the task, a JSON
-object with absolute paths: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …,
-"model": …, "report": …}``. The process ends when standard input ends. Standard output has one JSON object per line:
-``{"phase": words}``, ``{"done": …, "total": …}`` and finally ``{"answer": …}`` or ``{"error": words}``.
+The first line of standard input is the task, a JSON object with absolute paths: ``{"do": "open", "file": …,
+"options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …, "report": …}``. The process exits
+when standard input ends.
+
+Standard output has one JSON object per line: progress reports ``{"phase": words}`` and ``{"done": …, "total": …}``,
+and finally ``{"answer": …}`` or ``{"error": words}``.
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ from ftlm.io.binary_reader import limit_resources
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.progress import Progress
 
-#: Memory limit of the process [bytes], and time between two progress reports.
+#: Memory limit of the process [bytes], and minimum time between two progress reports.
 MEMORY_LIMIT = 6 << 30
 REPORT_INTERVAL_S = 0.1
-#: Columns of a file that the page shows.
+#: Maximum number of columns of a file in its preview.
 MAX_SHOWN_COLUMNS = 200
 
 
 class Reports(Progress):
-    """Writer of progress reports to standard output, one line each; it is thread-safe."""
+    """Thread-safe progress callback that writes each report as one line of JSON to a stream."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__("", quiet=True)
@@ -42,18 +45,18 @@ class Reports(Progress):
         self._last = 0.0
 
     def send(self, **facts: Any) -> None:
-        """Write one line of JSON."""
+        """Write the keyword arguments as one line of JSON."""
         line = json.dumps(facts, allow_nan=False)
         with self._turn:
             self._stream.write(line + "\n")
             self._stream.flush()
 
     def phase(self, words: str) -> None:
-        """Report the start of the next phase."""
+        """Report the start of the phase that `words` describes."""
         self.send(phase=words)
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Report progress at most once per interval."""
+        """Report completed and total parts, at most once per `REPORT_INTERVAL_S` except at the end."""
         now = time.monotonic()
         if now - self._last >= REPORT_INTERVAL_S or count >= total:
             self._last = now
@@ -61,8 +64,8 @@ class Reports(Progress):
 
 
 def main() -> None:
-    """Run the task that is read from standard input."""
-    # Output of libraries must not mix with the answers.
+    """Read the task from standard input, run it, and write its answer or error message."""
+    # Standard output is redirected, so that output of libraries does not mix with the messages.
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     reports = Reports(stream)
@@ -74,7 +77,7 @@ def main() -> None:
     except FtlmError as error:
         reports.send(error=str(error))
     except MemoryError:
-        reports.send(error="it needs more memory than there is; take a shorter file, or a coarser step")
+        reports.send(error="the task needs more memory than is available; use a shorter file, or a larger step")
     except Exception as error:
         reports.send(error=f"a fault in ftlm itself ({type(error).__name__}: {error}); please report it")
     else:
@@ -82,13 +85,13 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when standard input ends, which it does when the parent process ends."""
+    """Exit the process when standard input ends, as it does when the parent process exits."""
     sys.stdin.read()
     os._exit(1)
 
 
 def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the preview of a file for the page."""
+    """Open a file, and return its description for the page as values that JSON can represent."""
     opened = open_file(task["file"], **task["options"])
     description = opened.to_dict()
     return {
@@ -112,16 +115,16 @@ def _signals(opened: OpenedFile) -> tuple[list[str], list[str]]:
 
 
 def _run_preview(opened: OpenedFile) -> dict[str, Any]:
-    """Return charts and advice of a file's run."""
+    """Return charts, advice and number of samples of the run in a file; empty if the file cannot be loaded."""
     if opened.problem:
         return {"figures": [], "advice": [], "length": 0}
-    # The file is read again with all options fixed, so that the fit uses the rows of the preview.
+    # The file is read again with all options given, as the fit reads it, so that both have the same samples.
     run = opened.load()
     return {"figures": run_figures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
 
 
 def make_model(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
-    """Fit a model, write its files, and return a summary for the page."""
+    """Fit a model, write the model file and the report, and return the description for the page."""
     fitted_model = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
     reports.phase("writing the report")
     fitted_model.result.model.save(task["model"])

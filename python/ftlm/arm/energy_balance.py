@@ -192,9 +192,7 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
     A motion before the first sample would act as an impulse at the first sample.
     """
     moves = np.diff(angle)
-    way_out = (
-        "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
-    )
+    way_out = "energies need runs that start at rest with angle 0; cut the run where it rests, and subtract that angle"
     if abs(angle[0]) > REST_ANGLE_FRACTION * np.max(np.abs(angle)):
         raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {way_out}")
     if abs(moves[0]) > max(REST_INCREMENT_FRACTION * np.max(np.abs(moves)), REST_INCREMENT_RATIO * abs(moves[1])):

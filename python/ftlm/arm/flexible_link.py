@@ -366,7 +366,7 @@ def flexible_link(
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
-            f"{parameter('hub', False)} drives the deflection by the measured hub: use "
+            f"{parameter('hub', False)} makes the measured hub angle an input of the deflection; use "
             f"{parameter('form', 'lagrange')} and {parameter('coupling', 'measured')}, without "
             f"{parameter('friction', True)}"
         )

@@ -42,11 +42,11 @@ Method
 m
     Block pulses per run; default 2048, or as many as fit.
 threads
-    Threads; default FTLM_THREADS, or all cores.
+    Number of threads; default FTLM_THREADS, or all cores.
 bounds : NAME=LOW:HIGH
     Bounds of a parameter; inf for an open side.
 loss
-    Loss of residuals; huber resists outliers; default squares.
+    Loss function; huber is robust to outliers; default squares.
 
 Output
 ------

@@ -1,4 +1,4 @@
-"""Commands for data: open, inspect."""
+"""Commands for data files: open and inspect."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def open_(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Preview a file: columns, units, roles, step, assumptions with contrary evidence, next command.
+    """Preview a file: print columns, units, roles, step, assumptions with contrary evidence, and the next command.
 
     Arguments
     ---------
@@ -44,7 +44,7 @@ def inspect(
     reading: ReadingOptions,
     as_json: bool = False,
 ) -> None:
-    """Print ranges, noise, quantization and rest of runs, and advice before identification."""
+    """Print range, noise, quantization and initial rest of the signals of runs, and advice before identification."""
     inspected = [(run.inspect(), run.advice()) for run in reading.runs(files)]
     if as_json:
         data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]

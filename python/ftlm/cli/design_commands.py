@@ -1,4 +1,4 @@
-"""Commands for designs: controllers, input shapers, optimal inputs."""
+"""Commands control, input-shaper and design-input."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ftlm.progress import Progress
 from ftlm.utils.files import write_atomically
 from ftlm.utils.parameters import parameter
 
-#: Options of one design only.
+#: Options that only the PID design uses, and options that only the LQG design uses.
 PID_OPTIONS = ("crossover", "phase_margin")
 LQG_OPTIONS = ("max_deviation", "max_input", "process_noise", "noise", "measured", "band", "poles")
 
@@ -66,7 +66,7 @@ def control(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Design a controller on a model: margins, their ranges over the model's uncertainty, controller file.
+    """Design a controller for a model, and print its margins with their ranges over the uncertainty of the model.
 
     Options
     -------
@@ -75,7 +75,7 @@ def control(
     input : NAME
         Input of the loop, if the model has several.
     output : OUTPUT
-        Output that follows; with --path also a sum such as a+b.
+        Controlled output; with --path also a sum such as a+b.
     crossover
         PID: gain crossover frequency [rad/s].
     phase_margin
@@ -85,7 +85,7 @@ def control(
     max_input
         LQG: acceptable input, in its unit.
     process_noise
-        LQG: drift of the unknown input per second; default max-input/5.
+        LQG: change of the input disturbance in 1 s; default max-input/5.
     measured : OUTPUT
         LQG: measured output; default all.
     band : LOW:HIGH
@@ -117,7 +117,7 @@ def control(
         raise ModelError(f"{text}: used with --design {other}, not with {design}; leave it out, or change --design")
     loaded = load_model(model)
     most = np.inf if limit is None else limit
-    # A sum moves along the path; the loop itself has one output.
+    # The path may apply to a sum of outputs, but the loop controls a single output.
     followed = output
     if path is not None and output is not None and "+" in output:
         followed = output.partition("+")[0].strip() if design == "pid" else None
@@ -197,7 +197,7 @@ def input_shaper(
     modes
         Number of modes, the least damped first.
     coupling
-        Poles of the equations together, or of each alone.
+        Poles of the coupled equations, or of each equation alone.
     rate
         Sampling rate of the reference [Hz].
     out : FILE
@@ -216,7 +216,7 @@ def input_shaper(
 
 
 def _write_trajectory(planned: designs.Trajectory, rate: float, path: str, *, force: bool) -> None:
-    """Write a trajectory as csv rows."""
+    """Write a trajectory as a csv file with the columns time [s], reference, command, path, and the outputs."""
     time = np.arange(len(planned.path)) / rate
     rows = np.column_stack([time, planned.reference, planned.command, planned.path, *planned.outputs.values()])
     _write_table(rows, ("time_s", "reference", "command", "path", *planned.outputs), path, force=force)
@@ -249,7 +249,7 @@ def design_input(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Design the input that determines the parameters best within the limits of the machine.
+    """Design the input that minimizes the confidence intervals of the parameters within the limits of the machine.
 
     Options
     -------
@@ -305,7 +305,10 @@ def design_input(
 
 
 def _sizes(option: str, texts: list[str] | None) -> float | dict[str, float] | None:
-    """Return one number for all inputs, or numbers by name, from the texts of an option; None without texts."""
+    """Parse the values of an option: one number for all inputs, or numbers by input name; None without values.
+
+    Raise ModelError for other text.
+    """
     if texts and len(texts) == 1 and "=" not in texts[0]:
         try:
             return float(texts[0])

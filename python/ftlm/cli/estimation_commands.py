@@ -63,14 +63,16 @@ from ftlm.utils.validation import check_threads
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
 
 
-#: Range of a selection's duration relative to one fit per structure: from a list, and stepwise.
+#: Lowest and highest duration of a structure selection, divided by that of one fit per given structure. The first pair
+#: is for a list of structures, the second for a stepwise selection.
 LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
 
 
 def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure | None:
-    """Return the first structure, or None for ``auto``; raise ModelError for structures that no run can make valid.
+    """Return the first of the given structures, or None for ``auto``, before any run is read.
 
-    ``auto`` must be the only one, and can be combined with --delay and --only.
+    Raise ModelError for a structure that is invalid for every run. ``auto`` must be the only structure; of the options
+    of a structure, only --delay and --only can be combined with it.
     """
     if "auto" not in texts:
         parsed = [shape.structure(text) for text in texts]
@@ -96,9 +98,10 @@ def select_structure(
     store: str | None = None,
     quiet: bool,
 ) -> Selection:
-    """Return the selection of a structure, with a progress bar.
+    """Select a structure with a progress bar, and return the selection.
 
-    ``"auto"`` uses the delays and the output of the options.
+    `shape` is used for ``"auto"`` only: its delays, and its output if it names one. `driven_by` has texts
+    of the form OUTPUT=SIGNAL,…
     """
     automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
     drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
@@ -120,14 +123,14 @@ def select_structure(
             delay=ranges("--delay", shape.delay) if automatic else None,
             driven_by=drivers or None,
             threads=threads,
-            # The number of candidates depends on which terms improve the prediction.
+            # The number of candidates of a stepwise selection is not known in advance.
             progress=progress if listed else progress.so_far,
             store=store,
         )
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
-    """Return the expected time [s] of output-error fits of all parameters; each run belongs to one of the fits."""
+    """Return the expected total time [s] of `fits` output-error fits of all parameters, which share the runs."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
@@ -136,7 +139,10 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
 def validation_runs(
     reading: ReadingOptions, file: str | None, window: str | None, equation: Structure | None
 ) -> list[Run]:
-    """Return the validation run in a list, or [] without one; --validation-window applies to it, not --window."""
+    """Return a list with the validation run, or [] if `file` is None.
+
+    `window` is the value of --validation-window, which replaces --window. Raise ModelError for a window without a file.
+    """
     if file is None:
         if window is not None:
             raise ModelError("--validation-window is a part of the run that --validation names; name its file, too")
@@ -146,7 +152,7 @@ def validation_runs(
     try:
         return replace(reading, window=window).runs([file], equation)
     except DataError as error:
-        # The reader of a file knows its window by the option of the estimation runs.
+        # The file reader names the option --window in its messages, but here the window comes from another option.
         raise DataError(str(error).replace(f"{parameter('window')}:", "--validation-window:")) from None
 
 
@@ -174,7 +180,7 @@ def identify(
     verbose: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Identify a model: verdict, equations, parameters, gain and modes, fit, warnings.
+    """Identify a model, and print its verdict, equations, parameters, gains, modes, fit and warnings.
 
     Structure
     ---------
@@ -258,7 +264,7 @@ def search(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Search the orders of each equation, or of a joint under an order law, and count every outcome.
+    """Search the orders of each equation, or of a joint under an order law, and print the best candidates.
 
     Method
     ------
@@ -334,18 +340,18 @@ def certify(
     threads: int | None = None,
     as_json: bool = False,
 ) -> None:
-    """Prove a lower bound of the squared equation error of each equation at rest, over all orders in intervals.
+    """Prove a lower bound of the squared equation error of each equation over all orders in given intervals.
 
     Method
     ------
     order_grid : NAME=LOW:HIGH:STEP
-        Interval of an order; alpha: every alpha.
+        Interval of an order; alpha stands for every alpha.
     tolerance
-        How much smaller other errors may be, as a fraction.
+        Fraction by which errors at other orders may be smaller.
     min_separation
         Minimum distance of orders; default the increment.
     max_term_ratio
-        Maximum RMS of an equation's terms per RMS of its output.
+        Maximum RMS of all terms together per RMS of the output.
     max_cells
         Maximum number of boxes of orders.
     """
@@ -373,7 +379,7 @@ def certify(
 
 
 def check_order_names(grid: OrderGrid, structure: Structure) -> None:
-    """Raise ModelError for an order of the grid that is not free in any equation."""
+    """Raise ModelError if the grid names an order that is neither ``alpha`` nor a free order of the structure."""
     for name in grid.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
@@ -381,12 +387,12 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
 
 
 def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
-    """Return the part of an order grid that applies to one structure."""
+    """Return the order grid restricted to ``alpha`` and the free orders of the structure `part`."""
     return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in part.order_names})
 
 
 def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print results by output as text or JSON."""
+    """Print results, by the name of the output or search, as text or JSON."""
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
@@ -395,7 +401,10 @@ def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
-    """On Ctrl-C within the block, print how to resume from the checkpoint file, if there is one."""
+    """Context manager that prints on Ctrl-C how to resume from the checkpoint file `path`.
+
+    `how` is the command to print; by default ``ftlm resume PATH``. Without a checkpoint file, Ctrl-C is not handled.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -406,7 +415,7 @@ def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
 
 
 def show_notes(store: Store) -> None:
-    """Print the repairs of a checkpoint file."""
+    """Print the notes on a checkpoint file, such as repairs of a damaged file, to standard error."""
     for note in store.notes:
         print(f"ftlm: {store.path}: {note}", file=sys.stderr)
 
@@ -456,7 +465,7 @@ def status(
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """Options for reading frequency responses; None for an option that is not given.
+    """Options for reading frequency responses; the value None marks an option that is not given.
 
     File
     ----
@@ -469,7 +478,7 @@ class ResponseOptions:
     phase_unit
         Unit of phases; default the file's, or deg.
     negated
-        Whether the imaginary column holds -Z''; default by its name.
+        Whether the imaginary column is -Z''; default by its name.
     output : NAME
         Output of the response.
     input : NAME
@@ -491,7 +500,7 @@ class ResponseOptions:
     sheet: str | None = None
 
     def load(self, file: str) -> FrequencyData:
-        """Return the frequency response in a file."""
+        """Read the frequency response in a file with these options."""
         layout = layout_options(self)
         options = {name: value for name, value in given_fields(self).items() if name not in layout}
         columns: dict[str, Any] | None = pairs("--columns", options.pop("columns", None)) or None
@@ -529,7 +538,7 @@ def identify_frequency(
     structure : EQUATION|CIRCUIT
         Equation 'D y = a y + b u', or circuit 'R0-p(R1,CPE1)'.
     orders : NAME=VALUE
-        Fix an order, or give LOW:HIGH:STEP.
+        Fix an order, or give its grid LOW:HIGH:STEP.
 
     Method
     ------
@@ -651,7 +660,7 @@ def consistency(
     Method
     ------
     segments
-        Segments of one run; several runs are segments; default 2.
+        Number of segments of one run; default 2.
     """
     runs = reading.runs(files, shape.structure(structure))
     target = shape.structure_for_runs(structure, runs)

@@ -1,4 +1,4 @@
-"""Framework of the command line: commands from functions, help in panels, option values, errors and exit codes."""
+"""Framework of the command line: commands from functions, help texts, option values, errors and exit codes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ftlm.utils.validation import join_names, nearest
 
 
 def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
-    """Return {NAME: VALUE} from NAME=VALUE options; NAME alone means NAME=NAME. Raise ModelError for other text."""
+    """Parse NAME=VALUE options into a dictionary; NAME alone means NAME=NAME. Raise ModelError for other text."""
     values: dict[str, str] = {}
     for item in texts or []:
         name, equals, value = item.partition("=")
@@ -47,7 +47,7 @@ def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
 
 
 def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
-    """Return {NAME: number} from NAME=NUMBER options; raise ModelError for other text."""
+    """Parse NAME=NUMBER options into a dictionary; raise ModelError for other text."""
     values = {}
     for name, value in pairs(option, texts).items():
         try:
@@ -58,7 +58,10 @@ def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
 
 
 def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """Return numbers, or (low, high) bounds of estimates, by input, from INPUT=NUMBER or INPUT=LOW:HIGH options."""
+    """Parse NAME=NUMBER or NAME=LOW:HIGH options into a dictionary of numbers or (low, high) tuples.
+
+    Raise ModelError for other text.
+    """
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, texts).items():
@@ -72,7 +75,10 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
 
 
 def interval(text: str, option: str, example: str) -> tuple[float | None, float | None]:
-    """Return (from, to) from FROM:TO, with None for an empty end; raise ModelError for other text."""
+    """Parse FROM:TO into two numbers, with None for an empty end; raise ModelError for other text.
+
+    `option` and `example` are named in the message.
+    """
     parts = text.split(":")
     try:
         if len(parts) != 2:
@@ -84,7 +90,7 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
 
 
 def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
-    """Return numbers that are joined by colons; raise ModelError unless their count is one of `counts`."""
+    """Parse numbers that are separated by colons; raise ModelError unless their count is one of `counts`."""
     values = split_numbers(text)
     if len(values) not in counts:
         choices = " or ".join(str(c) for c in counts)
@@ -93,37 +99,38 @@ def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
 
 
 def split_numbers(text: str) -> list[float]:
-    """Return numbers that are joined by colons; [] if one is invalid."""
+    """Parse numbers that are separated by colons; return [] if one of them is invalid."""
     try:
         return [float(part) for part in text.split(":")]
     except ValueError:
         return []
 
 
-#: Options of other programs, or argument names, with the options that are meant.
+#: Options that do not exist, with the correct option that an error message suggests.
 OPTION_ALIASES = {"--equation": "--structure", "--circuit": "--structure"}
-#: Gaps between cells from which a line counts as a table row, and patterns of gaps and list entries.
+#: Minimum number of gaps of two or more spaces in a line that is treated as a table row. Patterns of such a gap, and of
+#: the beginning of a list entry.
 MIN_TABLE_GAPS, _GAP_PATTERN, _ENTRY_PATTERN = (
     3,
     re.compile(" {2,}"),
     re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )"),
 )
-#: Message of the parser of options for a word that is no choice of an option.
+#: Message of typer's option parser for a value that is not among the choices of an option.
 _CHOICE_PATTERN = re.compile(r".*?'([^']*)' is not one of (.*)\.")
-#: Type names in help texts.
+#: Names of types in help texts.
 TYPE_LABELS = {str: "TEXT", float: "NUMBER", int: "N"}
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
-#: Options whose value is the method that a command uses, and flag for the options of all methods.
+#: Options that select the estimation method of a command, and the flag that shows the help of all methods.
 METHOD_FLAGS, HELP_ALL_FLAG = ("--method", "--coefficients"), "--help-all"
-#: Order of the panels in a help text; options of no panel come last.
+#: Panels of a help text in their sequence. Options without a panel follow in the panel OTHER_PANEL.
 OPTION_PANELS = ("File", "Structure", "Method", "Output")
 OTHER_PANEL = "Options"
 
 
 def _number_message(details: Mapping[str, Any]) -> str:
-    """Return the message on a value of an option that is not a number, or out of its range."""
+    """Return the message for an option value that is not a number or is out of range; `details` has its value."""
     value, kind = details["input"], details["type"]
     if kind not in ("float_parsing", "int_parsing"):
         return f"{value!r} is out of range: {details['msg'].removeprefix('Input ')}."
@@ -133,15 +140,15 @@ def _number_message(details: Mapping[str, Any]) -> str:
 
 
 class Command(TyperCommand):
-    """Command with help in panels, which suggests correct options and choices."""
+    """Command whose help is grouped in panels, and whose errors suggest the correct option or choice."""
 
     @property
     def methods_by_field(self) -> dict[str, tuple[str, ...]]:
-        """Names of the methods that use an option, by option; options that are not listed apply to all methods."""
+        """Names of the methods that use an option, by option name; options without an entry apply to all methods."""
         return getattr(self.callback, "methods_by_field", {})
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse options; an alias raises an error that names the correct option."""
+        """Parse the command line; errors name the correct option or the valid choices."""
         names = {name for parameter in self.params for name in parameter.opts}
         for option_name in (a.partition("=")[0] for a in args):
             if option_name not in names and OPTION_ALIASES.get(option_name) in names:
@@ -165,7 +172,7 @@ class Command(TyperCommand):
             raise
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:
-        """Return the method that a command line selects, or the default one; None if the command has no methods."""
+        """Return the method that the arguments select, or the default method; None if the command has no methods."""
         option: Any = next((p for p in self.params if not set(METHOD_FLAGS).isdisjoint(p.opts)), None)
         if option is None:
             return None
@@ -177,7 +184,10 @@ class Command(TyperCommand):
         return str(choice)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options by panel; options of other methods than the selected one are omitted."""
+        """Write the help of arguments and options, grouped by panel.
+
+        Options that the selected method does not use are omitted, except with --help-all.
+        """
         method = ctx.meta.get("method")
         panels: dict[str, list[tuple[str, str]]] = {
             "Arguments": [],
@@ -191,7 +201,7 @@ class Command(TyperCommand):
             if methods is not None and method is not None and method not in methods:
                 is_method_section = True
             elif record is not None and shown_parameter.param_type_name == "argument":
-                # Versions of typer write different types behind the name.
+                # Some versions of typer add a type after the name, so the name is used alone.
                 panels["Arguments"].append((shown_parameter.metavar, record[1]))
             elif record is not None:
                 panels[getattr(shown_parameter, "rich_help_panel", None) or OTHER_PANEL].append(record)
@@ -205,20 +215,20 @@ class Command(TyperCommand):
 
 @dataclass(frozen=True)
 class OptionDetails:
-    """Details of an option that its name, type and default do not determine, as an annotation of its type.
+    """Annotation of an option with details that its name, type and default do not define.
 
     Parameters
     ----------
     flags
-        Flags; by default those of `OPTION_FLAGS`, or the name.
+        Flags, such as ("-o", "--out"). By default they are those of `OPTION_FLAGS`, or "--" and the name.
     min
-        Minimum of an integer.
+        Minimum value of an integer.
     is_output
-        Whether the option is a file to write. A path that cannot be written is rejected before the computation.
+        Whether the value is a file to write. A path that cannot be written is rejected before the computation.
     ending
-        Extension that the file must have; any if empty.
+        Required file extension; any extension if empty.
     help_entry
-        Name of the option's entry in the shared help; by default the name of the option.
+        Name of the entry in the shared help texts; by default the name of the option.
     """
 
     flags: tuple[str, ...] = ()
@@ -236,7 +246,7 @@ OptionalOutputCsv = Annotated[str | None, OptionDetails(is_output=True, ending="
 OptionalOutputJson = Annotated[str | None, OptionDetails(is_output=True, ending=".json")]
 NonNegative = Annotated[int, OptionDetails(min=0)]
 Positive = Annotated[int, OptionDetails(min=1)]
-#: Flags of options whose flag is not their name alone.
+#: Flags of options that have other flags than "--" and their name.
 OPTION_FLAGS = {
     "as_json": ("--json",),
     "structures": ("--structure",),
@@ -249,7 +259,7 @@ OPTION_FLAGS = {
 
 @dataclass(frozen=True)
 class OptionText:
-    """Help of an option: its panel, a word for the type of its value, and the text."""
+    """Help of an option: name of its panel, name of its value (metavar), and text."""
 
     panel: str | None
     metavar: str | None
@@ -257,10 +267,10 @@ class OptionText:
 
 
 def parse_option_texts(docstring: str | None) -> tuple[str, dict[str, OptionText]]:
-    """Return the text of a docstring before its first section, and the help of the options in its sections.
+    """Return the summary of a docstring, and the help of each option in its sections by option name.
 
-    Each section is a panel of the help. Its entries have the form of numpydoc, with a word for the type of the value
-    after a colon. Options in the section ``Options`` have no panel.
+    The summary is the text before the first section. Each section is a panel of the help, and its entries have the
+    form of numpydoc: option name, colon and metavar, then the text. Options in the section ``Options`` have no panel.
     """
     summary, *parts = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
     texts = {}
@@ -270,18 +280,20 @@ def parse_option_texts(docstring: str | None) -> tuple[str, dict[str, OptionText
     return summary.strip(), texts
 
 
-#: Help of the options that commands share.
+#: Help of options that several commands share, by option name.
 SHARED_TEXTS = parse_option_texts(cli.__doc__)[1]
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that is made from a function.
+    """Decorator that turns a function into a command for typer.
 
-    Positional parameters become arguments, and keyword-only ones become options. Their help is in the docstring of the
-    function, or in that of ``ftlm.cli`` for options that commands share. A dataclass parameter is expanded: each field
-    becomes an option, and the function receives the dataclass. Its `methods_of`, if any, returns the methods that use
-    an option. Errors become one line on standard error and an exit code. Existing files of type `OutputFile` raise an
-    error unless `force` is set.
+    Positional parameters become arguments, and keyword-only parameters become options. Their help texts are in the
+    docstring of the function. Options that several commands share have their help in the docstring of ``ftlm.cli``. A
+    dataclass parameter is expanded: each field becomes an option, and the function receives the dataclass. If the
+    dataclass has a function `methods_of`, it returns the methods that use an option.
+
+    An error becomes one line on standard error and an exit code. An output file that already exists is an error unless
+    `force` is set.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
@@ -322,25 +334,25 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             print("ftlm: interrupted; nothing was written", file=sys.stderr)
             raise typer.Exit(EXIT_INTERRUPTED) from None
         except BrokenPipeError:
-            # The reader of a pipe closed it, such as head: that is no error.
+            # A program such as head closed the pipe before reading all of it, which is not an error.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except FtlmError as error:
             print(f"ftlm: {error}", file=sys.stderr)
             raise typer.Exit(exit_code(error)) from None
         except OSError as error:
-            # An error of standard output or of the working folder; errors of files were turned into messages before.
+            # This is an error of standard output or of the working folder; errors of files are FtlmError.
             what = "" if error.filename is None else f" {error.filename!r}"
             print(
-                f"ftlm: the system refuses{what}: {error.strerror or error}; what was written to files is there, check "
-                "where the output goes and the working folder",
+                f"ftlm: the system refuses{what}: {error.strerror or error}; files that were written are complete; "
+                "check the destination of standard output and the working folder",
                 file=sys.stderr,
             )
             with contextlib.suppress(OSError, ValueError, AttributeError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(EXIT_DATA) from None
 
-    # typer reads these attributes.
+    # typer reads the options and the help from these attributes.
     run.__doc__ = summary
     run.__annotations__ = {option.name: option.annotation for option in options}
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
@@ -351,7 +363,10 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
 def _option(
     name: str, hint: Any, default: Any, texts: Mapping[str, OptionText], *, positional: bool = False
 ) -> inspect.Parameter:
-    """Return a parameter in the form that typer reads, from its name, type, default and help."""
+    """Return a parameter of a command with the annotation that typer requires.
+
+    `texts` has the help texts of the command by option name; shared help texts are the fallback.
+    """
     kind, details = get_args(hint) if get_origin(hint) is Annotated else (hint, OptionDetails())
     text = texts.get(name) or SHARED_TEXTS.get(details.help_entry or name) or OptionText(None, None, "")
     metavar = text.metavar or ("FILE" if details.is_output else _type_label(kind))
@@ -359,7 +374,7 @@ def _option(
     if positional:
         described = typer.Argument(metavar=metavar, help=text.help)
     else:
-        # A switch that is on by default has two flags, which typer makes.
+        # For a switch that is on by default, typer creates the two flags --name and --no-name.
         flags = details.flags or OPTION_FLAGS.get(name) or (() if default is True else (f"--{name.replace('_', '-')}",))
         described = typer.Option(*flags, metavar=metavar, rich_help_panel=text.panel, help=text.help, min=details.min)
     described.is_output, described.ending = details.is_output, details.ending
@@ -369,16 +384,16 @@ def _option(
 
 
 def _type_label(kind: Any) -> str | None:
-    """Return the type of an option's value in plain words; None for a switch without a value."""
+    """Return the name of the type of an option's value for help texts; None for a switch without a value."""
     if get_origin(kind) is Literal:
         return f"<{'|'.join(get_args(kind))}>"
-    # An optional value or a list has the label of its value.
+    # An optional type or a list has the name of its element type.
     parts = get_args(kind)
     return _type_label(parts[0]) if parts else TYPE_LABELS.get(kind)
 
 
 def exit_code(error: FtlmError) -> int:
-    """Return the exit code of an error: 1 internal, 2 usage, 3 data, 5 rig."""
+    """Return the exit code of an error: 1 internal error, 2 usage, 3 data or convergence, 5 rig."""
     if isinstance(error, InternalError):
         return EXIT_INTERNAL
     if isinstance(error, ModelError):
@@ -387,7 +402,7 @@ def exit_code(error: FtlmError) -> int:
 
 
 def show(result: Any, *, as_json: bool) -> None:
-    """Print a result as text or JSON."""
+    """Print a result as text, or as JSON by its method ``to_dict``."""
     if as_json:
         show_json(result.to_dict())
     else:
@@ -405,36 +420,39 @@ def print_text(text: str, end: str = "\n") -> None:
 
 
 def broken_line(line: str) -> list[str]:
-    """Return a line wrapped to the width of the terminal."""
+    """Return a line of text wrapped to the width of the terminal, as a list of lines.
+
+    Table rows, and lines that begin with "next: ", are not wrapped.
+    """
     lead = line[: len(line) - len(line.lstrip())]
     if len(line) <= columns() or line.startswith("next: ") or len(_GAP_PATTERN.findall(line.strip())) >= MIN_TABLE_GAPS:
         return [line]
-    # An entry such as "  mode  of so much": what follows stands under its words.
+    # Further lines of a list entry are indented to the column where the text of the entry begins.
     entry = _ENTRY_PATTERN.match(line)
     return wrap_text(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
 
 
 def show_json(document: Any) -> None:
-    """Print a document of Python and NumPy values as JSON."""
+    """Print a document of Python and NumPy values as indented JSON."""
     print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_to_json_value))
 
 
 def print_outcome(sentence: str, *, as_json: bool, **facts: Any) -> None:
-    """Print an outcome as a sentence, or its facts as one line of JSON."""
+    """Print the outcome of a command as a sentence, or its data `facts` as one line of JSON."""
     print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
 
 
 def _to_json_value(value: Any) -> Any:
-    """Return NumPy scalars and arrays as values for JSON."""
+    """Return a NumPy scalar or array as a Python number or list; return other objects as text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-#: File extensions of figures.
+#: File extensions for figures, without the dot.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 
 
 def figure_kind(path: str | None) -> str:
-    """Return the format of a figure from its file extension; "" for None."""
+    """Return the format of a figure file from its extension; "" for None. Raise ModelError for other extensions."""
     kind = "" if path is None else Path(path).suffix.removeprefix(".").lower()
     if path is not None and kind not in FIGURE_FORMATS:
         raise ModelError(f"{path} ends in {kind or 'nothing'!r}; write .png, .pdf or .svg")
@@ -442,53 +460,54 @@ def figure_kind(path: str | None) -> str:
 
 
 def write_figure(figure: Any, path: str, *, force: bool) -> None:
-    """Write a matplotlib figure to a file, in the format of its extension."""
+    """Write a matplotlib figure to a file at 200 dpi, in the format of the file extension."""
     data = io.BytesIO()
     figure.savefig(data, format=figure_kind(path), dpi=200)
     write_atomically(path, data.getvalue(), force=force)
 
 
 def say_written(*paths: str | None) -> None:
-    """Print the paths of written files; None is ignored."""
+    """Print one line for each written file; None is ignored."""
     for path in paths:
         if path is not None:
             print(f"written: {path}")
 
 
-#: Time to read a byte and to simulate a sample of an output on the reference machine [s], and range of the actual
-#: durations. Numbers with few digits need more time per byte, and oscillating simulations are refined.
+#: Time to read one byte of a file, and to simulate one sample of an output, on the reference machine [s]. Lowest and
+#: highest ratio of the actual to the estimated duration: numbers with few digits take more time per byte, and
+#: oscillating simulations use a smaller step.
 READ_TIME_PER_BYTE_S, SIMULATION_TIME_PER_SAMPLE_S, DURATION_FACTORS = 8e-8, 4e-6, (0.4, 4.0)
 MIN_ANNOUNCED_TIME_S = 0.2
-#: Time of a controller design, and of the loop analysis for one sample of the parameters [s].
+#: Time of a controller design, and of the loop analysis for one parameter sample, on the reference machine [s].
 DESIGN_TIME_S, LOOP_ANALYSIS_TIME_S = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
 
 
 def announce_reading(files: Sequence[str]) -> None:
-    """Print the expected duration of reading files if it is long."""
+    """Print the expected duration of reading files if it is long. A missing file is not reported here."""
     size = 0
     for file in files:
         try:
             size += os.stat(file).st_size
         except (OSError, ValueError):
-            # The reader of the file reports it.
+            # The file reader raises the error later, with a message.
             return
     _announce("reading", READ_TIME_PER_BYTE_S * size)
 
 
 def announce_simulation(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
-    """Print the expected duration of simulating a model on runs if it is long."""
+    """Print the expected duration of simulating `outputs` outputs of a model on runs if it is long."""
     samples = outputs * sum(run.length for run in runs)
     _announce("running the model", SIMULATION_TIME_PER_SAMPLE_S * samples, quiet=quiet)
 
 
 def announce_design(design: str, samples: int) -> None:
-    """Print the expected duration of a design with a number of parameter samples if it is long."""
+    """Print the expected duration of a controller design checked on `samples` parameter samples if it is long."""
     _announce("designing", DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0))
 
 
 def _announce(what: str, seconds: float, *, quiet: bool = False) -> None:
-    """Print the expected duration of work that takes a time [s] on the reference machine if it is long."""
-    # The speed of this machine is measured once, which work below this time is not worth.
+    """Print the expected duration of `what` if it is long; `seconds` is its time on the reference machine."""
+    # The speed of this machine is measured only for long work, because the measurement itself takes time.
     if seconds > MIN_ANNOUNCED_TIME_S:
         bounds = duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS)
         Progress("", quiet=quiet).expect(what, *bounds)

@@ -1,4 +1,4 @@
-"""Program `ftlm` with its commands, in the sequence of the help."""
+"""Program `ftlm`: table of its commands, and entry point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ftlm import _core
 from ftlm.cli.framework import EXIT_INTERRUPTED, Command
 from ftlm.utils.formatting import escape_standard_streams
 
-#: Module of each command, and its short help in `ftlm -h`; the docstring of its function is its own help.
+#: (module, short help in `ftlm -h`) by command name. The full help of a command is the docstring of its function.
 COMMAND_HELP = {
     "demo": ("other", "Identify a simulated arm, and plot the results."),
     "app": ("other", "Identify models in a web browser."),
@@ -24,7 +24,7 @@ COMMAND_HELP = {
     "open": ("data", "Preview a data file, and suggest the next command."),
     "inspect": ("data", "Show ranges and noise of signals, and check a run."),
     "identify": ("estimation", "Identify a model from measured runs."),
-    "identify-frequency": ("estimation", "Identify one from frequency responses or impedances."),
+    "identify-frequency": ("estimation", "Identify a model from frequency responses or impedances."),
     "select": ("estimation", "Select the structure that predicts best."),
     "consistency": ("estimation", "Test whether segments of runs share one model."),
     "search": ("estimation", "Rank all orders of an order grid."),
@@ -50,10 +50,10 @@ class CommandTable(UserDict[str, Any]):
     """Mapping from command names to commands; the module of a command is imported on access."""
 
     def __getitem__(self, name: str) -> TyperCommand:
-        """Return the command with a name."""
+        """Import the module of the command `name`, and return the command."""
         module, short = super().__getitem__(name)
         commands = importlib.import_module(f"ftlm.cli.{module}_commands")
-        # `open` would hide a builtin function.
+        # The function of the command `open` is `open_`, because `open` would hide a builtin function.
         function = getattr(commands, name.replace("-", "_"), None) or getattr(commands, f"{name}_")
         own = typer.Typer(rich_markup_mode=None, add_completion=False, context_settings=CONTEXT_SETTINGS)
         own.command(name, cls=Command, short_help=short)(function)
@@ -69,7 +69,7 @@ class Program(TyperGroup):
         super().__init__(**{**attributes, "commands": CommandTable(COMMAND_HELP)})
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command of the arguments; ``help COMMAND`` is ``COMMAND --help``."""
+        """Return the command that the arguments name; ``help COMMAND`` is treated as ``COMMAND --help``."""
         if args and args[0] == "help":
             args = [*args[1:2], "--help"]
             if len(args) == 1:
@@ -83,7 +83,7 @@ class Program(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands without importing them."""
+        """Write the list of commands with their short help, without importing their modules."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, short) for name, (_, short) in COMMAND_HELP.items()])
 
@@ -114,7 +114,7 @@ def version(
 
 def main() -> None:
     """Run the program."""
-    # A stream may be closed, as by `>&-`. The next opened file must not get its descriptor.
+    # A standard stream may be closed, as by `>&-`. The next file that is opened must not get its descriptor.
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
@@ -125,6 +125,6 @@ def main() -> None:
     try:
         app()
     except KeyboardInterrupt:
-        # It came before a command or after one.
+        # Ctrl-C was pressed outside a command; commands handle it themselves.
         print("ftlm: interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)

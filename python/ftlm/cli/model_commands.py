@@ -1,4 +1,4 @@
-"""Commands for saved models: compare, resid, simulate, report, plot, export."""
+"""Commands for saved models: compare, resid, simulate, report, plot and export."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from ftlm.utils.files import write_atomically
 def _with_runs(
     model: str, reading: ReadingOptions, files: Sequence[str] | None, *, quiet: bool
 ) -> tuple[Model, list[Run]]:
-    """Return a saved model and the runs of files."""
+    """Load a saved model and the runs in files; print the expected duration of their simulation if it is long."""
     loaded = load_model(model)
     runs = reading.runs(files, loaded.structure)
     announce_simulation(runs, len(loaded.outputs), quiet=quiet)
@@ -58,13 +58,13 @@ def compare(
     Options
     -------
     min_fit
-        Exit with 4 if the simulation fits less [%].
+        Minimum fit; exit with code 4 if the fit is below it [%].
     """
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     comparison = loaded.compare(runs, m=m)
     show(comparison, as_json=as_json)
     if min_fit is not None:
-        # Negated so that a fit that is not a number is too low.
+        # The comparison is negated, so that a fit of NaN counts as too low.
         low = {name: fit for name, fit in comparison.fit.items() if not fit >= min_fit}
         if low:
             listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())

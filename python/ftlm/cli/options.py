@@ -1,4 +1,4 @@
-"""Option groups that commands share: single options, and dataclasses with the method that applies them."""
+"""Groups of command-line options that several commands share, as dataclasses with methods that apply them."""
 
 from __future__ import annotations
 
@@ -22,46 +22,46 @@ from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_i
 from ftlm.utils.parameters import flag_of, parameter
 from ftlm.utils.validation import nearest
 
-#: Options of the flexible link, in the order of messages.
+#: Options of the structure flexible-link, in their sequence in messages.
 LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction", "laws", "form", "input_order")
-#: Stages of the arm by the end of a structure's name.
+#: Joint of the arm, or both joints, by the part of a structure's name after the colon.
 STAGES_BY_NAME: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
-#: Structures that have names, and the word for a selected one.
+#: Names of structures, and "auto" for a structure selection.
 STRUCTURE_NAMES = ("auto", *(f"{name}:{part}" for name in ("flexible-link", "arm") for part in ("1", "2", "both")))
 
 
 class MethodOptions:
-    """Base class of options of estimation methods; None marks an option that is not given."""
+    """Base class of option groups of estimation methods; the value None marks an option that is not given."""
 
     @staticmethod
     def methods_of(option: str) -> tuple[str, ...]:
-        """Return the names of the methods that have an option."""
+        """Return the names of the estimation methods that use an option."""
         field_name = "order_grid" if option == "increment" else option
         return tuple(n for n, kind in METHODS_BY_NAME.items() if field_name in {f.name for f in fields(kind)})
 
 
 @dataclass(frozen=True)
 class StructureOptions:
-    """Options that modify a structure; None for an option that is not given.
+    """Options that modify a structure; the value None marks an option that is not given.
 
     Structure
     ---------
     only : OUTPUT
         Fit the equation of this output only; default all.
     coupling
-        Other outputs in an equation; default measured for a link.
+        Values of other outputs in an equation; default measured for a link.
     cross_stage
-        Terms of the other stage of the arm; default none.
+        Add terms of the other joint of the arm; default none.
     cross_sensitivity
-        Deflections also follow hub angles (gauge and cable).
+        Add hub angles to measured deflections (gauge and cable).
     cross_damping
-        With --cross-stage inertial: rate of the other deflection.
+        Add rate of other deflection, with --cross-stage inertial.
     friction
         Add Coulomb friction of the hubs.
     laws
-        Order law; velocities: also gamma = mu; default none.
+        Order law; velocities adds gamma = mu; default none.
     form
-        Equation of the deflection: (15) or (23); default lagrange.
+        Deflection by (15) or (23) of the paper; default lagrange.
     input_order
         Order of the current in the published form.
     sensor_filter : stock|HZ[:DAMPING]
@@ -71,9 +71,9 @@ class StructureOptions:
     orders : NAME=VALUE
         Fix an order.
     saturation : INPUT=LIMIT
-        Saturation limit of an input; LOW:HIGH is estimated.
+        Saturation limit of an input; LOW:HIGH estimates it.
     dead_zone : INPUT=LIMIT
-        Dead zone of an input; LOW:HIGH is estimated.
+        Dead zone of an input; LOW:HIGH estimates it.
     initial
         auto, rest, caputo, history, or exponents of t: 0,1.
     offset
@@ -100,7 +100,11 @@ class StructureOptions:
     offset: Offset | None = None
 
     def structure(self, text: str, *, alone: bool = False) -> Structure:
-        """Return the structure of `text` with the options applied; ``alone`` omits the other joint."""
+        """Return the structure of the option --structure, whose value is `text`, with all options applied.
+
+        `alone` restricts a structure of the arm to one link without signals of the other joint. Raise ModelError for an
+        invalid text, or options that do not apply to it.
+        """
         if text.startswith("flexible-link"):
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
@@ -134,7 +138,11 @@ class StructureOptions:
         return built.with_orders(numbers("--orders", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
     def structure_for_runs(self, text: str, runs: Sequence[Run]) -> Structure:
-        """Return the structure of `text` for runs: a single link if no run contains signals of the other joint."""
+        """Return the structure of `text` for runs.
+
+        A structure arm:1 or arm:2 is restricted to one link if no run has the angles of the other joint; a note is
+        printed on standard error.
+        """
         stage = re.fullmatch("arm:([12])", text)
         if stage is not None:
             other = f"theta{3 - int(stage[1])}"
@@ -145,12 +153,12 @@ class StructureOptions:
         return self.structure(text)
 
     def given_options(self) -> list[str]:
-        """Names of options whose values differ from the defaults."""
+        """Return the flags of the options whose values differ from the defaults."""
         usual = StructureOptions()
         return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
 
     def _check_equation(self, count: int) -> None:
-        """Raise ModelError for options of the flexible link that do not apply to an equation in words."""
+        """Raise ModelError for options of the flexible link, which do not apply to `count` equations given as text."""
         wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
@@ -165,7 +173,10 @@ class StructureOptions:
         return [flag_of(name) for name in names if getattr(self, name)]
 
     def _sensor(self) -> SensorFilter | None:
-        """Return the sensor filter of signals in an equation; None without one."""
+        """Return the sensor filter of the signals of --filtered-signals; None without these options.
+
+        Raise ModelError for an invalid filter, or a filter without signals.
+        """
         if not self.filtered_signals:
             if self.sensor_filter is not None:
                 raise ModelError(
@@ -183,14 +194,12 @@ class StructureOptions:
             ) from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
-        """Return the structure of the real arm's deflections, with all angles as inputs.
+        """Return the structure of the link deflections of the real arm, with all angles as inputs.
 
-        Orders are integer except that of the elasticity of the links.
-
-        For a single link the order of the damping is free instead, which improved the fit on validation runs
-        significantly. A strain gauge measures the deflection, and its zero is an offset of each run. Terms of nearly
-        integer order have hardly any memory, so runs start from the link's angle and velocity unless a history is
-        requested.
+        All orders are integer except the order of the elastic term. If `alone` is True, for one link with the other
+        joint locked, the order of the damping term is free instead. This improved the fit on validation runs. The
+        offset of each run is the zero of the strain gauge. The initial conditions are the angle and velocity of the
+        link by default, because terms of nearly integer order have little memory.
         """
         wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if wrong:
@@ -245,7 +254,7 @@ class StructureOptions:
 
 @dataclass(frozen=True)
 class OrderGridOptions(MethodOptions):
-    """Order grid of a search; None for an option that is not given.
+    """Options of the order grid of a search; the value None marks an option that is not given.
 
     Method
     ------
@@ -259,7 +268,7 @@ class OrderGridOptions(MethodOptions):
     increment: float | None = None
 
     def grid(self) -> OrderGrid | None:
-        """Return the order grid of the search; None without options."""
+        """Return the order grid that the options define; None if none is given. Raise ModelError for invalid values."""
         if self.increment is None and not self.order_grid:
             return None
         axes: dict[str, Any] = dict(pairs("--order-grid", self.order_grid))
@@ -270,12 +279,12 @@ class OrderGridOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class RankingOptions(MethodOptions):
-    """Options of the ranking of candidates; None for an option that is not given.
+    """Options for the ranking of candidates; the value None marks an option that is not given.
 
     Method
     ------
     norm
-        Norm of errors: l1 (45) or l2 (46); default l1.
+        Norm of errors, (45) or (46) of the paper; default l1.
     criterion
         Error that ranks candidates; default output-error.
     top
@@ -292,7 +301,7 @@ class RankingOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class MultiInnovationOptions(MethodOptions):
-    """Options of the multi-innovation method; None for an option that is not given.
+    """Options of the multi-innovation method; the value None marks an option that is not given.
 
     Method
     ------
@@ -301,7 +310,7 @@ class MultiInnovationOptions(MethodOptions):
     prior_covariance
         Prior covariance K0 of the coefficients; default weak.
     row_basis
-        Basis of the rows of (44); default haar.
+        Row basis of the recursion, (44) of the paper; default haar.
     """
 
     innovation_length: int | None = None
@@ -311,7 +320,7 @@ class MultiInnovationOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class OutputErrorOptions(MethodOptions):
-    """Options of the output-error method; None for an option that is not given.
+    """Options of the output-error method; the value None marks an option that is not given.
 
     Method
     ------
@@ -335,12 +344,12 @@ class OutputErrorOptions(MethodOptions):
 
 @dataclass(frozen=True)
 class GeneticOptions(MethodOptions):
-    """Options of the genetic algorithm; None for an option that is not given.
+    """Options of the genetic algorithm; the value None marks an option that is not given.
 
     Method
     ------
     seeds
-        Seed of the genetic algorithm; several are several runs.
+        Seed of the genetic algorithm; each seed is one run.
     evaluations
         Evaluations per seed of the genetic algorithm.
     """

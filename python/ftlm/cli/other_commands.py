@@ -1,4 +1,4 @@
-"""Commands app, demo, reproduce and orders."""
+"""Commands demo, reproduce, orders and app."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ftlm.utils.files import check_folder
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads
 
-#: Processor time of `ftlm demo` and its pages on the reference machine of base/pace.py [s].
+#: Processor time of `ftlm demo` with the order increment 0.1 on the reference machine [s].
 DEMO_SECONDS = 22.0
 
 
@@ -37,7 +37,7 @@ def demo(
     verbose: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, and write models, tables and charts.
+    """Simulate both joints of the arm, identify each equation with p = 1, 3, 5, 7, and write models and charts.
 
     The paper's order grid has the increment 0.05, which takes minutes.
 
@@ -110,7 +110,7 @@ def reproduce(
     records
         Records per arm, with different noise.
     rivals_increment
-        Minimum order increment of the comparison with the GA.
+        Minimum order increment in the genetic comparison.
     """
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
@@ -156,7 +156,7 @@ def orders(
     Options
     -------
     filtered
-        Whether deflections passed the stock low-pass.
+        Whether deflections passed the stock low-pass filter.
     """
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:

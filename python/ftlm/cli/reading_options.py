@@ -1,4 +1,4 @@
-"""Command-line options for reading files, and options that every command has."""
+"""Command-line options for reading measured files."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ from ftlm.io.load import LoadOptions, Signals, load_selection, run_paths, select
 from ftlm.io.preview import OpenedFile, preview_selection
 from ftlm.structure.structure import Structure
 
-#: Options of a text file's layout; `layout_options` collects them from a dataclass.
-
 
 def layout_options(record: object) -> dict[str, Any]:
-    """Return the layout options that the user has set in a dataclass, by name."""
+    """Return the layout options that the user set, by name; `record` is a dataclass with options as fields."""
     options = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
     return {name: value for name, value in options.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Options for reading files.
+    """Options for reading measured files; the value None marks an option that is not given.
 
     File
     ----
@@ -86,10 +84,11 @@ class ReadingOptions:
     def runs(
         self, files: Sequence[str] | None, structure: Structure | None = None, *, apart: bool = False
     ) -> list[Run]:
-        """Return the runs of files, detrended if requested; each group of an HDF5 file with a time column is a run.
+        """Return the runs in files, detrended if requested; [] without files.
 
-        .mat files with one signal each form one run unless `apart`. Columns that no option names are the signals of
-        `structure`, if the files have them.
+        Each group of an HDF5 file that has a time column is a run. Several .mat files with one signal each form one
+        run, unless `apart` is True. Signals of `structure` that no option assigns are read from the columns of the same
+        name.
         """
         runs = self._read(files, structure, apart=apart)
         return runs if self.detrend is None else [run.detrend(self.detrend) for run in runs]
@@ -105,11 +104,11 @@ class ReadingOptions:
             try:
                 self._load(files[0], signals)
             except DataError:
-                # The first file alone lacks a column that is asked for, so the files belong together.
+                # The first file alone lacks a requested column, so the files are read as one run.
                 run = self._load(list(files), signals)
                 print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
                 return [run]
-        # Columns that are named by their group choose one run.
+        # Column names that include the path of their group already select a single run.
         has_paths = any("/" in text for text in (*(self.inputs or ()), *(self.outputs or ()), self.time or ""))
         paths = files if has_paths else [path for file in files for path in run_paths(file)]
         return [self._load(path, signals) for path in paths]
@@ -118,7 +117,10 @@ class ReadingOptions:
         return load_selection(path, *self._selection(), signals)
 
     def _selection(self) -> tuple[ColumnSelection, LoadOptions]:
-        """Return column selection, layout and further arguments of :func:`ftlm.load`."""
+        """Return the column selection with the layout, and the further options for loading.
+
+        Raise ModelError for an invalid option.
+        """
         selection = select_columns(
             self.columns,
             self.time,
@@ -133,7 +135,7 @@ class ReadingOptions:
         return selection, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
 
     def preview_file(self, file: str) -> OpenedFile:
-        """Return the preview of a file, which is not loaded as a run."""
+        """Return the preview of a file without loading it as a run; raise ModelError for the option --detrend."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         announce_reading([file])
@@ -141,7 +143,7 @@ class ReadingOptions:
 
 
 def given_fields(*records: Any) -> dict[str, Any]:
-    """Return the fields of option records that the user has set, by name."""
+    """Return the fields of option dataclasses that are not None, which the user set, by name."""
     return {
         f.name: getattr(record, f.name)
         for record in records

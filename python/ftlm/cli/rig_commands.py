@@ -1,4 +1,4 @@
-"""Commands for the rig and the installation: record, doctor."""
+"""Commands record and doctor, for experiments on a rig and for the installation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ftlm.structure.parser import equation
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import available_threads
 
-#: Reader packages with their file types and the extra that installs them.
+#: (file types, extra of ftlm that installs the package) by the name of a package for reading files.
 _READER_PACKAGES = {
     "scipy": (".mat files", "mat"),
     "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
@@ -46,7 +46,7 @@ def doctor(
     *,
     as_json: bool = False,
 ) -> None:
-    """Print versions, cores, vector unit, and whether the rig's driver is installed."""
+    """Print versions, processor cores, vector unit, and whether the driver of the rig is installed."""
     about: dict[str, Any] = {
         "ftlm": _core.__version__,
         "core": _core.__version__,
@@ -77,7 +77,7 @@ def _installed_version(package: str) -> str | None:
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of the identification during a recording.
+    """Options of the streaming identification during a recording.
 
     Options
     -------
@@ -97,7 +97,11 @@ class LiveOptions:
     prior_covariance: float | None = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
-        """Return the streaming estimator for a rate [Hz] and a longest run [s]; None if not requested."""
+        """Return the streaming estimator that --live requests; None without this option.
+
+        `rig` and `parameters` are the values of these options of the command, `rate` is the sampling rate [Hz], and
+        `limit` is the maximum duration of the run [s]. Raise ModelError for invalid options.
+        """
         if self.live is None:
             useless = [parameter(name) for name in given_fields(self)]
             if useless:
@@ -128,14 +132,14 @@ class LiveOptions:
 
     @property
     def method(self) -> MultiInnovation:
-        """Estimation method of the stream."""
+        """Multi-innovation method of the streaming estimator, with the options that the user set."""
         given = {n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance")}
         return MultiInnovation(row_basis="time", **{n: v for n, v in given.items() if v is not None})
 
     def identify(self, run: Run, stream: Streaming) -> Identification | None:
-        """Return the final estimate of the stream from the recorded run, as a result with a verdict.
+        """Identify the model of the streaming estimator from the whole recorded run, for a result with a verdict.
 
-        The result is None if the run was stopped too early for an estimate.
+        Return None if the identification fails, as for a run that was stopped early.
         """
         try:
             return identify(run, replace(stream.structure, initial="rest"), method=self.method, m=stream.pulses)
@@ -186,7 +190,7 @@ def record(
     band : LOW:HIGH
         Frequency band of chirp and multisine [Hz].
     ramp
-        Time over which the amplitude grows [s].
+        Time over which the amplitude rises from 0 [s].
     file
         Currents I1, I2 [A] for --input csv.
     duration
@@ -204,7 +208,7 @@ def record(
     real_time
         Run the virtual rig in real time.
     sensor_filter : stock
-        Record behind the stock 2 Hz low-pass filter; default none.
+        Record through the stock 2 Hz low-pass; default none.
     watchdog
         Time after which the motors are stopped [s].
     arm
@@ -252,7 +256,10 @@ def record(
 
 
 def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
-    """Return a callback that updates the progress bar, and prints the live estimate once per second of the run."""
+    """Return a callback (count, total) in samples for the progress bar.
+
+    With a streaming estimator it also prints the estimate once per second of the run. `rate` is the sampling rate [Hz].
+    """
     due = 1.0
 
     def report_progress(count: int, total: int) -> None:

@@ -44,7 +44,7 @@ def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, 
     absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
     if not names or (not absent and len(set(names)) < len(names)):
         raise ModelError(
-            f"{what} = {short_repr(choice)} is not a list of outputs, each once; the input reaches {', '.join(outputs)}"
+            f"{what} = {short_repr(choice)} is not a list of different outputs; the input affects {', '.join(outputs)}"
         )
     if absent:
         near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""

@@ -198,7 +198,7 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     try:
         return read.controller.controller()
     except (FtlmError, ValueError) as error:
-        raise DataError(f"{path} is damaged: {error_text(error)}; write it again") from error
+        raise DataError(f"{path} is damaged: {error_text(error)}; save the controller again") from error
 
 
 def _limit(value: float) -> float | None:

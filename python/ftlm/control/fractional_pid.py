@@ -72,9 +72,11 @@ class FractionalPid:
         for name in ("kp", "ki", "kd", "lam", "mu"):
             value = real_number(name, getattr(self, name))
             if not math.isfinite(value):
-                raise ModelError(f"{name} = {value:g} is not a finite number; give one")
+                raise ModelError(f"{name} = {value:g} is not finite; give a finite number")
             if name in ("lam", "mu") and not 0 < value <= 2:
-                raise ModelError(f"{name} = {value:g} is not an order of a fractional PID; give one above 0, at most 2")
+                raise ModelError(
+                    f"{name} = {value:g} is not an order of a fractional PID; give an order above 0, at most 2"
+                )
             object.__setattr__(self, name, value)
 
     def response(self, w: Floats | Complex) -> Complex:
@@ -508,8 +510,8 @@ def fractional_pid(
     failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * margin)]
     if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
         raise ModelError(
-            f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
-            f"numbers the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * margin:g} degrees of the "
+            f"the confidence intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the "
+            f"parameters the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * margin:g} degrees of the "
             "phase margin; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
@@ -607,7 +609,7 @@ def least_certain_parameter(model: Model) -> str:
     """Return text that names the coefficient or order with the largest relative standard error, and this error."""
     covariance = covariance_of(model)
     if covariance is None:
-        return "none is known"
+        return "their covariance is not known"
     names = []
     for item in model.equations:
         names += [f"the order of {item.output}"]
@@ -618,4 +620,4 @@ def least_certain_parameter(model: Model) -> str:
         ]
     share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
     at = int(np.argmax(np.nan_to_num(share, nan=0.0, posinf=1e300)))
-    return f"known least is {names[at]}, to {100 * share[at]:.2g} % (one standard error)"
+    return f"the most uncertain is {names[at]}, with a standard error of {100 * share[at]:.2g} %"

@@ -205,8 +205,8 @@ def input_shaper(
     swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate; other modes "
-            "need no shaper"
+            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate, and only "
+            "these need a shaper; give at most this number"
         )
     modes_used = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)

@@ -199,7 +199,7 @@ def inverse_dynamics(
     doi:10.1002/rob.4620040406).
     """
     if not isinstance(design, LoopDesign):
-        raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
+        raise ModelError(f"design is a {type(design).__name__}, not a PidDesign or an LqgDesign; design a loop first")
     rows = _path(path)
     count, start = check_samples(samples, seed)
     most = check_limit(limit)
@@ -260,7 +260,8 @@ def inverse_dynamics(
     worst = float(np.quantile(errors, 0.975)) if errors else None
     if worst is not None and not worst <= MAX_RESIDUAL_SHARE * plain:
         raise ModelError(
-            "the intervals are too wide to design on: within them the deviation after the end of the path may be "
+            "the confidence intervals are too wide to design on: within them the deviation after the end of the path "
+            "may be "
             f"{worst:.2g}, and {plain:.2g} with the path itself as reference; "
             f"{least_certain_parameter(design.plants[0].model)}; identify from a longer or richer run (ftlm "
             "design-input lays it out)"

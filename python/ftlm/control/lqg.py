@@ -545,7 +545,7 @@ def lqg(
     kalman = kalman_filter(realization, read, noise_deviations(model, read, noise), walks)
     c = realization.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
-    no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
+    no = "no state feedback stabilizes the model; state a maximum deviation of every output that integrates"
     with catch_numerical_errors(*no.split("; ")):
         gains, _, own = python_control().dlqr(realization.a, realization.b, cost, np.eye(1) / dear**2)
     if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
@@ -574,8 +574,8 @@ def lqg(
     failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
     if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
         raise ModelError(
-            f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
-            f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
+            f"the confidence intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the "
+            f"parameters the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
         )

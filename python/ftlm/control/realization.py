@@ -154,7 +154,7 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
         raise ModelError(
             f"a realization with {best.states} states has errors of up to {gain:.2g} dB and {phase:.2g} degrees "
-            f"between {low:.3g} and {high:.3g} rad/s, so nothing is designed on them; use a narrower band"
+            f"between {low:.3g} and {high:.3g} rad/s, too large for a design; use a narrower band"
             + ("" if poles is None else ", or more poles")
         )
     return best

@@ -185,11 +185,11 @@ class RunArguments:
                 continue
             if name in self.outputs:
                 if has_too_few_values(values):
-                    what = f"{int((~is_missing).sum())} values, {MIN_RUN_SAMPLES} are needed"
+                    what = f"{int((~is_missing).sum())} values, but {MIN_RUN_SAMPLES} are needed"
                     raise bad_rows(self.label_of(name), what, 0, int(is_missing.sum()), "use a longer record")
                 notes.append(
                     describe_missing(
-                        f"output {name}", is_missing, "they weigh nothing in output-error fits and figures"
+                        f"output {name}", is_missing, "they have no weight in output-error fits and figures"
                     )
                 )
                 continue
@@ -212,7 +212,7 @@ class RunArguments:
         if both:
             raise DataError(f"signal {both[0]!r} is both an input and an output, {len(both)} in all; give it two names")
         if not self.outputs:
-            raise DataError(f"{parameter('outputs')}: there is none; name at least one output")
+            raise DataError(f"{parameter('outputs')}: no output is given; name at least one output")
         if (self.step is None) == (self.time is None):
             reason = "neither is given" if self.step is None else "both are given"
             raise DataError(f"{parameter('step')} and {parameter('time')}: {reason}; pass exactly one of them")
@@ -236,7 +236,7 @@ class RunArguments:
             dated = as_seconds(self.time, self.time_label)
             if dated is not None and self.time_unit != "s":
                 raise DataError(
-                    f"{parameter('time_unit', self.time_unit)} is the unit of numbers, and {self.time_label} holds "
+                    f"{parameter('time_unit', self.time_unit)} is the unit of numbers, but {self.time_label} has "
                     f"dates; omit {parameter('time_unit')}"
                 )
             times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)

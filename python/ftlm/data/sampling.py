@@ -301,7 +301,7 @@ def regular_step(
     if worst > _MIN_REPORTED_JITTER_SHARE * mean:
         row = offset + int(deviation.argmax())
         share = f"{100.0 * worst / mean:.2g} % of a step, the most at row {row}"
-        fact = (f"time jitters by up to {share}; it was taken as regular",)
+        fact = (f"time jitters by up to {share}; the sampling was assumed uniform",)
     if stated_step is not None:
         if not abs(stated_step - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
             raise DataError(
@@ -552,7 +552,7 @@ def has_too_few_values(values: Floats) -> bool:
 def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
     """Return a sentence on the number of missing samples of the signal `thing`, with their treatment `what`."""
     first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
-    rows = "row holds" if count == 1 else "rows hold"
+    rows = "row has" if count == 1 else "rows have"
     return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
 
 

@@ -63,14 +63,15 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
         if name in inputs:
             item = inputs[name]
             raise ModelError(
-                f"{parameter('bounds')} has {name}, and the {item.words} has its bounds {item.bounds[0]:g} to "
-                f"{item.bounds[1]:g} where it is freed; change them there"
+                f"{parameter('bounds')} has {name}, but the bounds of the {item.words}, {item.bounds[0]:g} to "
+                f"{item.bounds[1]:g}, are stated where it is freed; change them there"
             )
         low, high = map(float, pair)
         value = start.get(name) if isinstance(start, Mapping) else None
         if value is not None and not low <= real_number(f"start value of {name}", value) <= high:
             raise ModelError(
-                f"{parameter('start')} has {name} = {value:g}, out of its bounds {low:g} to {high:g}; choose one within"
+                f"{parameter('start')} has {name} = {value:g}, out of its bounds {low:g} to {high:g}; choose a value "
+                "within them"
             )
         out[name] = (low, high)
     orders = {n: list(out.pop(n)) for n in structure.order_names if n in out}

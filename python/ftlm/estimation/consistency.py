@@ -328,7 +328,7 @@ def consistency(
     count = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
     if len(every) > 1 and count is not None:
         raise ModelError(
-            f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"
+            f"{len(every)} runs are given, and each is a segment; leave {parameter('segments')} out, or give one run"
         )
     estimator = resolve_method(method)
     options = [n for n in ("store", "start") if getattr(estimator, n, None) is not None]
@@ -397,7 +397,7 @@ def _shift_rows(samples: Floats, rows: int) -> Floats:
 def split_run(run: Run, parts: int) -> list[Run]:
     """Return consecutive segments of a run of nearly equal length; raise DataError if the run is too short."""
     if parts * MIN_RUN_SAMPLES > run.length:
-        raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
+        raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer parts")
     ends = [k * run.length // parts for k in range(parts + 1)]
     return [
         run.window(a * run.step if a else None, b * run.step if b < run.length else None)

@@ -281,8 +281,8 @@ def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str 
             ratio = dot(first, second) / size if size > 0 else 0.0
             if vector_norm(second - ratio * first) <= COLLINEARITY_TOLERANCE * vector_norm(second):
                 return (
-                    f"{other.signal} is {ratio:.6g} times {one.signal} on every run, which no run tells apart: leave "
-                    f"out the term of {other.coefficient} or that of {one.coefficient}, fix one of them, or add a run "
-                    "in which the two signals differ"
+                    f"{other.signal} is {ratio:.6g} times {one.signal} on every run, so their effects are not "
+                    f"separately identifiable: leave out the term of {other.coefficient} or that of {one.coefficient}, "
+                    "fix one of them, or add a run in which the two signals differ"
                 )
     return None

@@ -286,7 +286,7 @@ def _structure(
     if target.offset != "none":
         raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or {parameter('offset')}")
     if target.sensor_filter is not None:
-        raise ModelError("the structure has a sensor filter; divide the data by its response, and leave it out")
+        raise ModelError("the structure has a sensor filter; divide the data by its response, and leave the filter out")
     if target.coefficient_law:
         raise ModelError(
             f"the structure has a coefficient law, which this fit does not impose; leave {parameter('laws')} out"
@@ -327,7 +327,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
             elif own[side] not in names:
                 raise DataError(
                     f"{record.name} has the {side} {own[side]!r}, which is not an {side} of the equations; these have "
-                    f"{', '.join(names)}: write the equation in the names of the data, or say {parameter(side)} when "
+                    f"{', '.join(names)}: write the equation in the names of the data, or give {parameter(side)} when "
                     "loading"
                 )
         matches.append(replace(record, output=own["output"], input=own["input"]))
@@ -389,7 +389,8 @@ def _given_deviations(record: FrequencyData, weights: object) -> Floats:
     deviations = as_floats("weights", weights)
     if deviations.shape != record.frequency.shape:
         raise DataError(
-            f"weights has shape {deviations.shape}, the data {record.frequency.shape}; give one deviation each"
+            f"weights has shape {deviations.shape}, the data {record.frequency.shape}; give one standard deviation "
+            "per frequency"
         )
     return np.asarray(replace(record, deviation=deviations).deviation)
 

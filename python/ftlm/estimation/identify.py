@@ -207,7 +207,9 @@ def _fit_runs(
     ) -> Fit:
         fit = method.fit(runs, request, m=m, threads=threads, progress=report, **more)
         if not isinstance(fit, Fit):
-            raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}; return a Fit")
+            raise ModelError(
+                f"the method {estimator.name!r} fitted a {type(fit).__name__}; return a Fit from its fit method"
+            )
         return fit
 
     light, initial_condition_fits = (
@@ -583,7 +585,9 @@ def identify_many(
     check_executor(executor)
     estimator = resolve_method(method)
     if getattr(estimator, "store", None) is not None:
-        raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
+        raise ModelError(
+            "a store keeps one identification; identify each run by its own call with its own checkpoint file"
+        )
     if executor is not None and getattr(estimator, "executor", None) is not None:
         raise ModelError(f"the method has an executor besides {parameter('executor')}; leave one of the two out")
     options = {"method": estimator, "offset": offset, "m": m, "threads": threads}
@@ -619,5 +623,7 @@ def _future_result(future: Future[Any]) -> tuple[Identification | None, FtlmErro
         pair: tuple[Identification | None, FtlmError | None] = future.result()
     except (Exception, CancelledError) as error:
         what = f"{type(error).__name__}: {error}"
-        return None, ConvergenceError(f"the executor lost this run ({what}); start a new one and identify it again")
+        return None, ConvergenceError(
+            f"the executor lost this run ({what}); start a new executor and identify the run again"
+        )
     return pair

@@ -127,8 +127,8 @@ class OffsetTest:
         if not self.degrees:
             return "none: it is not separately identifiable from the other parameters"
         if self.exceeds():
-            return f"constant, since the runs ask for one ({self.statistic_text})"
-        return f"none, since the runs ask for none ({self.statistic_text})"
+            return f"constant, because the test is significant ({self.statistic_text})"
+        return f"none, because the test is not significant ({self.statistic_text})"
 
 
 def evaluate_at_point(

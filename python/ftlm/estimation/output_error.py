@@ -450,7 +450,7 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
             if lacking
             else f"{len(parameter_set.orders)} orders where its equations have {count}"
         )
-        raise ModelError(f"the record of the fit in the model has {what}; identify it again")
+        raise ModelError(f"the fit results that the model stores have {what}; identify the model again")
     laws = iter(parameter_set.orders)
     equations = []
     for item in model.equations:
@@ -476,5 +476,7 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     problem = FreeProblem.of(structure)
     if set(problem.names) != set(parameter_set.names):
         odd = sorted(set(problem.names) ^ set(parameter_set.names))
-        raise ModelError(f"the record of the fit in the model contradicts its equations: {odd[0]}; identify it again")
+        raise ModelError(
+            f"the fit results that the model stores contradict its equations: {odd[0]}; identify the model again"
+        )
     return problem, [values[n] for n in problem.names]

@@ -386,8 +386,8 @@ def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
     if ramp > rows // 4:
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
-            f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * step:.3g} s from one peak to the other, "
-            f"of {(rows - 1) * step:g} s in all: no input of that peak can be kept within it; lower "
+            f"slew of {slow} = {bounds.slews[slow]:g} per second needs {ramp * step:.3g} s from one peak to the other, "
+            f"but the run lasts only {(rows - 1) * step:g} s; lower "
             f"{parameter('peak')}, or raise {parameter('slew')} or {parameter('duration')}"
         )
 
@@ -423,16 +423,18 @@ def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
     if lacking:
         raise DataError(
             f"run {reference_run.name!r} has no input {lacking[0]!r}{nearest(lacking[0], reference_run.inputs)}, which "
-            f"drives the model; give the run of that machine, or leave {parameter('reference_run')} out"
+            f"the model requires; give the run of that machine, or leave {parameter('reference_run')} out"
         )
 
 
 def _positive(name: str, value: object, what: str) -> float:
     if value is None:
-        raise ModelError(f"{name} is not given; give {parameter(name)} {what}, or {parameter('reference_run')} a run")
+        raise ModelError(
+            f"{name} is not given; give {what} as {parameter(name)}, or a run as {parameter('reference_run')}"
+        )
     number = real_number(name, value)
     if not (number > 0 and math.isfinite(number)):
-        raise ModelError(f"{setting(name)} {number:g} is not {what} above 0; give one")
+        raise ModelError(f"{setting(name)} {number:g} is not {what} above 0; give a positive number")
     return number
 
 
@@ -492,7 +494,7 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
     if poles.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift without "
-            f"limit; give its largest acceptable value with {parameter('limits')}, or give "
+            f"limit; give its maximum acceptable value with {parameter('limits')}, or give "
             f"{parameter('reference_run')} a run"
         )
 
@@ -523,7 +525,7 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
         share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
         if not share <= MAX_RELATIVE_UNCERTAINTY:
             _raise_too_uncertain(
-                fit, f"its own uncertainty moves what {output} does by {100 * share:.0f} %", (step, length)
+                fit, f"its uncertainty changes the response of {output} by {100 * share:.0f} %", (step, length)
             )
 
 

@@ -33,7 +33,7 @@ SIZE_LIMIT = 1 << 30
 MAX_ARRAYS = 10_000
 MAX_GROUP_DEPTH = 8
 #: Remedy to which the parent process adds the option that selects a sheet.
-SHEET_CHOICE_HINT = "say which sheet"
+SHEET_CHOICE_HINT = "name the sheet"
 SAVE_AGAIN = "save it again with save('FILE.mat', '-v7')"
 NUMERIC_MATLAB_CLASSES = frozenset(
     ("double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
@@ -118,7 +118,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
             f"with it the arrays take more than {SIZE_LIMIT} bytes (it declares {size})", "save a part of it"
         )
     if len(names) > MAX_ARRAYS:
-        raise UnreadableError(f"it holds {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
+        raise UnreadableError(f"it contains {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
     # With mat_dtype=True, SciPy drops imaginary parts; the stored types keep them.
     wanted = [*kinds, *structs]
     loaded = matlab.loadmat(path, mat_dtype=False, variable_names=wanted) if wanted else {}
@@ -300,7 +300,7 @@ class Arrays:
         if size > self.left:
             raise UnreadableError(f"with {name!r} the arrays take more than {SIZE_LIMIT} bytes", "save a part of it")
         if len(self.values) + len(kind.names or " ") > MAX_ARRAYS:
-            raise UnreadableError(f"it holds more than {MAX_ARRAYS} arrays", "save a part of it")
+            raise UnreadableError(f"it contains more than {MAX_ARRAYS} arrays", "save a part of it")
         self.left -= size
         return True
 

@@ -179,9 +179,11 @@ def assume_roles(
     if not follows:
         return ()
     inputs, outputs = join_names(selection.inputs.values(), 10), join_names(selection.outputs.values(), 10)
-    words = f"{inputs} {'drives' if len(selection.inputs) == 1 else 'drive'} {outputs}, by their names"
+    words = f"{inputs} {'is an input' if len(selection.inputs) == 1 else 'are inputs'} of {outputs}, by their names"
     if not drives:
-        words = f"nothing drives {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
+        words = (
+            f"there is no input of {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
+        )
     remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
     return (Assumption("inputs", inputs, words, remedy),)
 

@@ -94,16 +94,16 @@ class _BadCells:
             way_out = _fill_hint()
         elif (mark := detect_thousands_separator(text, comma=self.comma)) is not None:
             what = f"{cell_text} has marks between thousands"
-            way_out = f"say {layout_parameter(thousands=mark)}, or write all numbers without"
+            way_out = f"give {layout_parameter(thousands=mark)}, or write all numbers without"
         elif self.comma and "." in text and is_number(text):
             what = f"{cell_text} has a point where decimals follow a comma"
             way_out = "write all numbers alike"
             if may_group(text, "point", comma=True):
-                way_out += f", or say {layout_parameter(thousands='point')} where points group thousands"
+                way_out += f", or give {layout_parameter(thousands='point')} where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
             what = f"{cell_text} has a decimal comma"
             way_out = (
-                f"write all numbers alike, or say {layout_parameter(decimal='comma')} where all of them have commas"
+                f"write all numbers alike, or give {layout_parameter(decimal='comma')} where all of them have commas"
             )
         elif self.other:
             what = f"{cell_text} and {self.other!r} are dates or times of day written in two ways"
@@ -202,7 +202,7 @@ def parse_text(
     mark = "#" if sheet is None else "\0"
     head, sample, remark = _sample(blocks, layout, mark)
     if not sample:
-        raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
+        raise DataError(f"{source}: the file is empty, 0 rows; choose a file that contains a record")
     dialect = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
     dialect = _with_gaps(dialect, head, sample, layout, sheet=sheet is not None)
     rows = _Rows(dialect, sheet is not None)
@@ -376,7 +376,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
     if rows.ragged:
         raise _ragged_rows_error(rows, source)
     if rows.count == 0:
-        raise DataError(f"{source}: a header and no rows; choose a file that holds a record")
+        raise DataError(f"{source}: a header and no rows; choose a file that contains a record")
     values = np.concatenate(rows.blocks).T.copy() if len(rows.blocks) > 1 else rows.blocks[0].T.copy()
     names = dialect.names if dialect.names is not None else [f"c{index + 1}" for index in range(dialect.width)]
     columns = []
@@ -448,7 +448,7 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
                 f"text in any encoding{zipped}; give {layout_parameter(encoding=Placeholder('NAME'))}, or pass a csv, "
                 "text or .mat file"
             ) from None
-        words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
+        words = f"no UTF-8 (byte {head[error.start]:#04x}), read as cp1252 of Windows, which does not affect numbers"
         otherwise = layout_parameter(encoding=Placeholder("NAME"))
         try:
             head.decode("cp1252")
@@ -496,11 +496,11 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
 def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
     if not isinstance(error, UnicodeDecodeError):
         return DataError(
-            f"{path.name}: the text is not {encoding} ({error}); say {layout_parameter(encoding=Placeholder('NAME'))}"
+            f"{path.name}: the text is not {encoding} ({error}); give {layout_parameter(encoding=Placeholder('NAME'))}"
         )
     at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
     return DataError(
-        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say "
+        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); give "
         f"{layout_parameter(encoding='cp1252')} if it is that of Windows, or save it as UTF-8"
     )
 

@@ -326,7 +326,7 @@ def find_table(
     rows = [(at, line) for at, line in lines if at > (layout_options.skip or 0)]
     if not rows:
         raise DataError(
-            f"{source}: no table below the first {layout_options.skip} lines; say another number with "
+            f"{source}: no table below the first {layout_options.skip} lines; give another number with "
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
     _check_width(rows[-2:], source)
@@ -567,7 +567,7 @@ def _header(
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
     if commas and not own and count == 1:
         raise DataError(
-            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; say "
+            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; give "
             f"{layout_parameter(decimal='comma')}"
         )
     check_distinct(names, line.at, source)
@@ -600,7 +600,7 @@ def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool,
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
-            f"a table of {width} cells per row; give every line the same number of cells, or say how many lines to "
+            f"a table of {width} cells per row; give every line the same number of cells, or state how many lines to "
             "leave "
             f"out with {layout_parameter(skip=Placeholder('LINES'))}"
         )
@@ -632,7 +632,7 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], sou
     if pairs or single:
         at, example = rows[0][0].at, rows[0][1].strip()[:40]
         raise DataError(
-            f"{source}: line {at}: the commas of {example!r} may stand between cells or before decimals; say "
+            f"{source}: line {at}: the commas of {example!r} may be cell separators or decimal marks; give "
             f"{layout_parameter(separator='comma')}, or {layout_parameter(decimal='comma')} where spaces separate"
         )
 
@@ -648,8 +648,8 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
     if cells and all(_COMMA_THOUSANDS_PATTERN.fullmatch(cell) for _, cell in cells):
         at, text = cells[0]
         raise DataError(
-            f"{source}: line {at}: the comma of {text!r} may stand before decimals or group thousands, as in every "
-            f"other number there; say {layout_parameter(decimal='comma')}, or write them without"
+            f"{source}: line {at}: the comma of {text!r} may be a decimal mark or group thousands, as in every "
+            f"other number there; give {layout_parameter(decimal='comma')}, or write them without"
         )
 
 
@@ -662,7 +662,7 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
     if len(both[0]) > header.width and len(both) > 1 and len({len(cells) for cells in both}) == 1:
         raise DataError(
             f"{source}: line {header.at} and the rows below it have commas and {SEPARATOR_WORDS[separator]}s between "
-            "their cells; write one separator, or say "
+            "their cells; write one separator, or give "
             f"{layout_parameter(separator=_WORDS_BY_SEPARATOR[separator], decimal='comma')}"
         )
 
@@ -691,7 +691,7 @@ def _layout_assumptions(
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
     if given.header is None and units is not None:
-        words = f"line {cut[top - 1].at} holds units" if any(units) else f"line {cut[top - 1].at} is a remark"
+        words = f"line {cut[top - 1].at} contains units" if any(units) else f"line {cut[top - 1].at} is a remark"
         assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
     elif given.header is None and layout.header == 0:
         words = "no line of names: columns are c1, c2, …"

@@ -31,7 +31,7 @@ from ftlm.utils.validation import Floats
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
 #: Remedy in an answer of the reader, to which the option that selects a sheet is added here.
-_SHEET_CHOICE_HINT = "say which sheet"
+_SHEET_CHOICE_HINT = "name the sheet"
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ class _ReaderOutput:
         if not columns:
             skipped = list(header.skipped.items())[:10]
             why = ", ".join(f"{name!r} ({reason})" for name, reason in skipped) or "it is empty"
-            raise DataError(f"{str(path)!r} holds no real numeric matrix: {why}; save the samples as matrices")
+            raise DataError(f"{str(path)!r} contains no real numeric matrix: {why}; save the samples as matrices")
         own = None if header.own is None else Header.read(path, "its metadata", header.own)
         return FileTable(path, columns, text=header.text, header=own, skipped=header.skipped)
 

@@ -276,7 +276,7 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
         return _TimeColumn(column.numbers(), unit, label, column.name, facts + notes)
     if unit_option is not None:
         raise DataError(
-            f"{parameter('time_unit', unit_option)} is the unit of numbers, and {label} holds dates or times of day; "
+            f"{parameter('time_unit', unit_option)} is the unit of numbers, but {label} has dates or times of day; "
             f"omit {parameter('time_unit')}"
         )
     seconds = column.timestamps.seconds(label, selection.layout.dates)

@@ -314,18 +314,20 @@ def _frequencies(item: _ResponseColumn, option: str | None, notes: list[str]) ->
         frequency_factor(option)
         if file_unit and file_unit != option:
             raise DataError(
-                f"column {item.column.name!r} states {file_unit}, and {parameter('frequency_unit', option)} is asked "
-                f"for; leave {parameter('frequency_unit')} out, or rename the column"
+                f"column {item.column.name!r} states {file_unit}, and {parameter('frequency_unit', option)} is "
+                f"given; leave {parameter('frequency_unit')} out, or rename the column"
             )
     unit = option or file_unit
     if not unit:
         if item.unit:
             raise DataError(
-                f"column {item.column.name!r} states the unit {item.unit!r}, which is not a unit of frequency; say "
+                f"column {item.column.name!r} states the unit {item.unit!r}, which is not a unit of frequency; give "
                 f"{parameter('frequency_unit')}, one of {', '.join(FREQUENCY_UNITS)}"
             )
         unit = "rad/s" if item.word in _ANGULAR_FREQUENCY_NAMES else "Hz"
-        notes.append(f"frequencies {item.column.name!r} taken for {unit}; otherwise {parameter('frequency_unit')}")
+        notes.append(
+            f"frequencies {item.column.name!r} are assumed to be in {unit}; otherwise {parameter('frequency_unit')}"
+        )
     return values * FREQUENCY_UNITS[unit]
 
 
@@ -362,13 +364,13 @@ def _cartesian(
     x, y = (i.column.numbers().astype(np.float64) for i in (real, imag))
     if turned and negated is None:
         notes.append(
-            f"column {imag.column.name!r} holds the negative imaginary part, by its name; otherwise "
+            f"column {imag.column.name!r} contains the negative imaginary part, by its name; otherwise "
             f"{parameter('negated')}"
         )
     elif negated is None and imag.word.startswith("z") and np.mean(y > 0) > 0.5:
         notes.append(
             f"the imaginary part {imag.column.name!r} is positive in {int(np.sum(y > 0))} of {y.size} rows, as of an "
-            f"inductance; if it holds -Z'', say {parameter('negated', True)}"
+            f"inductance; if it contains -Z'', give {parameter('negated', True)}"
         )
     response: Complex = np.asarray(factor * (x - 1j * y if turned else x + 1j * y), dtype=np.complex128)
     return response, factor, unit or _magnitude_scale(imag)[1]
@@ -400,12 +402,12 @@ def _polar(
         bad = values < 0
         raise DataError(
             f"column {size.column.name!r}: a magnitude is negative, first at row {int(np.argmax(bad))}, "
-            f"{int(bad.sum())} in all; say {parameter('magnitude_unit', 'dB')} if these are decibels"
+            f"{int(bad.sum())} in all; give {parameter('magnitude_unit', 'dB')} if these are decibels"
         )
     turned = angle.is_negated if negated is None else _truth("negated", negated)
     if turned and negated is None:
         notes.append(
-            f"column {angle.column.name!r} holds the negative phase, by its name; otherwise {parameter('negated')}"
+            f"column {angle.column.name!r} contains the negative phase, by its name; otherwise {parameter('negated')}"
         )
     response: Complex = factor * values * np.exp((-1j if turned else 1j) * radians * phase)
     return response, factor, unit
@@ -432,9 +434,9 @@ def _resolve_unit(
         return option
     if unit is not None:
         return unit
-    words = "a size, not decibels" if what == "magnitude" else "degrees"
+    words = "linear, not in decibels" if what == "magnitude" else "in degrees"
     notes.append(
-        f"the {what} {item.column.name!r} is taken for {words}; otherwise {parameter(f'{what}_unit', choices[1])}"
+        f"the {what} {item.column.name!r} is assumed to be {words}; otherwise {parameter(f'{what}_unit', choices[1])}"
     )
     return choices[0]
 
@@ -455,6 +457,6 @@ def _compare(parts: Mapping[str, _ResponseColumn], response: Complex, notes: lis
     off = np.abs(np.abs(response) * scale - own) > _MAGNITUDE_TOLERANCE * np.abs(own)
     if np.any(off):
         notes.append(
-            f"column {item.column.name!r} is not the size of real and imaginary part, first at row "
+            f"column {item.column.name!r} is not the magnitude of real and imaginary part, first at row "
             f"{int(np.argmax(off))}, {int(off.sum())} in all; real and imaginary part were used"
         )

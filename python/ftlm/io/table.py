@@ -92,7 +92,7 @@ class Column:
         if blank and self.blank and self.values is not None:
             return self.values
         if self.problem is not None or self.values is None:
-            raise self.problem or DataError(f"column {self.name!r} holds no numbers; choose another column")
+            raise self.problem or DataError(f"column {self.name!r} has no numbers; choose another column")
         return self.values
 
 
@@ -264,7 +264,7 @@ class Pool:
             columns, why = self._clocks(table, signals)
             if len(columns) > 1 and table.runs:
                 raise DataError(
-                    f"{table.path.name} holds {len(table.runs)} runs, each in a group with its own time; give the "
+                    f"{table.path.name} contains {len(table.runs)} runs, each in a group with its own time; give the "
                     f"path of one, as in {str(table.path / table.runs[0])!r}; the groups are {join_names(table.runs)}"
                 )
             if len(columns) > 1:
@@ -308,7 +308,7 @@ class Pool:
             return columns, f"the time is column {columns[0].name!r}, by its name"
         dated = [c for c in own if c.timestamps is not None]
         if dated:
-            return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"
+            return dated, f"the time is column {dated[0].name!r}, which contains dates or times of day"
         if own and own[0].file_unit and is_time_unit(own[0].file_unit):
             return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].file_unit}"
         return [], ""

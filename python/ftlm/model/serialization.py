@@ -202,4 +202,6 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     try:
         return read.restore_model()
     except ModelError as error:
-        raise DataError(f"{path} holds no usable model: {error_text(error)}; give a file written by save()") from error
+        raise DataError(
+            f"{path} contains no usable model: {error_text(error)}; give a file written by save()"
+        ) from error

@@ -371,7 +371,7 @@ def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | N
 def _executor_error(error: BaseException) -> ConvergenceError:
     return ConvergenceError(
         f"the executor lost its work ({type(error).__name__}: {error}); start a new one and search again: "
-        f"with {parameter('store')} nothing that was finished is lost"
+        f"with {parameter('store')} completed work is kept"
     )
 
 

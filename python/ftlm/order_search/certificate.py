@@ -199,8 +199,8 @@ def _check_certifiable(job: Job) -> None:
     fixed_terms = [t for t in item.terms if t.fixed is not None]
     if fixed_terms:
         raise ModelError(
-            f"there is no certificate over all orders with known coefficients, and {len(fixed_terms)} of the terms of "
-            f"{item.output} have one (the first is {fixed_terms[0].fixed:g}); name them"
+            f"there is no certificate over all orders with fixed coefficients, but {len(fixed_terms)} of the terms of "
+            f"{item.output} have one (the first is {fixed_terms[0].fixed:g}); give these coefficients names"
         )
 
 

@@ -217,10 +217,10 @@ class Section:
             self.table = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are not a valid range")
+            raise ModelError(f"batches {frame.first} to {frame.last} are not a valid range")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.frames[self._firsts[place - 1]].last > frame.first:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are stored twice")
+            raise ModelError(f"batches {frame.first} to {frame.last} are stored twice")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
             return
@@ -234,10 +234,10 @@ class Section:
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
-            raise ModelError(f"rounds {frame.first} to {frame.last} do not continue their block")
+            raise ModelError(f"batches {frame.first} to {frame.last} do not continue their block")
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
-            raise ModelError(f"rounds {frame.first} to {frame.last} have an invalid position")
+            raise ModelError(f"batches {frame.first} to {frame.last} have an invalid position")
         if half is None or frame.anew:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts
@@ -308,7 +308,7 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
 
 def _contents_of_requests(frame: Requests | Frame, corruption: str | None) -> Contents:
     if not isinstance(frame, Requests) or not frame.requests:
-        raise ModelError("the first record holds no request")
+        raise ModelError("the first record contains no request")
     if frame.algorithm != ALGORITHM_VERSION:
         writer = f"ftlm {frame.version} with algorithm {frame.algorithm}"
         raise ModelError(f"it was written by {writer}, and this version has algorithm {ALGORITHM_VERSION}")
@@ -384,12 +384,12 @@ class Store:
     def _check_same(self, requests: Sequence[Request], stored: Sequence[Request]) -> None:
         if [r.name for r in requests] != [r.name for r in stored]:
             names = ", ".join(r.name for r in stored)
-            raise DataError(f"store {self.path} holds searches of {names}; choose another file")
+            raise DataError(f"store {self.path} contains searches of {names}; choose another file")
         for one, other in zip(requests, stored, strict=True):
             difference = one.difference(other)
             if difference is not None:
                 raise DataError(
-                    f"store {self.path} holds another search of {one.name} (this one has {difference}); choose "
+                    f"store {self.path} contains another search of {one.name} (this one has {difference}); choose "
                     "another file"
                 )
 

@@ -524,7 +524,7 @@ def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
         yield
     except ModelError as error:
         raise DataError(
-            f"{path} holds no usable search of {request.name}: {error}; start it again in another file"
+            f"{path} contains no usable search of {request.name}: {error}; start it again in another file"
         ) from error
 
 

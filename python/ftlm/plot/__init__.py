@@ -1,4 +1,7 @@
-"""Charts of results: matplotlib figures for papers (``ax=`` in every function), and SVG charts of reports."""
+"""Charts of results: matplotlib figures, for papers, and SVG charts, for reports.
+
+Every function for matplotlib figures accepts axes as ``ax=``. Functions for SVG charts have the prefix ``svg_``.
+"""
 
 from ftlm.estimation.cost_surface import correlated_orders
 from ftlm.estimation.cost_surface import output_error_landscape as svg_output_error_landscape

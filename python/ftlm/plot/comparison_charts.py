@@ -21,14 +21,15 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
-#: Lower and upper end of a band.
+#: (lower, upper) edge of a band over time.
 Band: TypeAlias = tuple[Floats, Floats]
-#: Step of the numerical derivatives in standard errors: small beside the curvature, large beside the tolerance of runs.
+#: Step of the numerical derivatives, in standard errors of the parameter. It is small enough for the curvature of the
+#: output, and large enough for the tolerance of the simulation.
 DERIVATIVE_STEP_IN_ERRORS = 0.1
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
-    """Return the time of each compared value [s]: sample times, or centers of the block pulses."""
+    """Return the times [s] of the compared values of the run with index `run`: sample times, or block-pulse centers."""
     if comparison.times:
         return comparison.times[run]
     return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
@@ -43,20 +44,20 @@ def comparison_charts(
     points: int = MAX_LINE_POINTS,
     bands: Mapping[str, Band] | None = None,
 ) -> list[LineChart]:
-    """Return a chart of measured and simulated values for every output of every run.
+    """Return a chart of the measured and the simulated output for every output of every run.
 
     Parameters
     ----------
     comparison
         Result of :func:`ftlm.compare`, or the comparison of an identification.
     units
-        Units of the outputs.
+        Units of the outputs by name.
     label
-        Role of the data, such as "estimation".
+        Role of the data for the titles, such as "estimation".
     points
-        Most points of a line.
+        Maximum number of drawn points of a line.
     bands
-        (lower, upper) edge of a 95 % band of the simulated output by output, if there is one run.
+        (lower, upper) edges of the 95 % confidence band of a simulated output, by output; only for a single run.
     """
     bands_by_output = bands or {}
     return [
@@ -78,29 +79,29 @@ def comparison_charts(
 
 
 def _bands_of_lines(band: Band) -> list[Band]:
-    """Return a list of two bands for the measured and the simulated line of a chart; the first band is empty (NaN)."""
+    """Return the bands of the measured and the simulated line of a chart; the first band is empty (NaN)."""
     none = np.full(band[0].size, np.nan)
     return [(none, none), band]
 
 
 @check_arguments
 def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[LineChart]:
-    """Return charts of the inputs of every run, which are placed below its outputs.
+    """Return a chart of every input of every run, for the place below the outputs of the run.
 
     Parameters
     ----------
     runs
-        The runs.
+        Runs whose inputs are drawn.
     signals
         Names of the inputs; those that a run lacks are omitted.
     points
-        Most points of a line.
+        Maximum number of drawn points of a line.
     """
     return [signal_chart(run, name, points=points) for run in runs for name in signals if name in run.inputs]
 
 
 def signal_chart(run: Run, name: str, *, points: int = MAX_LINE_POINTS) -> LineChart:
-    """Return the chart of one signal of a run over time."""
+    """Return the chart of the signal `name` of a run over time; `points` is the maximum number of drawn points."""
     is_input = name in run.inputs
     return LineChart(
         run.time,
@@ -110,7 +111,7 @@ def signal_chart(run: Run, name: str, *, points: int = MAX_LINE_POINTS) -> LineC
         y_label=with_unit(symbol(name), run.units, name),
         points=points,
         height=180 if is_input else 240,
-        # A command is held until the next row: a straight line to it was never sent.
+        # A command is constant until the next sample, so it is drawn as a staircase.
         steps=run.intersample.get(name) == "zoh",
     )
 
@@ -119,7 +120,7 @@ def signal_chart(run: Run, name: str, *, points: int = MAX_LINE_POINTS) -> LineC
 def residual_series(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[LineChart]:
-    """Return charts of simulation residuals over time and their histogram, for every output of every run.
+    """Return charts of the simulation residual (measured minus simulated) and its histogram, per output and run.
 
     Parameters
     ----------
@@ -133,7 +134,10 @@ def residual_series(
 def residual_rows(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[list[LineChart]]:
-    """Return the charts of :func:`residual_series`, one row for every output of every run."""
+    """Return the charts of :func:`residual_series` as rows, one for every output of every run.
+
+    A row has the residual over time, then its histogram if there are at least two finite residuals.
+    """
     rows = []
     suffix = f", {label}" if label else ""
     for k, (run, _, _) in enumerate(comparison.per_run):
@@ -167,18 +171,18 @@ def compared_bars(
     Parameters
     ----------
     compared
-        Pairs of the name of a model and its comparisons, each with the role of its data, such as
-        ``("integer", [("estimation", a), ("validation", b)])``. All models have the same roles.
+        (name, comparisons) of each model. The comparisons are (role of the data, comparison) pairs, as in
+        ``("integer", [("estimation", a), ("validation", b)])``. All models must have the same roles.
     title
         Title of the charts.
 
     Raises
     ------
     DataError
-        If there is no model, or a model has other outputs or data than the first.
+        If there is no model, or a model has other outputs or roles of data than the first.
     """
     if not compared:
-        raise DataError("bars need at least one model; give (name, comparisons) pairs")
+        raise DataError("compared is empty; give at least one (name, comparisons) pair")
     first, kinds = compared[0], [kind for kind, _ in compared[0][1]]
     outputs = list(first[1][0][1].output_error) if first[1] else []
     for name, parts in compared:
@@ -216,15 +220,15 @@ def error_chart(
     Parameters
     ----------
     compared
-        (name of the model, its comparison) of each model, all on the same run with the same m.
+        (name, comparison) of each model. All comparisons are with the same run and the same number of pulses.
     output
         Name of the output.
     title
         Title; "" for a default title.
     units
-        Units of the outputs.
+        Units of the outputs by name.
     points
-        Most points of a line.
+        Maximum number of drawn points of a line.
 
     Raises
     ------
@@ -232,7 +236,7 @@ def error_chart(
         If there is no comparison, or one of them lacks the output.
     """
     if not compared:
-        raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
+        raise DataError("compared is empty; give at least one (name, comparison) pair")
     for name, comparison in compared:
         outputs = list(comparison.measured)
         if output not in outputs:
@@ -249,14 +253,14 @@ def error_chart(
 
 
 def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
-    """Return an axis label with the unit of a signal if it is known."""
+    """Return the axis label `text`, followed by the unit of the signal `name` in brackets if it is known."""
     unit = (units or {}).get(name, "")
     return f"{text} [{unit}]" if unit else text
 
 
 @check_arguments
 def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
-    """Return charts of each output's residual autocorrelation and cross-correlations, with 99 % bands.
+    """Return charts of the autocorrelation and the cross-correlations of each residual, with 99 % bands.
 
     Parameters
     ----------
@@ -269,8 +273,11 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
 
 
 def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
-    """Return the chart of the correlations of an output's residual with a signal; "" stands for the residual itself."""
-    # Lag 0 of an autocorrelation is always 1.
+    """Return the chart of the correlation between the residual of `output` and an input `signal` over the lag.
+
+    An empty `signal` stands for the residual itself (autocorrelation).
+    """
+    # Lag 0 of an autocorrelation is omitted, because its value is always 1.
     keep = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
     values = test.values[keep]
     band = np.full(values.size, test.band)
@@ -310,7 +317,10 @@ def _residual_caption(test: CorrelationTest, values: Floats, signal: str) -> str
 
 
 def run_charts(run: Run, *signals: str) -> Figures:
-    """Return charts of a run; see :meth:`ftlm.Run.plot`."""
+    """Return a chart of each named signal of a run, by default of all signals; see :meth:`ftlm.Run.plot`.
+
+    Raise DataError if the run lacks a signal.
+    """
     unknown = [name for name in signals if name not in run]
     if unknown:
         raise DataError(f"signal {unknown[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}")
@@ -320,8 +330,8 @@ def run_charts(run: Run, *signals: str) -> Figures:
 def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:
     """Return the pointwise 95 % confidence band of each simulated output on one run, by output.
 
-    The covariance of orders and coefficients is propagated to first order. The band excludes measurement noise and the
-    uncertainty of delays, saturations and dead zones. It takes one simulation per parameter.
+    The covariance of orders and coefficients is propagated to first order. The band does not include measurement noise,
+    or the uncertainty of delays, saturations and dead zones. The computation takes one simulation per parameter.
 
     Parameters
     ----------
@@ -330,13 +340,13 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     run
         Run that the model is compared with.
     comparison
-        Comparison with this run alone.
+        Comparison of the model with this run alone.
 
     Returns
     -------
     dict
-        (lower, upper) edge of the band by output. Empty for a model without covariance, and if a simulation with a
-        changed parameter fails.
+        (lower, upper) edges of the band by output. The dictionary is empty for a model without covariance, or if a
+        simulation with a changed parameter fails.
     """
     spread = covariance_of(model)
     if spread is None:

@@ -48,20 +48,24 @@ from ftlm.utils.validation import as_array
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
-#: Width of a figure and height of one row of axes [inch]; the width is a journal's double column.
+#: Width of a figure and height of one row of axes [inch]. The width is that of two columns of a journal.
 FIGURE_WIDTH_INCH, ROW_HEIGHT_INCH = 7.0, 2.2
-#: Height of a legend over the lines, as a share of the plot.
+#: Free space above the lines for the legend, as a fraction of the range of the vertical axis.
 LEGEND_HEIGHT_SHARE = 0.25
-#: Resolution in a notebook.
+#: Resolution of figures in notebooks [dots per inch].
 NOTEBOOK_DPI = 110
 
 
 def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **options: Any) -> tuple[Any, Any]:
-    """Return a figure with a grid of axes, created without pyplot."""
+    """Return a new figure, created without pyplot, and its axes as an array of shape (rows, columns).
+
+    `row` is the height of a row of axes [inch], and `options` are passed to ``Figure.subplots``. Raise ModelError if
+    matplotlib is not installed.
+    """
     module = optional_module("matplotlib.figure", "matplotlib", "'ftlm[plot]'")
 
     class NotebookFigure(module.Figure):  # type: ignore[misc, name-defined]
-        """Figure that notebooks show although it was not created by pyplot."""
+        """Matplotlib figure that notebooks display without pyplot."""
 
         def _repr_png_(self) -> bytes:
             data = io.BytesIO()
@@ -73,7 +77,10 @@ def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **op
 
 
 def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """Return a figure and a grid of axes with `rows` rows, from the given axes or a new figure."""
+    """Return a figure and its axes, shape (rows, columns): the given axes `ax`, or those of a new figure for None.
+
+    Raise ModelError if `ax` contains other objects, or their number is not rows times columns.
+    """
     if ax is None:
         return figure_of(rows, columns, **options)
     axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
@@ -91,7 +98,10 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
 
 
 def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> Any:
-    """Draw rows of charts into the given axes or a new figure, and return the figure."""
+    """Draw rows of charts into the axes `ax`, or into a new figure if it is None, and return the figure.
+
+    `options` are those of :func:`figure_of`.
+    """
     figure, axes = axes_for(ax, max(len(rows), 1), max((len(row) for row in rows), default=1), **options)
     for row, charts in zip(axes, rows, strict=False):
         for axis, chart in zip(row, charts, strict=False):
@@ -102,12 +112,12 @@ def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> An
 
 
 def escape_math(text: str) -> str:
-    """Return text escaped for matplotlib, whose math mode is used only for powers."""
+    """Return text with dollar signs escaped, and powers such as s^2 in matplotlib's math mode."""
     return re.sub(r"((?<!\w)\w|)\^([\d.]+)", r"$\1^{\2}$", text.replace("$", r"\$"))
 
 
 def draw_chart(axis: Any, chart: Figure) -> None:
-    """Draw a chart in matplotlib axes."""
+    """Draw a chart and its title in matplotlib axes."""
     axis.set_title(escape_math(chart.title), fontsize="small")
     if isinstance(chart, LineChart):
         _draw_lines(axis, chart)
@@ -141,13 +151,13 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
         else:
             dash = (0, [float(length) for length in dashes.split()]) if dashes else "-"
             drawn = {"drawstyle": "steps-post"} if chart.steps else {}
-            # The measured line is wide enough to show on both sides of one that follows it exactly.
+            # The measured line is wider, so that it stays visible behind a simulated line that coincides with it.
             width = 2.2 if style == 0 and len(styles) > 1 else 1.0
             axis.plot(x, values, color=color, linewidth=width, linestyle=dash, label=label, **drawn)
     for (low, high), style in zip(chart.bands, styles, strict=False):
         axis.fill_between(x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
     left, right, bottom, top = chart.frame
-    # The legend has its own place above the lines.
+    # Free space for the legend, so that it does not cover the lines.
     top += LEGEND_HEIGHT_SHARE * (top - bottom) if any(name for name, _ in chart.lines) else 0.0
     xlim, ylim = (10.0**left, 10.0**right) if chart.log_x else (left, right), (bottom, top)
     axis.set(xscale="log" if chart.log_x else "linear", yscale="log" if chart.log_y else "linear")
@@ -156,7 +166,7 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
 
 
 def _label_axes(axis: Any, x_label: str, y_label: str, **legend: Any) -> None:
-    """Set the labels and the grid of axes, and a legend of named lines."""
+    """Set the axis labels and the grid, and add a legend if a line has a name."""
     axis.set(xlabel=escape_math(x_label), ylabel=escape_math(y_label))
     axis.grid(visible=True, alpha=0.3)
     axis.set_axisbelow(True)
@@ -191,7 +201,7 @@ def _draw_bars(axis: Any, chart: BarChart) -> None:
         axis.bar_label(bars, [f"{v:.4g}" for v in values], fontsize="small", padding=3)
     axis.set_yticks(range(len(chart.names)), [escape_math(n) for n in chart.names])
     axis.invert_yaxis()
-    # Beside the longest bar there is room for its number.
+    # The axis extends beyond the longest bar, because the value is printed next to it.
     axis.set(xlim=(low, low + 1.12 * (high - low)))
     _label_axes(axis, chart.x_label, "")
 
@@ -221,7 +231,7 @@ def _draw_landscape(axis: Any, chart: Landscape) -> None:
     axis.figure.colorbar(drawn, ax=axis, label=f"{chart.score} (grey: no candidate, or diverged)")
 
 
-#: Height of a residual plot relative to the fit plot above it.
+#: Height of a residual plot, as a fraction of the height of the fit plot above it.
 RESIDUAL_HEIGHT_SHARE = 0.4
 
 
@@ -238,11 +248,12 @@ def fit(
     Parameters
     ----------
     result
-        Comparison; identification, plotted on its own runs unless others are given; or model, which requires `runs`.
+        A comparison, an identification or a model. An identification is by default plotted on its estimation runs. A
+        model requires `runs`.
     runs
-        Runs to compare with.
+        Measured runs that the model is compared with.
     inputs
-        Whether the inputs of each run are plotted below its outputs.
+        Whether the inputs of each run are plotted below its outputs. For a comparison this requires `runs`.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -254,10 +265,10 @@ def fit(
     Raises
     ------
     ModelError
-        A model without runs, inputs without runs, something that is not a result, invalid axes or too many or
-        few, or no matplotlib.
+        If `result` has another type, or a model or requested inputs are given without runs. Also if `ax` is not the
+        required number of axes, or matplotlib is not installed.
     DataError
-        Runs that do not fit the model.
+        If a run lacks a signal of the model.
     """
     units: Mapping[str, str] = {}
     if isinstance(result, Comparison):
@@ -288,7 +299,7 @@ def fit(
 
 
 def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
-    """Return the runs of a comparison, whose inputs are plotted."""
+    """Return the given runs, or else the estimation runs of an identification; raise ModelError without runs."""
     if runs is not None:
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
@@ -304,7 +315,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
     Parameters
     ----------
     run
-        The run.
+        Run to plot.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -316,7 +327,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is not a run, an invalid or wrong number of axes, or no matplotlib.
+        If `run` is not a run, `ax` is not the required number of axes, or matplotlib is not installed.
     """
     charts = [[signal_chart(run, name)] for name in (*run.outputs, *run.inputs)]
     return draw_figure(charts, ax, row=ROW_HEIGHT_INCH * 0.6)
@@ -324,24 +335,25 @@ def run(run: Run, *, ax: Any = None) -> Any:
 
 @check_arguments
 def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
-    """Plot correlations of the residuals with themselves and with every input, with 99 % bands.
+    """Plot the autocorrelation of the residuals and their cross-correlations with every input, with 99 % bands.
 
     Parameters
     ----------
     tests
-        From :func:`ftlm.resid`, or an identification (on its own runs).
+        Result of :func:`ftlm.resid`, or an identification, whose residuals on its estimation runs are plotted.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        A row for every output.
+        One row for every output, with one axes for the autocorrelation and one for every input.
 
     Raises
     ------
     ModelError
-        An identification whose runs were too short for tests, something that is not a result, or no matplotlib.
+        If the runs of the identification were too short for residual tests, `tests` has another type, or matplotlib is
+        not installed.
     """
     results = tests.residuals if isinstance(tests, Identification) else tests
     if results is None:
@@ -360,10 +372,11 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     Parameters
     ----------
     result
-        An identification by output error or with an order search, or a landscape (``ftlm.report.landscape``,
-        ``ftlm.report.output_error_landscape``), which may be of any two orders.
+        An identification by output error or with an order search, or a landscape. A landscape of any two orders is
+        returned by ``ftlm.report.landscape`` and ``ftlm.report.output_error_landscape``.
     output
-        Name of the search of an identification; by default the first.
+        Output whose order search is plotted, or ``"stage"`` for a search of coupled equations; by default the first
+        search of the identification.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -374,7 +387,8 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     Raises
     ------
     ModelError
-        An identification without an order search of this output, fewer than two free orders, or no matplotlib.
+        If the identification has no order search of this output, or no two free orders with standard errors. Also if
+        matplotlib is not installed.
     """
     if not isinstance(result, Identification):
         surface: Landscape | None = result
@@ -385,7 +399,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
             raise ModelError("the identification has no order search; identify with an order grid to draw its scores")
         name = next(iter(result.searches)) if output is None else output
         if name not in result.searches:
-            raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
+            raise ModelError(f"there is no order search {name!r}; the searches are {', '.join(result.searches)}")
         part = result.task.structure if name == "stage" else result.task.structure.equation(name)
         surface = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
     if surface is None:
@@ -414,22 +428,22 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     Raises
     ------
     ModelError
-        Something that is not a model, or no matplotlib.
+        If `model` has another type, or matplotlib is not installed.
     DataError
-        Frequencies that are not finite numbers from 0.
+        If a frequency is not finite or is negative.
     """
     charts = bode_charts(_model_of(model), w)
     return draw_figure([charts[k : k + 2] for k in range(0, len(charts), 2)] or [[], []], ax)
 
 
 def _model_of(model: Model | Identification) -> Model:
-    """Return the model of an argument."""
+    """Return the model of an identification, or the given model itself."""
     return model.model if isinstance(model, Identification) else model
 
 
 @check_arguments
 def poles(model: Model | Identification, *, ax: Any = None) -> Any:
-    """Plot poles in the plane of s^q (s for integer orders) with the unstable sector.
+    """Plot poles in the complex plane of s^q, with the unstable sector; q is 1 for integer orders.
 
     Parameters
     ----------
@@ -445,7 +459,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is not a model, a model with friction or without poles, invalid axes, or no matplotlib.
+        If `model` has another type, friction or no poles, `ax` is invalid, or matplotlib is not installed.
     """
     charts = pole_charts(_model_of(model))
     if not charts:
@@ -455,14 +469,14 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
 
 @check_arguments
 def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
-    """Plot the response to unit steps from rest, with its 95 % band if the model has a covariance.
+    """Plot the responses to unit steps with zero initial conditions, with 95 % bands if the model has a covariance.
 
     Parameters
     ----------
     model
         A model or an identification.
     time
-        Uniform sample times from 0 [s]; by default up to the settling time.
+        Uniform sample times that begin at 0 [s]; by default up to the settling time.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -474,16 +488,20 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     Raises
     ------
     ModelError
-        Something that is not a model, a model with a saturation or dead zone of an input, invalid axes, no matplotlib.
+        If `model` has another type, or an input with a saturation or dead zone. Also if `ax` is invalid, or matplotlib
+        is not installed.
     DataError
-        Sample times that are not uniform from 0.
+        If sample times are not uniform, or do not begin at 0.
     """
     return _response_figure(_model_of(model).step(time), ax)
 
 
 @check_arguments
 def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
-    """Plot the response to unit impulses, averaged over each interval; otherwise as :func:`step`."""
+    """Plot the responses to unit impulses, averaged over each sampling interval.
+
+    Arguments, figure and errors are those of :func:`step`.
+    """
     return _response_figure(_model_of(model).impulse(time), ax)
 
 
@@ -527,12 +545,12 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
 
 @check_arguments
 def residual_series(result: Identification | Comparison, *, ax: Any = None) -> Any:
-    """Plot output-error residuals over time and their histogram.
+    """Plot output-error residuals (measured minus simulated) over time, and their histograms.
 
     Parameters
     ----------
     result
-        An identification (on its own runs) or a comparison.
+        An identification, whose residuals on its estimation runs are plotted, or a comparison.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -544,7 +562,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     Raises
     ------
     ModelError
-        Something that is not a result, an invalid or wrong number of axes, or no matplotlib.
+        If `result` has another type, `ax` is not the required number of axes, or matplotlib is not installed.
     """
     comparison = result.comparison if isinstance(result, Identification) else result
     units = result.model.units if isinstance(result, Identification) else {}
@@ -554,12 +572,12 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
 
 @check_arguments
 def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
-    """Plot the fits of several models on the same runs as bars.
+    """Plot the fits [%] of several models on the same runs as a bar chart.
 
     Parameters
     ----------
     compared
-        Comparisons by the name of the model.
+        Comparison of each model with the runs, by the name of the model.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -571,16 +589,17 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        No model, something that is not a comparison, models with other outputs, invalid axes, or no matplotlib.
+        If there is no model, a value is not a comparison, or the models have different outputs. Also if `ax` is
+        invalid, or matplotlib is not installed.
     """
     if not compared:
-        raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")
+        raise ModelError("compared is empty; give at least one comparison by name, such as {'integer': a, 'free': b}")
     outputs = list(next(iter(compared.values())).output_error)
     for name, comparison in compared.items():
         if list(comparison.output_error) != outputs:
             raise ModelError(
-                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}; give "
-                "comparisons of the same outputs"
+                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first has {', '.join(outputs)}; "
+                "give comparisons of the same outputs"
             )
     chart = BarChart(
         list(compared),
@@ -594,7 +613,9 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
 
 @check_arguments
 def design(result: DesignedInput, *, ax: Any = None) -> Any:
-    """Plot a designed input and its spectrum, the predicted responses to it and to a square wave, and the limits.
+    """Plot a designed input and its spectrum, with the predicted outputs and the limits of the signals.
+
+    A square wave of the same length and peaks, and the outputs for it, are plotted for comparison.
 
     Parameters
     ----------
@@ -611,14 +632,14 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Another type of result, the wrong number of axes, or no matplotlib.
+        If `result` has another type, `ax` is not the required number of axes, or matplotlib is not installed.
     """
     charts = [[_designed_chart(result, name)] for name in (*result.run.inputs, *result.run.outputs)]
     return draw_figure([*charts, [_spectrum_chart(result)]], ax, row=1.9)
 
 
 def _designed_chart(result: DesignedInput, name: str) -> LineChart:
-    """Return the chart of a signal in the designed run and in the square-wave run, with its limits."""
+    """Return the chart of signal `name` in the designed run and in the square-wave run, with its limits as a band."""
     run, square = result.run, result.reference
     lines = [("designed", run[name]), (square.name, square[name])]
     limit = next(r.limit for r in result.predicted_extremes if r.name == name)
@@ -627,9 +648,10 @@ def _designed_chart(result: DesignedInput, name: str) -> LineChart:
 
 
 def _spectrum_chart(result: DesignedInput) -> LineChart:
-    """Return the chart of the cumulative power of a designed input over frequency.
+    """Return the chart of the power below each frequency, as a fraction, of the designed and the square-wave input.
 
-    It shows differences between line spectra better than the spectrum itself.
+    A cumulative curve shows differences between line spectra better than the spectrum itself. The optimal periodic
+    spectrum is included if it has power.
     """
     rows, lines = result.run.length - 1, result.spectrum.lines.frequencies
     every = np.fft.rfftfreq(rows, result.step)
@@ -656,21 +678,23 @@ def response(
     result
         Result of :func:`ftlm.identify_frequency`, or a model.
     data
-        Responses to draw, by default those of the fit; required for a model.
+        Measured responses to draw; by default those of the identification. A model requires them.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Gain on the left, phase on the right, a row for every record; of an impedance magnitude and phase over Hz.
+        Gain on the left, phase on the right, a row for every measured response. For an impedance, magnitude and phase
+        are drawn over frequency in Hz.
 
     Raises
     ------
     ModelError
-        Another type of result, a model without data, the wrong number of axes, or no matplotlib.
+        If `result` or `data` has another type, or a model is given without data. Also if `ax` is not the required
+        number of axes, or matplotlib is not installed.
     DataError
-        Data of signals that the model does not have.
+        If the model lacks a signal of the data.
     """
     model, records = _model_and_data(result, data)
     return draw_figure([record_charts(model, record) for record in records], ax)
@@ -685,19 +709,19 @@ def nyquist(
     Parameters
     ----------
     result, data, ax
-        See :func:`response`. An impedance has its negative imaginary part upwards.
+        See :func:`response`. For an impedance, the vertical axis is the negative imaginary part.
 
     Returns
     -------
     matplotlib.figure.Figure
-        One axes for every record.
+        One axes for every measured response.
 
     Raises
     ------
     ModelError
         See :func:`response`.
     DataError
-        Data of signals that the model does not have.
+        If the model lacks a signal of the data.
     """
     model, records = _model_and_data(result, data)
     return draw_figure([[nyquist_chart(model, record)] for record in records], ax, row=3.4)
@@ -706,7 +730,10 @@ def nyquist(
 def _model_and_data(
     result: FrequencyIdentification | Model, data: FrequencyData | FrequencyValidation | None
 ) -> tuple[Model | Circuit, list[FrequencyData]]:
-    """Return the model and the frequency data of the arguments."""
+    """Return the model and the measured responses to draw, from the arguments of :func:`response`.
+
+    Raise ModelError for other types, or if there are no measured responses.
+    """
     if not isinstance(result, (FrequencyIdentification, Model)):
         raise ModelError(f"result is {type(result).__name__}; give what identify_frequency returns, or a model")
     if isinstance(result, FrequencyIdentification):

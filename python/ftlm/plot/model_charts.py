@@ -32,9 +32,10 @@ from ftlm.utils.validation import Complex, Floats, as_floats
 
 
 def response_frequencies(model: Model, step: float | None = None, duration: float | None = None) -> Floats:
-    """Return default frequencies [rad/s] of a Bode plot.
+    """Return 240 logarithmically spaced frequencies [rad/s] for a Bode plot.
 
-    They range from one period per record to the Nyquist frequency.
+    For runs with a sampling interval `step` [s] and a duration [s], they range from one period per run to the Nyquist
+    frequency. Otherwise they cover two decades on each side of the mean corner frequency of the model.
     """
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
@@ -48,12 +49,14 @@ def response_frequencies(model: Model, step: float | None = None, duration: floa
 
 @check_arguments
 def bode_charts(model: Model, w: ArrayLike | None = None) -> list[LineChart]:
-    """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
+    """Return gain and phase charts for every pair of output and external input.
+
+    They include 95 % bands if the model has a covariance.
 
     Parameters
     ----------
     model
-        The model.
+        Model.
     w
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
@@ -62,7 +65,7 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[LineChart]:
 
 
 def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
-    """Return the gain and phase charts of some curves."""
+    """Return a gain chart and a phase chart for every Bode curve; `omega` are its frequencies [rad/s]."""
     charts = []
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
@@ -73,13 +76,16 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
 
 
 def pole_points(model: Model) -> tuple[float, Complex]:
-    """Return the order q of the plane s^q, and the poles in this plane; empty for a non-linear model."""
+    """Return the order q of the pole plane s^q, and the poles as complex values in this plane.
+
+    There are no poles for a nonlinear model.
+    """
     q = plane_order(model)
     model_modes = modes(model) if model.structure.is_linear else ()
     points = []
     for m in model_modes:
         angle = math.acos(max(-1.0, min(1.0, -m.damping)))
-        # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
+        # The zero of a relaxation of fractional order may have |arg s| > pi. It is drawn on the negative axis of s^q.
         turn = math.pi if not m.oscillatory and not m.unstable else q * angle
         value = m.frequency**q * complex(math.cos(turn), math.sin(turn))
         points += [value, value.conjugate()] if m.oscillatory else [complex(value.real)]
@@ -88,14 +94,15 @@ def pole_points(model: Model) -> tuple[float, Complex]:
 
 @check_arguments
 def pole_charts(model: Model) -> list[PlaneChart]:
-    """Return the pole chart in the plane of s^q with the unstable sector; [] for friction or without poles.
+    """Return a list with the pole chart in the plane of s^q, in which the unstable sector is shaded.
 
-    The order q is the highest order divided by the next integer.
+    The list is empty for a model with friction or without poles. The order q is 1 for integer orders, otherwise the
+    highest order divided by the next higher integer.
 
     Parameters
     ----------
     model
-        Any model.
+        Model; it need not be linear.
     """
     q, points = pole_points(model)
     if not points.size:
@@ -133,7 +140,10 @@ def plane_order(model: Model) -> float:
 
 @dataclass(frozen=True)
 class BodeCurve:
-    """Gain [dB] and phase [degrees] from one input to one output, with half-widths of 95 % confidence bands."""
+    """Gain [dB] and phase [degrees] over frequency from one input to one output.
+
+    The spreads are half-widths of the 95 % confidence bands in the same units; None without a covariance.
+    """
 
     output: str
     input: str
@@ -144,7 +154,10 @@ class BodeCurve:
 
 
 def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
-    """Return the Bode curves of all pairs of input and output with a nonzero response; friction inputs are omitted."""
+    """Return the Bode curve of every pair of input and output with a nonzero response at frequencies `omega` [rad/s].
+
+    Friction forces, which are inputs of the linear part, are omitted.
+    """
     response = frequency_response(model, omega)
     spread = None if covariance_of(model) is None else response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
@@ -166,21 +179,22 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
 
 @dataclass(frozen=True)
 class Bode:
-    """Result of :meth:`ftlm.Model.bode`: frequency response with its charts.
+    """Result of :meth:`ftlm.Model.bode`: frequency responses with their charts.
 
     Parameters
     ----------
     frequency
-        [rad/s], shape (W,).
+        Frequencies [rad/s], shape (W,).
     curves
-        Gain [dB], phase [degrees] and half-widths of their 95 % bands for every connected pair of input and output.
+        Gain [dB] and phase [degrees] with half-widths of their 95 % bands, for every pair of input and output with a
+        nonzero response.
     """
 
     frequency: Floats
     curves: tuple[BodeCurve, ...]
 
     def figures(self) -> list[Figure]:
-        """Return the charts, as in a report."""
+        """Return the SVG charts of the result, as a report shows them."""
         return [*curve_charts(self.frequency, self.curves)]
 
     def __str__(self) -> str:
@@ -202,12 +216,14 @@ def bode(model: Model, w: ArrayLike | None = None) -> Bode:
 
 @check_arguments
 def response_charts(result: Response, *, units: Mapping[str, str] | None = None) -> list[LineChart]:
-    """Return step or impulse response charts of every connected pair of input and output, with 95 % bands.
+    """Return a chart of the step or impulse response of every pair of input and output with a nonzero response.
+
+    The charts include 95 % bands if standard deviations are known.
 
     Parameters
     ----------
     result
-        Responses, sample times and standard deviations.
+        Responses with their sample times and standard deviations.
     units
         Units of the signals by name.
     """
@@ -220,7 +236,7 @@ def response_charts(result: Response, *, units: Mapping[str, str] | None = None)
 
 
 def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
-    """Return the chart of the response of the output with index i to the input with index j, with its 95 % band."""
+    """Return the chart of the response of output i to input j (indices), with its 95 % band if it is known."""
     output, values = found.outputs[i], found.values[i, j]
     bands, shade = [], "No covariance, so there is no band."
     if found.deviation is not None:
@@ -241,21 +257,22 @@ def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) ->
 
 @dataclass(frozen=True)
 class TimeResponse(Response):
-    """Result of :meth:`ftlm.Model.step` or `impulse`: a response with its charts.
+    """Result of :meth:`ftlm.Model.step` or :meth:`ftlm.Model.impulse`: responses with their charts.
 
     Parameters
     ----------
     kind, outputs, inputs, time, values, deviation
-        ``"step"`` or ``"impulse"``; names; sample times [s], shape (N,); values and their standard deviations (or
-        None), shape (outputs, inputs, N). An impulse response is the mean over each interval, at its middle.
+        ``"step"`` or ``"impulse"``. Names of outputs and inputs. Sample times [s], shape (N,). Responses and their
+        standard deviations (or None), shape (outputs, inputs, N). An impulse response is a mean over each sampling
+        interval, at the middle of the interval.
     units
-        Units of the signals.
+        Units of the signals by name.
     """
 
     units: Mapping[str, str] = field(default_factory=dict)
 
     def figures(self) -> list[Figure]:
-        """Return the charts, as in a report."""
+        """Return the SVG charts of the result, as a report shows them."""
         return [*response_charts(self, units=self.units)]
 
     def __str__(self) -> str:
@@ -276,6 +293,6 @@ class TimeResponse(Response):
 
 
 def time_response(model: Model, time: ArrayLike | None, kind: str) -> TimeResponse:
-    """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
+    """Return the responses of a model for `kind` "step" or "impulse", with charts; see :meth:`ftlm.Model.step`."""
     result = response(model, time, kind=kind)
     return TimeResponse(**vars(result), units=dict(model.units))

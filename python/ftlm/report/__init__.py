@@ -1,4 +1,4 @@
-"""Reports: one HTML file with tables and charts that opens offline."""
+"""HTML reports with tables and charts. Each report is a single file, which can be opened offline."""
 
 from ftlm.report.html_report import identification_page, model_page
 from ftlm.svg.html_page import Section, Table, write_page

@@ -68,13 +68,13 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_table
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, resid, residual_table
 
-#: Largest number of pole maps and step responses on a page.
+#: Maximum number of pole maps and step responses together on a page.
 MAX_RESPONSE_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
 def verdict_box(judgement: Verdict, of: str = "") -> Markup:
-    """Return HTML of a verdict for the top of a page; `of` names the model if there are several."""
+    """Return a verdict as an HTML box for the top of a page; the prefix `of` names one of several models."""
     remedy = Markup(' <span class="todo">→ {}</span>').format(judgement.remedy) if judgement.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LEVEL_CSS_CLASSES[judgement.level],
@@ -85,7 +85,10 @@ def verdict_box(judgement: Verdict, of: str = "") -> Markup:
 
 
 def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
-    """Return sentences on findings: first the most serious groups with remedies, second all others."""
+    """Return two lists of sentences: the most serious findings, and all other findings.
+
+    The first list has one sentence with its remedy for each of the `MAX_SUMMARY_FINDINGS` most serious groups.
+    """
     first: list[str] = []
     rest: list[str] = []
     for k, group in enumerate(group_findings(findings)):
@@ -99,12 +102,12 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
 
 
 def _on_validation(findings: Iterable[Finding], run: Run) -> list[Finding]:
-    """Return findings on a run, marked as findings on a validation run."""
+    """Return copies of findings that are marked as findings on the validation run `run`."""
     return [msgspec.structs.replace(f, run=f.run or run.name, role=VALIDATION_ROLE) for f in findings]
 
 
 def title_of(model: Model) -> str:
-    """Return the page title for a model."""
+    """Return the page title for a model: the name of its structure, or its outputs and inputs."""
     structure = model.structure
     if structure.name != "equation":
         return structure.name
@@ -114,7 +117,10 @@ def title_of(model: Model) -> str:
 
 
 def behavior_tables(model: Model) -> list[Table]:
-    """Return tables of steady-state gains and modes with standard errors; empty if the model has none."""
+    """Return tables of steady-state gains and of modes with standard errors.
+
+    A table is omitted if it would be empty. The list is empty for a model that is not linear.
+    """
     if not model.structure.is_linear:
         return []
     tables = []
@@ -123,7 +129,7 @@ def behavior_tables(model: Model) -> list[Table]:
         grows = any(mode.unstable for mode in model_modes)
         states = () if grows or model.structure.limits else steady_states(model)
     except FtlmError:
-        # Equations that cannot be solved for their outputs together have neither.
+        # Equations that cannot be solved for all outputs together have neither gains nor modes.
         return []
     if states:
         rows: list[list[Cell]] = []
@@ -169,7 +175,11 @@ def behavior_tables(model: Model) -> list[Table]:
 
 
 def behavior_figures(model: Model) -> list[Figure]:
-    """Return pole maps and step responses; outputs without poles or with overflow are omitted."""
+    """Return the pole map and step responses, at most `MAX_RESPONSE_FIGURES` charts.
+
+    The list is empty for a model that is not linear, or has a saturation or dead zone. Charts that cannot be computed
+    are omitted.
+    """
     figures: list[Figure] = []
     if not model.structure.is_linear or model.structure.limits:
         return figures
@@ -179,24 +189,25 @@ def behavior_figures(model: Model) -> list[Figure]:
     return figures[:MAX_RESPONSE_FIGURES]
 
 
-#: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.
+#: Maximum number of charts of measured and simulated outputs on a page, and of points in all their lines. A point takes
+#: at most 10 bytes, so that the page stays below 2 MB.
 PAGE_CHARTS = 60
 PAGE_POINTS = 90_000
-#: Charts of residuals, and of the frequency response, on a page.
+#: Maximum number of residual charts, and of frequency-response charts, on a page.
 SMALL_CHARTS = 24
-#: Points of a line in a notebook, which keeps what it shows.
+#: Maximum number of points of a line in a notebook, whose file stores every displayed chart.
 NOTEBOOK_POINTS = 600
-#: Points of a line of residuals in a small chart.
+#: Maximum number of points of a residual line in a small chart.
 SERIES_POINTS = 600
-#: Points of a convergence curve.
+#: Approximate number of points of a convergence curve of the recursion.
 TRACE_POINTS = 64
-#: Text for models with friction, in place of their stability.
+#: Texts for models that are not linear, in place of a statement on their stability.
 FRICTION_STABILITY_NOTE = "A model with friction is not linear, so it has no poles."
 NONLINEAR_STABILITY_NOTE = "The model is not linear: only its linear model about a point has poles."
 
 
 def stability_note(model: Model) -> str:
-    """Return a sentence on the stability of a model."""
+    """Return a sentence on the stability of a model, or on the reason why it has no poles."""
     if model.structure.has_nonlinear_terms:
         return NONLINEAR_STABILITY_NOTE
     return FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}."
@@ -220,9 +231,14 @@ def identification_page(
     path, validation, force
         See :meth:`ftlm.Identification.report`.
     sections
-        Sections on the choice of the structure, after the warnings.
+        Sections on the structure selection, which follow the warnings.
     validated
-        Comparison with validation runs in place of `validation`, if the runs are not available.
+        Comparison with validation runs, used if `validation` is None because the runs are not available.
+
+    Returns
+    -------
+    Path
+        The file that was written.
     """
     check_free(path, force=force)
     model = result.model
@@ -267,7 +283,10 @@ def _write_model_page(
     *,
     force: bool,
 ) -> Path:
-    """Write a page with the verdict and the sections of a model, followed by collapsed details."""
+    """Write a page with a verdict, `sections` and collapsed `details`, and return its path.
+
+    `compared` has (role of the data, comparison) pairs, whose fits are summarized below the title.
+    """
     every, box = [*sections, *(replace(section, collapsed=True) for section in details)], verdict_box(judgement)
     return write_page(path, title=title_of(model), sections=every, lead=lead_of(compared), force=force, verdict=box)
 
@@ -282,10 +301,24 @@ def first_sections(
     bands: Sequence[Mapping[str, Band]] = (),
     offsets: Mapping[str, Parameter] | None = None,
 ) -> list[Section]:
-    """Return the first sections of a page: fit on validation runs, equations, warnings, and collapsed details.
+    """Return the first sections of a page: measured and simulated outputs, equations, warnings, and collapsed details.
 
-    Without validation runs, the fit on the estimation runs is shown. `bands` are confidence bands of the simulated
-    outputs on the validation runs. `offsets` are those of the estimation runs.
+    The outputs are those of the validation runs, or of the estimation runs without validation.
+
+    Parameters
+    ----------
+    compared
+        (role, comparison) pairs; the role is "estimation" or "validation".
+    validated
+        Whether a validation run was given.
+    joint
+        Output-error fit of the model; None for other methods.
+    runs
+        Runs of all comparisons in the same sequence, for charts of the inputs.
+    bands
+        For each validation comparison, confidence bands of the simulated outputs by output.
+    offsets
+        Offsets of the estimation runs by name.
     """
     units = model.units
     words = [
@@ -298,7 +331,7 @@ def first_sections(
     warned = unique(findings)
     findings_shown, rest = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
-    # Two lines a chart, drawn once wide and once narrow with half the points.
+    # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
@@ -338,9 +371,10 @@ def _with_inputs(
     points: int,
     bands: Sequence[Mapping[str, Band]] = (),
 ) -> list[Figure]:
-    """Return charts of measured and simulated outputs of each run, followed by its inputs if available.
+    """Return charts of the measured and simulated outputs of each compared run, followed by its inputs.
 
-    The runs of the comparisons are removed from the start of the list `runs`.
+    `runs` starts with the compared runs, which are removed from this list. Inputs of a run that is not in it are
+    omitted. `points` is the maximum number of points of a line.
     """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
     charts: list[Figure] = []
@@ -356,12 +390,12 @@ def _with_inputs(
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
-    """Return the residual tests of each run that is long enough."""
+    """Return a ("validation", residual tests) pair for each run that has at least 2 DEFAULT_LAGS + 3 samples."""
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * DEFAULT_LAGS + 3]
 
 
 def correlation_sections(joint: JointFit | None) -> list[Section]:
-    """Return a section with the correlation matrix of a joint fit; [] for one parameter or without covariance."""
+    """Return a section with the correlation matrix of the estimates; [] without a joint fit or for one parameter."""
     if joint is None or len(joint.names) < 2:
         return []
     words = (
@@ -379,7 +413,10 @@ def residual_section(
     compared: Sequence[tuple[str, Comparison]] = (),
     units: Mapping[str, str] | None = None,
 ) -> Section:
-    """Return a section with residual tests, information criteria, residual series, histograms and correlations."""
+    """Return a section with residual tests, information criteria, residual series, histograms and correlations.
+
+    `tests` and `compared` have (role, result) pairs; a role is "estimation" or "validation".
+    """
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
@@ -391,9 +428,10 @@ def residual_section(
 
 
 def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> list[Section]:
-    """Return a section with Bode charts over the frequency range of runs; [] for a model with non-linear terms.
+    """Return a section with Bode charts of a model; [] for a model with nonlinear terms.
 
-    `steps` are the (sampling interval, duration) pairs of the runs [s].
+    `steps` are (sampling interval, duration) pairs of the runs [s], which determine the frequency range. Without runs
+    it follows from the model.
     """
     structure = model.structure
     if structure.has_nonlinear_terms:
@@ -420,7 +458,10 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
 
 
 def _search_sections(result: Identification) -> list[Section]:
-    """Return sections with the convergence of the multi-innovation recursion and the cost over two orders."""
+    """Return sections with the convergence of the multi-innovation recursion and with the cost over two orders.
+
+    A section that does not apply to the method of the result is omitted.
+    """
     sections = []
     traces = _traces(result)
     if traces:
@@ -442,7 +483,7 @@ def _search_sections(result: Identification) -> list[Section]:
 
 
 def _order_search_sections(result: Identification) -> list[Section]:
-    """Return a section with the best rows of order searches, score profiles and maps; [] without a search."""
+    """Return a section with the best candidates of order searches, score profiles and maps; [] without a search."""
     if not result.searches:
         return []
     tops = [search_top(name, search) for name, search in result.searches.items()]
@@ -451,7 +492,7 @@ def _order_search_sections(result: Identification) -> list[Section]:
 
 
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
-    """Return score profiles over each order, and score maps over two orders of searches with two or more."""
+    """Return charts of the score over each order, and score maps over two orders of searches with two or more."""
     maps: list[Figure] = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
@@ -463,9 +504,10 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
 
 
 def _traces(result: Identification) -> list[LineChart]:
-    """Return charts of the multi-innovation recursion at the best orders, for the paper's p and the p of the result.
+    """Return charts of the error of the multi-innovation recursion at the identified orders, one per equation.
 
-    Empty if the first run does not start at rest.
+    The lines are for the innovation lengths p of the paper and of the result. The list is empty for other methods,
+    nonzero initial conditions, or an estimated offset.
     """
     if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
         return []
@@ -492,7 +534,7 @@ def _traces(result: Identification) -> list[LineChart]:
 
 
 def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
-    """Return text with the fit of the simulation in percent, one sentence for each data set."""
+    """Return text on the simulation fit of every output [%], one sentence for each (role of the data, comparison)."""
     sentences = []
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit.items())
@@ -502,7 +544,10 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
 
 
 def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
-    """Return a table of orders and coefficients of a joint fit with intervals, and true values if given."""
+    """Return a table of orders and coefficients of a joint fit with 95 % intervals, and true values by name if given.
+
+    The table has no rows without a joint fit.
+    """
     rows: list[list[Cell]] = []
     if result is not None and result.joint is not None:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
@@ -517,7 +562,10 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
 
 
 def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
-    """Return sentences on findings of several results by label; findings that differ only in numbers are merged."""
+    """Return sentences on the findings of several results, each with the labels of the results that have it.
+
+    Findings that differ only in numbers are merged; the sentence then has the numbers of the first one.
+    """
     groups: dict[tuple[str, ...], tuple[Finding, list[str]]] = {}
     for label, result in results.items():
         for item in () if result is None else result.findings:
@@ -530,12 +578,12 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
     ]
 
 
-#: Initial guesses in the table of a report.
+#: Maximum number of initial guesses in the table of a report.
 MAX_STARTS_SHOWN = 10
 
 
 def starts_table(joint: JointFit) -> Table:
-    """Return a table of the initial guesses and their costs on subsampled records, best first."""
+    """Return a table of the best automatic initial guesses of a fit, with their costs on subsampled records."""
     best = joint.starts[:MAX_STARTS_SHOWN]
     cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best, 1)]
     note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
@@ -543,7 +591,7 @@ def starts_table(joint: JointFit) -> Table:
 
 
 def settings_table(result: Identification) -> Table:
-    """Return a table of the options of a result: estimator, criterion, M, p, K0, initial terms and runs."""
+    """Return a table of the settings of an identification: structure, estimator and its options, delays, runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
@@ -566,20 +614,20 @@ def settings_table(result: Identification) -> Table:
     return Table("What the result depends on", ("setting", "used"), rows)
 
 
-#: Phrases for the result of the independence test.
+#: Phrase for each result of the test of independence between residuals and inputs.
 _INDEPENDENCE_PHRASES = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
 
 
 def identification_html(result: Identification) -> str:
-    """Return warnings, equations, parameters with intervals, both errors and residual tests as HTML."""
+    """Return an identification as HTML for notebooks: verdict, equations, parameters, fit, residual tests, warnings."""
     model = result.model
     parts = [verdict_html(verdict(result))]
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
     parts += [table.to_html() for table in behavior_tables(model)]
     parts.append(parameter_table(model, result.joint, result.offsets).to_html())
-    # One run is enough to see; a report has all.
+    # A notebook shows the first run only; a report shows all runs.
     figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
-    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts
+    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # safe: all parts are escaped
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
         verdicts = [
@@ -602,7 +650,7 @@ def identification_html(result: Identification) -> str:
 def model_page(
     model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the HTML report of a saved model, with identification results from its file, and validation runs.
+    """Write the HTML report of a saved model, with its stored identification results and with validation runs.
 
     Parameters
     ----------
@@ -610,6 +658,11 @@ def model_page(
         Model, as :func:`ftlm.load_model` returns it.
     path, validation, force
         See :meth:`ftlm.Identification.report`.
+
+    Returns
+    -------
+    Path
+        The file that was written.
     """
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)

@@ -25,12 +25,12 @@ from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison, describe_initial_terms, describe_offsets
 
-#: Largest number of modes that are listed.
+#: Maximum number of modes in a summary.
 MAX_LISTED_MODES = 6
 
 
 def summary(result: Identification, validation: Comparison | None = None) -> str:
-    """Return the summary of a result as text."""
+    """Return the summary of an identification as text; `validation` is its comparison with validation runs."""
     judgement = verdict(result, validation)
     lines = [*wrap_text(str(judgement)), ""]
     lines += equation_lines(result.model, result.comparison)
@@ -43,7 +43,10 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
 
 
 def equation_lines(model: Model, comparison: Comparison | None = None) -> list[str]:
-    """Return the equations as text lines with delays, limits and friction, and with offsets if there is one run."""
+    """Return one text line per equation of a model, with delays, saturations, dead zones and friction.
+
+    The offset is shown as a number if `comparison` has a single run.
+    """
     structure = model.structure
     lines = []
     for item in model.equations:
@@ -54,7 +57,7 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
 
 
 def _readable(item: Equation) -> Equation:
-    """Return the equation with its orders rounded to four decimals."""
+    """Return a copy of an equation with its orders rounded to four decimals."""
     new = copy.copy(item)
     terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
     vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
@@ -62,9 +65,9 @@ def _readable(item: Equation) -> Equation:
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
-    """Return the offset of the only run as text in an equation; None without an offset, or with several runs.
+    """Return the estimated offset of the equation of `output` as text; None for several runs or without an offset.
 
-    A level is omitted, because it is added to the output and is not a term of the equation.
+    An offset of kind "level" is omitted: it is added to the output, and is not a term of the equation.
     """
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None
@@ -74,7 +77,10 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
 
 
 def parameter_lines(result: Identification) -> list[str]:
-    """Return orders and coefficients with standard errors, units and nominal values, one line each."""
+    """Return one text line per parameter with value, standard error, unit, interval by profile and nominal value.
+
+    The list is empty without parameters.
+    """
     offsets, reference = result.offsets, result.model.structure.reference
     rows = []
     for name, p in result.parameters.items():
@@ -95,13 +101,16 @@ def parameter_lines(result: Identification) -> list[str]:
 
 
 def behavior_lines(model: Model) -> list[str]:
-    """Return text lines on steady-state gains and modes; [] if the model has none."""
+    """Return text lines on steady-state gains and modes, or one line on the reason if the model is not linear.
+
+    The list is empty if they cannot be computed.
+    """
     if model.structure.has_friction:
         return ["  no poles and no gain: a model with friction is not linear"]
     if model.structure.has_nonlinear_terms:
         return ["  no poles and no gain: only a linear model has them, such as linearized(at=…) about a point"]
     lines: list[str] = []
-    # Equations that cannot be solved for their outputs together have neither modes nor gains.
+    # Equations that cannot be solved for all outputs together have neither modes nor gains.
     with contextlib.suppress(FtlmError):
         model_modes = modes(model)
         grows = any(mode.unstable for mode in model_modes)
@@ -118,14 +127,14 @@ def behavior_lines(model: Model) -> list[str]:
 
 
 def describe_mode(mode: Mode) -> str:
-    """Return text on a mode and its pole."""
+    """Return text on a mode, followed by its pole [rad/s]."""
     s = mode.pole
     where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.oscillatory else f"{s.real:.4g}"
     return f"{mode}; pole {where}"
 
 
 def describe_gain(state: SteadyState, model: Model) -> str:
-    """Return text on a steady-state gain, or on the growth of an output without steady state."""
+    """Return text on the steady-state gain from an input to an output, or on the growth of an output without one."""
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
@@ -139,7 +148,7 @@ def describe_gain(state: SteadyState, model: Model) -> str:
 
 
 def describe_order(state: SteadyState) -> str:
-    """Return text on the uncertainty of the exponent with which an output grows; empty if it is fixed."""
+    """Return text on the standard error of the exponent of t with which a step response grows; empty if it is fixed."""
     error = state.order_error
     if not error:
         return ""
@@ -152,7 +161,7 @@ def describe_order(state: SteadyState) -> str:
 
 
 def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
-    """Return text lines on the simulation fit to estimation and validation data, and on the equation error."""
+    """Return text lines of a table: simulation fit [%] to estimation and validation data, and RMSE, per output."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'simulation fit, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
     for output, own in result.output_error.items():
@@ -173,7 +182,7 @@ def _residuals(result: Identification) -> list[str]:
 
 
 def _starts(result: Identification) -> list[str]:
-    """Return text lines on offsets that are not identifiable, and on runs with nonzero initial conditions."""
+    """Return text lines on offsets without an estimate, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     hidden = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)
     lines = describe_offsets(replace(comparison, offsets=hidden))
@@ -184,7 +193,10 @@ def _starts(result: Identification) -> list[str]:
 
 
 def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[str]:
-    """Return text lines on up to three groups of findings with remedies, most serious first."""
+    """Return text lines on at most `MAX_SUMMARY_FINDINGS` groups of findings with remedies, most serious first.
+
+    If findings are omitted, the last line has their number and `how` to display them.
+    """
     groups = group_findings(findings)
     lines = []
     for group in groups[:MAX_SUMMARY_FINDINGS]:
@@ -207,7 +219,7 @@ NORM_TEXTS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
 
 
 def settings_text(settings: Mapping[str, Any]) -> str:
-    """Return the options of a result as one line of text."""
+    """Return the settings of an identification as one line of text."""
     words = f"M = {settings['m']}"
     if "refinement" in settings:
         words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} initial guesses"
@@ -230,7 +242,7 @@ def settings_text(settings: Mapping[str, Any]) -> str:
 
 
 def robust_loss_text(settings: Mapping[str, Any]) -> str:
-    """Return a summary of the robust loss as text."""
+    """Return text on the number of residuals that the robust loss down-weighted, and on the number of outliers."""
     return (
         f"{settings['downweighted_count']} of {settings['samples']} residuals down-weighted, "
         f"{settings['outliers']} of them beyond five deviations"
@@ -238,9 +250,9 @@ def robust_loss_text(settings: Mapping[str, Any]) -> str:
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
-    """Return the options of a result as table rows.
+    """Return (setting, value) rows for the settings of an identification.
 
-    The ranking criterion is included only if orders were searched.
+    `searched` is whether orders were searched; only then the ranking criterion is included.
     """
     rows: list[list[Cell]] = [["block pulses per run, M", int(settings["m"])]]
     if "innovation_length" in settings:

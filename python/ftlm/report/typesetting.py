@@ -1,4 +1,4 @@
-"""Typesetting of models in HTML: equations as MathML, parameters as a table."""
+"""Typesetting of models in HTML: equations as MathML, and a table of parameters."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from ftlm.svg.html_page import Table
 from ftlm.utils.formatting import GREEK_LETTERS, SYMBOL_PATTERN, Cell, Exact, format_bound, number, symbol, symbol_html
 from ftlm.utils.statistics import NORMAL_95
 
-#: Decimals of an order in an equation; the model file stores all digits.
+#: Number of decimals of an order in a displayed equation; a model file stores all digits.
 ORDER_DECIMALS = 4
-#: Text on the place of an offset, by kind.
+#: Description of an offset by its kind, the part of its name before the first underscore.
 OFFSET_PLACES = {"constant": "constant of the equation", "ramp": "ramp of the equation", "level": "level of the output"}
-THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
+THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # safe: a constant
 _DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>{}</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
 _IN_PARENTHESES = Markup("<mrow><mo>(</mo>{}<mo>)</mo></mrow>")
@@ -44,24 +44,25 @@ def equation_html(
     limits: Sequence[InputNonlinearity] = (),
     offset: Mapping[str, float] | str = "",
 ) -> Markup:
-    """Return an identified equation as MathML, with one element per term so that lines break between terms.
+    """Return an identified equation as MathML. Each term is an element, so that lines break between terms.
 
     Parameters
     ----------
     item
-        Equation.
+        Equation with numerical coefficients.
     delay
-        Delays of inputs [s] by name; a delayed input is written u(t − 0.035 s), one that leads u(t + 0.035 s).
+        Delays of inputs [s] by name. An input with a delay is written u(t − 0.035 s), with a negative delay
+        u(t + 0.035 s).
     limits
-        Known saturations and dead zones of inputs; a saturated input is written sat(u, 0.94).
+        Known saturations and dead zones of inputs. An input with a saturation is written sat(u, 0.94).
     offset
-        Offset of the equation: estimates for ``"constant"`` and possibly ``"ramp"`` from one run, or a text.
+        Offset of the equation: estimates by kind (``"constant"``, ``"ramp"``) from one run, or a text to append.
     """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
         value = term.fixed or 0.0
         sign = "−" if value < 0 else "" if k == 0 else "+"
-        # The first sign belongs to its number; the others stand between two terms.
+        # The sign of the first term is a prefix operator; the other signs are infix operators between terms.
         lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(
             _math(
@@ -89,7 +90,11 @@ def equation_html(
 
 
 def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
-    """Return the equations of a model as MathML; offsets are numbers only if there is one run."""
+    """Return the equations of a model as MathML.
+
+    `offsets` has the estimated offsets of each run, by output and kind. They are shown as numbers for a single run, and
+    as symbols otherwise.
+    """
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
     return [
@@ -97,7 +102,7 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
             e,
             structure.delay,
             structure.limits,
-            # A level is added to the output, and is not a term of its equation.
+            # An offset of kind "level" is omitted: it is added to the output, and is not a term of the equation.
             "" if "level" in own.get(e.output, {}) else own.get(e.output) or structure.offset_in_words,
         )
         for e in model.equations
@@ -121,7 +126,7 @@ def _number_math(value: float | Exact) -> Markup:
 
 
 def _short(value: float) -> Exact:
-    """Return a delay or limit rounded to six significant digits, in a form that tables print in full."""
+    """Return a delay or limit rounded to six significant digits, as a number that is displayed with all its digits."""
     return Exact(f"{value:.6g}")
 
 
@@ -147,7 +152,7 @@ def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequ
 
 
 def _operator_math(order: Order) -> Markup:
-    """Return the operator of a derivative as MathML; empty for order 0."""
+    """Return the differential operator D of an order as MathML; empty for order 0."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return Markup("")
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed_math(order.constant)
@@ -155,7 +160,7 @@ def _operator_math(order: Order) -> Markup:
 
 
 def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
-    """Return the operand of a coefficient as MathML: a derivative of a signal or of an expression."""
+    """Return a term without its coefficient as MathML: a derivative of a signal or of an expression."""
     shape = term.nonlinear
     if shape is None:
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
@@ -165,7 +170,7 @@ def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[Input
 
 
 def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
-    """Return an expression of signals as MathML."""
+    """Return an expression of signals, with their delays and limits, as MathML."""
     match item.operation:
         case "constant":
             sign = Markup("<mo>−</mo>") if item.value < 0 else Markup("")
@@ -178,7 +183,7 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
         case "add":
             out = parts[0]
             for argument, part in zip(item.arguments[1:], parts[1:], strict=True):
-                # A term with a negative factor brings its own sign.
+                # The text of a summand with a negative factor already begins with its sign.
                 out += part if argument.split_factor()[0] < 0 else Markup("<mo>+</mo>") + part
             return out
         case "multiply":
@@ -207,7 +212,7 @@ def _signed_math(value: float) -> Markup:
 
 
 def derivative_html(order: Order, signal: str) -> Markup:
-    """Return a derivative of a signal as HTML."""
+    """Return a derivative of a signal as HTML; the signal alone for order 0."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
@@ -217,14 +222,14 @@ def derivative_html(order: Order, signal: str) -> Markup:
 def parameter_table(
     model: Model, joint: JointFit | None = None, offsets: Mapping[str, Parameter] | None = None
 ) -> Table:
-    """Return a table of orders and coefficients with their terms, standard errors and nominal values.
+    """Return a table of orders and coefficients with standard errors, 95 % intervals, nominal values and units.
 
     Parameters
     ----------
     model
-        Model. Its ``estimate`` is used if `joint` is None.
+        Model. Standard errors and intervals come from its ``estimate`` if `joint` is None.
     joint
-        Output-error fit of the model with its standard errors.
+        Output-error fit of the model, with standard errors and intervals.
     offsets
         Offsets of the estimation runs by name; see :attr:`ftlm.Identification.offsets`.
     """
@@ -263,7 +268,7 @@ def parameter_table(
             place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
             reference_value = reference.get(term.name)
             names.add(term.name)
-            # + 0.0 makes the negative zero of a product of signs a plain zero.
+            # Adding 0.0 turns a negative zero, the product of signs, into a positive one.
             rows.append(
                 row(
                     term.name,
@@ -324,7 +329,7 @@ def unit_html(unit: str) -> Markup:
 
 
 def model_html(model: Model) -> str:
-    """Return the equations and parameters of a model as HTML."""
+    """Return the equations of a model, and its parameter table unless it is empty, as HTML."""
     lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
     has_values = model.orders or model.coefficients
     return str(lines + parameter_table(model).to_html() if has_values else lines)

@@ -167,7 +167,8 @@ class Excitation:
         lines = lines[(lines > 0) & (2 * lines <= round(period * rate))]
         if lines.size == 0:
             raise ModelError(
-                f"{setting('band')} {self.band!r} Hz holds no multiple of 1/period = {1 / period:g} Hz; widen it"
+                f"{setting('band')} {self.band!r} Hz contains no multiple of 1/period = {1 / period:g} Hz; "
+                "widen the band"
             )
         phases = rng.uniform(0, 2 * math.pi, lines.size)
         n = max(2, round(period * rate))
@@ -195,7 +196,9 @@ class Excitation:
         # A run that was written by ftlm is loaded with all signals; from any other file only the currents are read.
         run = load(self.file) if names is None else load(self.file, outputs=names_present) if names_present else None
         if run is None or not any(name in run for name in CURRENT_SIGNALS):
-            raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
+            raise DataError(
+                f"{str(self.file)!r} has no column I1 or I2; give the columns of the currents [A] these names"
+            )
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
         past = t > run.duration + run.step * (1 - 1e-6)
         currents = np.column_stack(

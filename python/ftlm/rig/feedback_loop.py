@@ -345,11 +345,11 @@ def _describe_controller(controller: Controller) -> dict[str, Any]:
         size = len(json.dumps(description, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(
-            f"what to_dict() of the controller returns is not valid JSON ({error_text(error, 200)}); correct it"
+            f"the result of to_dict() of the controller is not valid JSON ({error_text(error, 200)}); correct it"
         ) from None
     if size > MAX_CONTROLLER_JSON_CHARACTERS:
         raise ModelError(
-            f"what to_dict() of the controller returns is {size} characters long, more than the "
+            f"the result of to_dict() of the controller is {size} characters long, more than the "
             f"{MAX_CONTROLLER_JSON_CHARACTERS} that the metadata of a run may contain; shorten it"
         )
     return description

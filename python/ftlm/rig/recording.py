@@ -688,7 +688,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
     check_rate(samples)
     if length * samples < 2:
         raise ModelError(
-            f"{setting('duration')} {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer"
+            f"{setting('duration')} {length:g} s has fewer than three samples at {samples:g} Hz; make it longer"
         )
     return length, longest, samples
 

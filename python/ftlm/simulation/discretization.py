@@ -393,8 +393,8 @@ def _check_missing(run: Run, structure: Structure) -> None:
     if lacking is not None:
         mask = missing[lacking]
         raise DataError(
-            f"signal {lacking!r} of run {run.name!r} holds no value in {int(mask.sum())} rows, first row "
-            f"{int(np.flatnonzero(mask)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
+            f"signal {lacking!r} of run {run.name!r} has no value in {int(mask.sum())} rows, first row "
+            f"{int(np.flatnonzero(mask)[0])}, and enters the equation of {drivers[lacking]} as measured; fill these "
             f"rows yourself, avoid them with {parameter('window')}, or use {parameter('coupling', 'simulated')}"
         )
     if structure.all_filtered and any(name in missing for name in outputs):
@@ -410,7 +410,7 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
     for run in runs:
         for name, is_missing in run.missing_samples.items():
             raise DataError(
-                f"output {name!r} of run {run.name!r} holds no value in {int(is_missing.sum())} rows, first row "
+                f"output {name!r} of run {run.name!r} has no value in {int(is_missing.sum())} rows, first row "
                 f"{int(np.flatnonzero(is_missing)[0])}: {what} requires all samples; use "
                 f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )
@@ -426,7 +426,7 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
     ModelError
         If the equation has friction or another non-linear term.
     """
-    check_frictionless([item], "what is linear in its coefficients")
+    check_frictionless([item], "a method that is linear in the coefficients")
     return linear_tuple(item, signals)
 
 
@@ -439,7 +439,7 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
             linear = choose_text(f"model.linearized({point})", "Model.linearized in Python")
             raise ModelError(
                 f"the equation of {item.output} has the non-linear term {term}, and {what} needs a linear model; "
-                f"use the linear model about an operating point, {linear}, or free runs (simulate, compare)"
+                f"use the linear model about an operating point, {linear}, or simulations (simulate, compare)"
             )
 
 

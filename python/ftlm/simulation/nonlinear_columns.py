@@ -85,9 +85,9 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
         pair = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)
         if pair is not None:
             raise ModelError(
-                f"{name} has the derivative of order {pair[1]:g} of {pair[0]}, and run {run.name!r} holds {pair[0]} "
-                f"between its samples: its jumps have no derivative; say {parameter('intersample', 'foh')} if it moves "
-                "in between"
+                f"{name} has the derivative of order {pair[1]:g} of {pair[0]}, but run {run.name!r} has a zero-order "
+                f"hold for {pair[0]}, whose jumps have no derivative; give {parameter('intersample', 'foh')} if it is "
+                "linear between samples"
             )
         first = int(bad[0])
         where = ", ".join(f"{s} = {rows[s][first]:.6g}" for s in dict.fromkeys(s for s, _ in item.channels))

@@ -331,8 +331,8 @@ class EquationParser:
             kind, value, at = self._peek()
             if kind != "number" or float(value) == 0.0:
                 raise self._error(
-                    f"{value!r} at character {at + 1} divides, but a divisor is a number other than 0; give the "
-                    "quotient a name of its own, as in a y for y/T"
+                    f"{value!r} at character {at + 1} divides, but a divisor must be a number other than 0; "
+                    "write a coefficient instead, as in a y for y/T"
                 )
             factor /= float(self._take()[1])
         return factor
@@ -365,7 +365,7 @@ class EquationParser:
     def _take_offset(self, sign: float, *, is_lhs: bool) -> None:
         _, value, at = self._peek()
         if self.offset or sign < 0 or is_lhs:
-            reason = "occurs twice" if self.offset else "has a sign, but an unknown constant has its own"
+            reason = "occurs twice" if self.offset else "has a sign, but the estimate of the constant includes the sign"
             reason = "is on the left-hand side" if is_lhs else reason
             raise self._error(
                 f"the offset {value!r} at character {at + 1} {reason}; write '+ c' once, on the right-hand side"
@@ -609,7 +609,7 @@ class EquationParser:
         limit = self._value("a limit, or LEAST:LARGEST where it is estimated")
         self._expect(")")
         if self.limits.setdefault((signal, law), limit) != limit:
-            raise self._error(f"{signal} has two limits of one kind; an actuator has one")
+            raise self._error(f"{signal} has two saturations or two dead zones; write at most one of each")
         return signal
 
     def _time_argument(self, signal: str) -> None:
@@ -640,8 +640,8 @@ class EquationParser:
         kind, value, _ = self._peek()
         if kind == "name":
             raise self._error(
-                f"the delay {value} of {signal} is free, and a delay is estimated between bounds; write them: "
-                f"{signal}(t - 0:0.5)"
+                f"the delay {value} of {signal} is free, but a delay is estimated between bounds; write "
+                f"bounds in seconds, as in {signal}(t - 0:0.5)"
             )
         return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
 
@@ -716,7 +716,7 @@ class EquationParser:
         self._expect(")")
         if near is not None and near[0] != signal:
             raise self._error(
-                f"Stribeck friction has the speed of {near[0]} and the sign of {signal}; it follows one velocity"
+                f"Stribeck friction has the speed of {near[0]} and the sign of {signal}; use the same velocity in both"
             )
         if sign > 0:
             shape = "fc*" if near is None else f"fs*exp(-(D {signal}/vs)^2)*"
@@ -857,8 +857,8 @@ class EquationParser:
         close = {"(": ")", "{": "}"}.get(self._take()[1])
         if close is None or not self._accept("-") or self._peek()[0] != "number":
             raise self._error(
-                f"an exponential at character {at + 1} is a delay: a number, as in e^(-0.1 s), or bounds to estimate "
-                "it between, as in e^(-0:0.5 s)"
+                f"an exponential at character {at + 1} is a delay; write a number, as in e^(-0.1 s), or bounds of an "
+                "estimate, as in e^(-0:0.5 s)"
             )
         delay = self._value("a delay [s], or LEAST:LARGEST where it is estimated")
         self._accept("*")

@@ -163,8 +163,8 @@ def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None
     without = [item.output for item, has_offset in parsed if not has_offset]
     if pairs and without:
         raise ModelError(
-            f"the equation of {pairs[0][0]} has an offset, that of {without[0]} has none; each equation of a structure "
-            "has one or none has: write + c in each (its estimate says whether it is 0)"
+            f"the equation of {pairs[0][0]} has an offset, that of {without[0]} has none; write + c in "
+            "each equation (its estimate shows whether it is 0), or in none"
         )
     kinds = {has_offset for _, has_offset in pairs}
     if len(kinds) > 1:
@@ -333,7 +333,9 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
     limits: dict[tuple[str, NonlinearityKind], Value] = {}
     for key, limit in chain.from_iterable(words.limits.items() for words in parsed):
         if limits.setdefault(key, limit) != limit:
-            raise ModelError(f"{key[0]} has two different limits of one kind in these equations; give it one")
+            raise ModelError(
+                f"{key[0]} has two different saturations or two different dead zones in these equations; use one"
+            )
     bare = {signal for words in parsed for signal in words.plain}
     both = next((signal for signal, _ in limits if signal in bare), None)
     if both is not None:

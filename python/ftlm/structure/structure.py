@@ -244,7 +244,7 @@ class Structure:
         if self.all_filtered:
             through = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
             raise ModelError(
-                f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: friction acts "
+                f"{words}, and {' and '.join(through)}, an input of it, passed the sensor filter: friction acts "
                 "before the filter, and the unfiltered input is not known; add an equation with this signal as output "
                 f"and use {parameter('coupling', 'simulated')}, or exclude it from the filter"
             )
@@ -312,8 +312,8 @@ class Structure:
         if not (self.all_filtered or sensor.holds_answers):
             through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
-                f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run starts "
-                "in motion: the transient of such a filter is not a sum of impulse responses; use "
+                f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run has "
+                "nonzero initial conditions: the transient of such a filter is not a sum of impulse responses; use "
                 f"{parameter('initial', 'rest')} and begin the run at rest, or give the exponents of its initial "
                 "terms"
             )

@@ -196,7 +196,7 @@ class Store:
         # Digests detect damage, not wrong contents.
         wrong = record.answer.inconsistency() if isinstance(record.answer, StoredFit) else None
         if wrong is not None:
-            raise DataError(f"store {path} holds a fit with {wrong} in record {number}; choose another file")
+            raise DataError(f"store {path} contains a fit with {wrong} in record {number}; choose another file")
         self._answers[record.request] = record.answer
 
     def _check_same(self, request: Request, stored: Request) -> None:
@@ -210,7 +210,7 @@ class Store:
             )
         difference = request.difference(stored)
         if difference is not None:
-            raise DataError(f"store {path} holds a selection {difference}; choose another file")
+            raise DataError(f"store {path} contains a selection {difference}; choose another file")
 
     def _expect(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
         """Return an answer of the expected kind; raise DataError for another kind."""
@@ -218,7 +218,8 @@ class Store:
             return answer
         words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
         raise DataError(
-            f"store {self._file.path} holds {words[type(answer)]} where {description} is expected; choose another file"
+            f"store {self._file.path} contains {words[type(answer)]} where {description} is expected; choose "
+            "another file"
         )
 
     def __len__(self) -> int:

@@ -70,8 +70,8 @@ def automatic_problems(
         for name in drivers:
             if name not in first or name == output:
                 raise ModelError(
-                    f"{parameter('driven_by')}: {name!r} cannot drive {output}; name an input or another output of "
-                    f"the runs: {', '.join(n for n in first.signals if n != output)}"
+                    f"{parameter('driven_by')}: {name!r} cannot be an input of {output}; name an input or another "
+                    f"output of the runs: {', '.join(n for n in first.signals if n != output)}"
                 )
     problems = []
     for output in first.outputs:

@@ -1,1 +1,1 @@
-"""SVG charts and HTML pages from plain data, independent of identification results."""
+"""SVG charts and HTML pages from plain data; this package does not use identification results."""

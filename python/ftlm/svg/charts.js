@@ -1,5 +1,5 @@
 "use strict";
-// Zoom and sliders for the charts of a page. Without this script the page is complete, but for these.
+// Zoom and sliders for the charts of a page. Without this script, only these are missing.
 function zoomable(svg) {
   const plot = svg.querySelector("svg.plot"), grid = svg.querySelector(".grid"), texts = svg.querySelector(".ticks");
   if (!plot || !grid || !texts || svg.nextElementSibling?.classList.contains("zoom")) return null;
@@ -124,7 +124,7 @@ function zoomable(svg) {
   svg.addEventListener("pointercancel", end);
   svg.addEventListener("dblclick", () => { view = whole.slice(); show(); });
 
-  // Where a slider is: a line across the plot, and a ring on every line of the chart.
+  // Marks of the slider position: a vertical line across the plot, and a ring on every line of the chart.
   const cursor = add(svg, "g", { class: "cursor" });
   chart.point = (x, values) => {
     cursor.replaceChildren();
@@ -137,7 +137,7 @@ function zoomable(svg) {
       add(cursor, "circle", { class: `line${style}`, cx: across, cy: down, r: 4.5 });
     });
   };
-  // A window that was zoomed into follows the slider.
+  // A zoomed section follows the slider.
   chart.follow = (x) => {
     const wide = view[1] - view[0];
     if (x < view[0] || x > view[1]) move(x - wide / 2, x + wide / 2, view[2], view[3]);
@@ -146,11 +146,11 @@ function zoomable(svg) {
 }
 
 let sliders = 0;
-// A slider below a chart reads out what its lines are at an instant, and how far apart.
+// A slider below a chart displays the values of its lines at one position, and their difference.
 function slider(svg, charts) {
   const figure = svg.parentElement, told = JSON.parse(svg.dataset.readings), name = svg.querySelector("title").textContent;
   const times = told.at[1];
-  // Whole numbers and their power of ten, put together as text so that 3 tenths are 0.3.
+  // An integer and its power of ten are combined as text, so that 3 tenths are displayed as 0.3.
   const scaled = ([power, whole], k) => (whole[k] === null ? null : Number(`${whole[k]}e${power}`));
   const time = (k) => scaled(told.at, k), value = (i, k) => scaled(told.lines[i].at, k);
   function words(v, unit) {

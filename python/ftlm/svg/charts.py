@@ -33,27 +33,27 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol, truncate_text
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats
 
-#: Most bars of a histogram, and its height [px].
+#: Maximum number of bars of a histogram, and height of its chart [px].
 MAX_BARS = 41
 HISTOGRAM_HEIGHT_PX = 190
 #: Height of one bar of a grouped bar chart [px].
 BAR_HEIGHT_PX = 16.0
-#: Longest label beside a bar [characters].
+#: Maximum length of the name beside a bar [characters]; longer names are truncated.
 MAX_BAR_NAME_CHARACTERS = 26
 
 
 @check_arguments
 def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "") -> LineChart:
-    """Return a histogram with the normal density of the same mean and standard deviation.
+    """Return a histogram chart of values, with the normal density of equal mean and standard deviation as a line.
 
     Parameters
     ----------
     values
         Values of shape (N,). Nonfinite values are omitted, and the caption states their number.
     title, x_label
-        Text, with units.
+        Title, and label of the horizontal axis with its unit.
     caption
-        Sentence below the chart.
+        Text shown below the chart.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     finite = every[np.isfinite(every)]
     if finite.size < 2:
         raise DataError(f"a histogram needs two finite values at least, not {finite.size}; give a longer run")
-    # As many bars as Sturges and the spread of outliers ask for, symmetric about the mean.
+    # Twice the number of bars of Sturges' rule. The range is symmetric about the mean and includes all outliers.
     mean, deviation = float(np.mean(finite)), float(np.std(finite))
     reach = float(np.max(np.abs(finite - mean)))
     if reach <= max(1e-12 * abs(mean), MIN_DIFFERENCE):
@@ -102,22 +102,23 @@ def _normal(x: Floats, mean: float, deviation: float) -> Floats:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class BarChart(Figure):
-    """Chart of horizontal bars, grouped by name.
+    """Chart of horizontal bars: one group of bars for each name, one bar of the group for each series.
 
     Parameters
     ----------
     names
-        Group names, from top to bottom.
+        Names of the groups, from top to bottom.
     groups
-        (series name, one value per group name) of each series, at most five.
+        (name, values) of each series, at most five; ``values`` has one value for each of `names`.
     title, x_label
-        Text, with units.
+        Title, and label of the value axis with its unit.
     low, high
-        Axis limits, by default from 0 to the largest value. A bar beyond them is truncated and labeled with its value.
+        Limits of the value axis, by default 0 and the largest value. Bars are truncated at the limits, and every bar is
+        labeled with its value.
     caption
-        Sentence below the chart.
+        Text shown below the chart.
     width
-        Width [px] of the drawing for wide screens, which scales with the page.
+        Width [px] of the drawing for wide screens. The page scales the drawing to the available width.
 
     Raises
     ------
@@ -150,12 +151,12 @@ class BarChart(Figure):
 
     @cached_property
     def tables(self) -> list[tuple[str, Floats]]:
-        """Names and values of the series."""
+        """(name, array of values) of each series."""
         return [(name, as_floats(name, values, gaps=True)) for name, values in self.groups]
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Axis limits."""
+        """Lower and upper limit of the value axis."""
         finite = np.concatenate([v[np.isfinite(v)] for _, v in self.tables])
         end = self.high if self.high is not None else float(np.max(finite, initial=self.low))
         return self.low, end if end > self.low else self.low + 1.0
@@ -198,35 +199,36 @@ class BarChart(Figure):
 
 
 def _shade(style: int, x: float, y: float, width: float, height: float, **attributes: str) -> Markup:
-    """Return a rectangle in the color of a style as SVG markup."""
+    """Return a filled rectangle with upper left corner (x, y) [px] as SVG markup, in the color of a line style."""
     place = {"x": x, "y": y, "width": width, "height": height}
     return element("rect", class_=f"shade{style}", **place, fill=LINE_STYLES[style][0], **attributes)
 
 
-#: Height of the plot, half the size of a cross, and radius of a dot [px].
+#: Maximum height of the complex plane, half the width of a cross, and radius of a dot [px].
 PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX, DOT_RADIUS_PX = 260.0, 5.0, 2.6
-#: Axis limits relative to the farthest cross, and margin around dots as a share of their range.
+#: Axis limit of a pole map divided by the largest magnitude of a pole. Margin around the dots of a locus, as a fraction
+#: of their range.
 PLANE_MARGIN_FACTOR, LOCUS_MARGIN_SHARE = 1.18, 0.06
 
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class PlaneChart(Figure):
-    """Chart of the complex plane with equal axis scales: poles as crosses, or a measured locus and a model's curve.
+    """Chart of the complex plane with equal axis scales: a pole map, or a measured locus with the curve of a model.
 
     Parameters
     ----------
     points
-        Finite complex values, including both members of each conjugate pair.
+        Finite complex values. Poles include both members of each conjugate pair and are drawn as crosses.
     title, x_label, y_label
-        Text, with units.
+        Title, and axis labels with their units.
     sector
-        Half-angle [rad] of the shaded unstable sector around the positive axis.
+        Half-angle [rad] of the shaded unstable sector around the positive real axis.
     curve
-        Complex curve of a model. The points are then measured values, drawn as dots. They determine the axis limits,
-        and no sector is drawn.
+        Complex values of a model's curve. If it is given, the points are measured values and are drawn as dots. The
+        dots determine the axis limits, and no sector is drawn.
     caption
-        Sentence below the chart.
+        Text shown below the chart.
 
     Raises
     ------
@@ -254,12 +256,12 @@ class PlaneChart(Figure):
 
     @cached_property
     def values(self) -> Complex:
-        """Complex values of the points."""
+        """Points as a complex array."""
         return as_complex("points", self.points)
 
     @cached_property
     def line(self) -> Complex | None:
-        """Finite values of the curve."""
+        """Finite values of the curve; None without a curve."""
         line = None if self.curve is None else as_complex("curve", self.curve)
         return None if line is None else line[np.isfinite(line)]
 
@@ -275,10 +277,10 @@ class PlaneChart(Figure):
         return low - complex(pad, pad), high + complex(pad, pad)
 
     def sector_outline(self, reach: float) -> list[complex]:
-        """Return the corners of the sector, extended beyond a square of half-width `reach` around 0."""
+        """Return the corners of the shaded sector, which extends beyond the square of half-width `reach` around 0."""
         edge = 8 * reach
         arm = edge * complex(math.cos(self.sector), math.sin(self.sector))
-        # Beyond a right angle the sector also covers what lies above and below its arms' ends.
+        # The two corners on the right keep the outline outside the visible square for every half-angle.
         return [0, arm.conjugate(), edge * (1 - 1j), edge * (1 + 1j), arm]
 
     def draw(self, *, narrow: bool) -> Markup:
@@ -288,7 +290,7 @@ class PlaneChart(Figure):
         upward = ticks(low.imag, high.imag, 5)
         left, top = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0 if self.line is None else 48.0
         w, spread = width - left - 14.0, high - low
-        # As many pixels a unit in both directions.
+        # Equal scale [px per unit] on both axes.
         scale = min(w / spread.real, PLANE_HEIGHT_PX / spread.imag)
         h = max(scale * spread.imag, 90.0)
         corner = (low + high) / 2 - complex(w, h) / scale / 2
@@ -334,13 +336,13 @@ class PlaneChart(Figure):
 
 
 def _dot(x: float, y: float) -> Markup:
-    """Return a measured point as SVG markup."""
+    """Return the dot of a measured point at pixel coordinates (x, y) as SVG markup."""
     stroke = {"class_": "line0", "fill": "none", "stroke": LINE_STYLES[0][0], "stroke_width": "1.6"}
     return element("circle", **stroke, cx=x, cy=y, r=DOT_RADIUS_PX)
 
 
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
-    """Return the pixel coordinates of complex values; coordinates far outside the plot are limited."""
+    """Return the (x, y) pixel coordinates of complex values, limited to [-10000, 10000]."""
     points = np.asarray(values, dtype=np.complex128)
     xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(points.real), plot.y_pixels(points.imag)))
     return list(zip(xs, ys, strict=True))
@@ -350,7 +352,8 @@ def _complex_text(value: complex) -> str:
     return f"{number(value.real, 3)} {'−' if value.imag < 0 else '+'} {number(abs(value.imag), 3)}j"
 
 
-#: From best to worst, reversed viridis: dark is good on white, and lightness is monotone.
+#: Colors from the best (lowest) score to the worst, from the color map viridis. The best scores are dark, which is well
+#: visible on white, and lightness is monotone.
 HEAT_COLORS = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
 NO_SCORE = "#9aa3ad"
 
@@ -368,13 +371,13 @@ class Landscape(Figure):
     x, y
         Ascending values of these orders.
     scores
-        Scores of shape (y, x); infinite for pairs that are not candidates or whose simulation diverges.
+        Scores of shape (len(y), len(x)). A score is infinite if the pair is not a candidate or its simulation diverges.
     other_orders_note
-        Text on how the other parameters are treated.
+        Text on the values of the orders that are not on the axes.
     score
-        Name of the score.
+        Name of the score for captions.
     correlation
-        Correlation of the two orders in a joint fit, otherwise NaN.
+        Correlation of the estimates of the two orders in a joint fit; NaN without one.
     """
 
     names: tuple[str, str]
@@ -387,21 +390,21 @@ class Landscape(Figure):
 
     @property
     def title(self) -> str:  # type: ignore[override]
-        """Title, which names both orders."""
+        """Title of the chart, with the names of both orders."""
         across, upward = map(symbol, self.names)
         return f"Score over {across} and {upward}"
 
     @cached_property
     def valid_scores(self) -> Floats:
-        """Scores with NaN for pairs that have none."""
+        """Scores, with NaN for pairs without a positive finite score; raise DataError if no pair has one."""
         scores = np.where(np.isfinite(self.scores) & (self.scores > 0), self.scores, np.nan)
         if np.all(np.isnan(scores)):
-            raise DataError("no candidate of this order grid has a finite score; widen it")
+            raise DataError("no candidate of this order grid has a finite score; widen the order grid")
         return scores
 
     @property
     def best(self) -> tuple[int, int]:
-        """Row and column of the best score."""
+        """Row index and column index of the best (lowest) score."""
         row, column = divmod(int(np.nanargmin(self.valid_scores)), self.scores.shape[1])
         return row, column
 
@@ -412,7 +415,7 @@ class Landscape(Figure):
 
     @property
     def caption(self) -> str:  # type: ignore[override]
-        """Sentences on the location of the best score and on the meaning of the colors."""
+        """Sentences on the orders of the best score and on the meaning of the colors."""
         parts = [
             f"Best: {self._best_orders()} (ring). Dark is good; colors are steps of the logarithm.",
             self.other_orders_note,
@@ -440,7 +443,7 @@ class Landscape(Figure):
         out = []
         for i, row in enumerate(_classes(self.scores, *ends).tolist()):
             j = 0
-            # Cells alike in a row are one rectangle.
+            # Adjacent cells of a row with equal color are drawn as one rectangle.
             for step, alike in groupby(row):
                 count, colour = len(list(alike)), HEAT_COLORS[step] if step >= 0 else NO_SCORE
                 place = left + j * cell_w, bottom - (i + 1) * cell_h
@@ -468,7 +471,7 @@ class Landscape(Figure):
 
 
 def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
-    """Return the color class of each score on a logarithmic scale; -1 for pairs without a score."""
+    """Return the index into HEAT_COLORS of each score, on a logarithmic scale; -1 for pairs without a score."""
     first, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):
         place = (np.log(scores) - first) / (span if span > 0 else 1.0)
@@ -482,16 +485,16 @@ def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Ma
 
 
 def _label_indices(count: int, most: int) -> list[int]:
-    """Return the indices of at most `most` cells that get a label: the first, and others at equal distances."""
+    """Return at most `most` equally spaced indices from 0 to count - 1, which mark the cells with a label."""
     return list(range(0, count, max(1, math.ceil((count - 1) / max(most - 1, 1)))))
 
 
-#: From -1 to 1, blue over light gray to vermilion; black text is readable in the middle.
+#: Colors from correlation -1 to 1: blue, light gray, vermilion. Black text is readable on the colors in the middle.
 CORRELATION_COLORS = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
-#: Indices of colors that need white text.
+#: Indices of the colors on which text is white.
 DARK_COLOR_INDICES = {0, 1, 7, 8}
 NO_VALUE = "#9aa3ad"
-#: Largest cell, and smallest cell with a number [px].
+#: Maximum width of a cell, and minimum width of a cell that shows its correlation as a number [px].
 MAX_CELL_PX, MIN_LABELED_CELL_PX = 46.0, 30.0
 MAX_COLUMN_NAME_CHARACTERS = 12
 
@@ -499,18 +502,18 @@ MAX_COLUMN_NAME_CHARACTERS = 12
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class CorrelationMap(Figure):
-    """Correlation matrix as colored cells.
+    """Chart of a correlation matrix with colored cells.
 
     Parameters
     ----------
     names
-        Names of the rows and columns.
+        Names of the N parameters, for rows and columns.
     values
         Correlations of shape (N, N), from -1 to 1. NaN gives a gray cell.
     title
-        Title.
+        Title of the chart.
     caption
-        Sentence below the chart.
+        Text shown below the chart.
 
     Raises
     ------
@@ -527,7 +530,10 @@ class CorrelationMap(Figure):
     def __post_init__(self) -> None:
         matrix, names = self.matrix, self.names
         if matrix.shape != (len(names), len(names)) or not len(names):
-            raise DataError(f"a matrix of shape {matrix.shape} for {len(names)} names; give one row and column a name")
+            raise DataError(
+                f"values has shape {matrix.shape}, but there are {len(names)} names; give one row and one "
+                "column per name"
+            )
         beyond = np.abs(matrix) > 1 + 1e-6
         if np.any(beyond):
             row, column = divmod(int(np.argmax(beyond)), len(names))
@@ -555,7 +561,7 @@ class CorrelationMap(Figure):
         labels = [truncate_text(symbol(n), MAX_COLUMN_NAME_CHARACTERS) for n in names]
         left = 10 + max(map(text_width, labels))
         cell = min((width - left - 8) / count, MAX_CELL_PX)
-        # Names above the columns stand upright where they have no room.
+        # Column names that are wider than a cell are rotated by 90 degrees.
         turned = max(map(text_width, labels)) > cell - 4
         top = 8 + (max(map(text_width, labels)) if turned else 16)
         out, texts = [], []

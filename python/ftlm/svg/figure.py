@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, truncate_text
 from ftlm.utils.validation import Floats, as_floats
 
-#: Width of the drawing for narrow screens; its text is as large as in the wide one.
+#: Width of the drawing for narrow screens, in which text has the same size as in the wide drawing.
 NARROW_WIDTH_PX = 360
-#: Width of charts that stand side by side.
+#: Width of charts that are placed side by side.
 SMALL_WIDTH_PX = 520
-#: Width of a character and height of a line at 12 px [px].
+#: Approximate width of a character and height of a line of text with a font size of 12 px [px].
 LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 
@@ -31,7 +31,7 @@ class Figure(ABC):
     Attributes
     ----------
     title, caption
-        Title, and a sentence below the chart.
+        Title of the chart, and text shown below it.
     """
 
     title: str
@@ -48,7 +48,7 @@ class Figure(ABC):
 
     @cached_property
     def narrow(self) -> Markup:
-        """SVG markup for narrow screens; empty if the wide one is sufficient."""
+        """SVG markup for narrow screens; empty if the drawing for wide screens is sufficient."""
         return self.draw(narrow=True)
 
     @property
@@ -62,7 +62,7 @@ class Figure(ABC):
 
 @dataclass(frozen=True)
 class StaticFigure(Figure):
-    """Chart with two finished SVG drawings, for wide and for narrow screens."""
+    """Chart with given SVG drawings: `wide` for wide screens and `small` for narrow screens."""
 
     title: str
     wide: Markup
@@ -75,7 +75,7 @@ class StaticFigure(Figure):
 
 
 class Figures(tuple[Figure, ...]):
-    """Tuple of charts, which notebooks show as drawings and :func:`print` as titles."""
+    """Tuple of charts. Notebooks display the drawings; :func:`print` displays the titles."""
 
     __slots__ = ()
 
@@ -87,9 +87,10 @@ class Figures(tuple[Figure, ...]):
 
 
 def element(name: str, parts: Iterable[str] | None = None, /, **attributes: str | float) -> Markup:
-    """Return an SVG element, empty without parts.
+    """Return an SVG element with the content `parts`; without parts it is an empty element.
 
-    Underscores in the names of attributes stand for hyphens, and floats [px] are written with one decimal.
+    Underscores in attribute names become hyphens, and a trailing underscore is removed. Floats [px] are written with
+    one decimal.
     """
     opening = Markup("<{}").format(name)
     for attribute, value in attributes.items():
@@ -101,7 +102,7 @@ def element(name: str, parts: Iterable[str] | None = None, /, **attributes: str 
 def svg(
     width: int, height: int, title: str, described: str, parts: Iterable[Markup], *, narrow: bool, **attributes: str
 ) -> Markup:
-    """Return an SVG drawing of the given size [px] and parts, with a description for screen readers."""
+    """Return an SVG drawing of the given size [px] and parts; `described` is the description for screen readers."""
     every = [element("title", [title]), element("desc", [described]), *parts]
     look: dict[str, str] = {"class_": f"chart {'narrow' if narrow else 'wide'}", "role": "img"}
     view = f"0 0 {width} {height}"
@@ -114,12 +115,12 @@ def svg_text(x: float, y: float, text: str, anchor: str, **attributes: str) -> M
 
 
 def text_group(texts: Iterable[Markup]) -> Markup:
-    """Return the group of the text of a drawing."""
+    """Return an SVG group of text elements with the font size and color of charts."""
     return element("g", texts, font_size="12", fill="currentColor")
 
 
 def faint_path(data: str) -> Markup:
-    """Return the SVG path of an axis, in a faint text color."""
+    """Return the SVG path with the path data `data`, in a faint text color, for an axis."""
     return element("path", fill="none", stroke="currentColor", stroke_opacity="0.55", d=data)
 
 
@@ -128,17 +129,18 @@ def text_width(text: str) -> float:
     return LETTER_WIDTH_PX * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
 
 
-#: Points of a line in the wide chart: two per pixel column, so that no peak is lost.
+#: Maximum number of points of a line in a wide chart: two per pixel column, so that every extreme value is drawn.
 MAX_LINE_POINTS = 1500
-#: Minimum difference between axis limits; denormal numbers have too few digits.
+#: Minimum difference between axis limits. Below it, denormal numbers have too few digits for ticks.
 MIN_DIFFERENCE = 1e-290
-#: Lines that leave the range of the measured line by more than this many times its height do not extend the axis.
+#: Maximum extension of the vertical axis beyond the measured lines, in multiples of their range. Other lines that
+#: exceed it are cut off.
 MAX_STRAY_HEIGHTS = 3.0
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """Ticks of an axis: values, labels, and their common power of ten as text and as a number."""
+    """Ticks of an axis: values, labels, and the common factor 10**power of the labels, as text and as exponent."""
 
     values: list[float]
     labels: list[str]
@@ -146,13 +148,13 @@ class Ticks:
     power: int = 0
 
 
-#: Coordinates of curves are integer tenths of a pixel.
+#: Resolution of the coordinates of curves, which are integers in tenths of a pixel.
 TENTHS_PER_PIXEL = 10
 
 
 @dataclass(frozen=True)
 class PlotArea:
-    """Plot area of a drawing [px], with its axis limits left, right, bottom and top."""
+    """Plot area of a drawing [px]; `frame` has the axis limits (left, right, bottom, top)."""
 
     left: float
     top: float
@@ -161,17 +163,20 @@ class PlotArea:
     frame: tuple[float, float, float, float]
 
     def x_pixels(self, x: Floats | float) -> Floats:
-        """Return the horizontal pixel coordinates of values."""
+        """Return the horizontal pixel coordinates of values on the horizontal axis."""
         low, high, _, _ = self.frame
         return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
 
     def y_pixels(self, y: Floats | float) -> Floats:
-        """Return the vertical pixel coordinates of values."""
+        """Return the vertical pixel coordinates, counted downward, of values on the vertical axis."""
         _, _, low, high = self.frame
         return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
 
     def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
-        """Return pixel coordinates of points in integer tenths of a pixel, clipped near the plot."""
+        """Return coordinates of points relative to the upper left corner of the plot, in integer tenths of a pixel.
+
+        Vertical coordinates are limited to one plot height above and below the plot.
+        """
         down = np.clip(self.y_pixels(y) - self.top, -self.height, 2 * self.height)
         xs, ys = (
             np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
@@ -180,7 +185,10 @@ class PlotArea:
         return xs, ys
 
     def grid(self, across: Ticks, upward: Ticks | None) -> list[Markup]:
-        """Return grid lines and the left and lower axis as SVG markup; without upward ticks there is no lower axis."""
+        """Return grid lines and the left and lower axis as SVG markup.
+
+        Without ticks of the vertical axis (`upward`), only vertical grid lines and the left axis are drawn.
+        """
         levels = () if upward is None else upward.values
         lines = [f"M{self.left:.1f} {float(self.y_pixels(v)):.1f}h{self.width:.1f}" for v in levels]
         lines += [f"M{float(self.x_pixels(v)):.1f} {self.top:.1f}v{self.height:.1f}" for v in across.values]
@@ -192,7 +200,7 @@ class PlotArea:
         ]
 
     def labels(self, axes: tuple[Ticks, Ticks], names: tuple[str, str], width: int) -> list[Markup]:
-        """Return tick labels and names of both axes as SVG markup, in a drawing of the given width [px]."""
+        """Return tick labels and axis labels `names` as SVG markup; `width` is the width of the whole drawing [px]."""
         across, upward = axes
         bottom = self.top + self.height
         pairs = zip(upward.values, upward.labels, strict=True)
@@ -200,7 +208,7 @@ class PlotArea:
         pairs = zip(across.values, across.labels, strict=True)
         for v, label in pairs:
             x = float(self.x_pixels(v))
-            # A label at the right end would leave the drawing if it were centered.
+            # A centered label at the right end would exceed the drawing, so it is right-aligned there.
             fits = x + text_width(label) / 2 <= width - 4
             marks.append(svg_text(x if fits else width, bottom + 16, label, "middle" if fits else "end"))
         x_text, y_text = (
@@ -215,7 +223,7 @@ class PlotArea:
 
 
 def ticks(low: float, high: float, most: int = 6) -> Ticks:
-    """Return ticks within an interval, at multiples of 1, 2 or 5 times a power of ten.
+    """Return the ticks of an axis, at multiples of 1, 2 or 5 times a power of ten within an interval.
 
     Parameters
     ----------
@@ -233,7 +241,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     if last - first < 1 and most < 20:
         return ticks(low, high, most + 1)
-    # Whole multiples of a power of ten, so that 0.3 is not 0.30000000000000004.
+    # Integer multiples of a power of ten avoid rounding, such as 0.30000000000000004 for 0.3.
     multiples = [k * size for k in range(first, last + 1)]
     values = [float(m * 10**exponent) if exponent >= 0 else m / 10**-exponent for m in multiples]
     largest = max(abs(v) for v in values)
@@ -244,7 +252,11 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
 
 
 def log_ticks(low: float, high: float, most: int) -> Ticks:
-    """Return ticks between 10**low and 10**high: powers of ten, or a 1-2-5 series if there are few powers."""
+    """Return the ticks of a logarithmic axis from 10**low to 10**high, with decimal logarithms as tick values.
+
+    They are powers of ten, a 1-2-5 series for fewer than three powers, or linear ticks for a short interval. There are
+    about `most` powers at most.
+    """
     every = max(1, math.ceil((high - low) / most))
     first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
     powers = [k * every for k in range(first, last + 1)]
@@ -262,31 +274,31 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
 
 
 def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
-    """Return indices of points that represent a line: ends of constant intervals, or extremes of blocks.
+    """Return indices of points that represent a line: ends of constant intervals, or extreme values of blocks.
 
     Parameters
     ----------
     y
-        Values of the line; nonfinite ones are omitted.
+        Values of the line; nonfinite values are omitted.
     most
         Maximum number of indices, at least 4.
 
     Returns
     -------
     ndarray of int
-        Ascending indices; those of all finite values if there are at most ``most``.
+        Ascending indices. All finite values are included if there are at most ``most``.
     """
     values = as_floats("y", y, gaps=True)
     finite = np.flatnonzero(np.isfinite(values))
     if finite.size <= most:
         return finite
-    # Rows within a constant stretch lie on the line between its ends, so that steps stay steps.
+    # Points inside a constant interval are on the line between its ends. Staircases keep their shape without them.
     changes = values[1:] != values[:-1]
     ends = np.flatnonzero(np.isfinite(values) & (np.append(True, changes) | np.append(changes, True)))
     if ends.size <= most:
         return ends
     edges = np.linspace(0, finite.size, max(1, (most - 2) // 2) + 1).astype(np.intp)
-    # One pass each for all stretches: sort by (stretch, value), then take the ends of every stretch.
+    # Sorting by (block, value) places the extreme values of every block at its ends.
     stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
     order = np.lexsort((values[finite], stretch))
     picked = np.concatenate([order[edges[:-1]], order[edges[1:] - 1], [0, finite.size - 1]])
@@ -295,7 +307,10 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
 
 
 def limits(values: list[Floats], margin: float) -> tuple[float, float]:
-    """Return axis limits (low, high) that include all values, with a relative margin; low < high."""
+    """Return axis limits (low, high), low < high, that include all finite values.
+
+    `margin` is added on each side, as a fraction of the range. Without finite values the limits are 0 and 1.
+    """
     finite = np.concatenate(values) if values else np.empty(0)
     if finite.size == 0:
         return 0.0, 1.0
@@ -307,6 +322,9 @@ def limits(values: list[Floats], margin: float) -> tuple[float, float]:
 
 
 def snap_limits(low: float, high: float) -> tuple[float, float]:
-    """Return limits extended to a nearby tick, such as 0 and 10 for block pulses with centers just inside."""
+    """Return axis limits extended to ticks that are at most 1 % of the range outside.
+
+    Centers of block pulses from 0.05 to 9.95 give the limits 0 and 10, for example.
+    """
     values = ticks(low - 0.01 * (high - low), high + 0.01 * (high - low), 9).values
     return min(low, values[0]), max(high, values[-1])

@@ -1,4 +1,4 @@
-"""HTML pages, sections and tables of reports, from plain data."""
+"""HTML pages of reports with their sections and tables, from plain data."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from ftlm.svg.line_chart import chart_css
 from ftlm.utils.files import check_ending, write_atomically
 from ftlm.utils.formatting import Cell, number
 
-#: Columns from which a table has small type, so that the paper's fifteen columns fit a laptop screen.
+#: Minimum number of columns of a table that is set in small type. A table of the paper has fifteen columns, which must
+#: fit a laptop screen.
 DENSE_MIN_COLUMNS = 12
 NOT_IN_MODEL = "–"
 
 
 def cell_html(value: Cell) -> Markup:
-    """Return the HTML of a table cell; a number has its full precision in an attribute."""
+    """Return the HTML content of a table cell. A number is rounded, and an attribute has its full precision."""
     if value is None:
         return Markup(NOT_IN_MODEL)
     if isinstance(value, str):
@@ -44,22 +45,23 @@ class Table:
     Parameters
     ----------
     title
-        Caption.
+        Title above the table.
     columns
-        Column headers. The first column names the row.
+        Column headers. The first column has the names of the rows.
     rows
         Cells of each row: text (escaped unless it is ``Markup``), numbers (shown with five significant digits, stored
         in full), or None for values that a model does not have.
     groups
-        Headers of groups of columns, as (text, number of columns) from left to right; empty text gives no header.
+        (text, number of columns) of each header over a group of columns, from left to right. Empty text gives no
+        header.
     headings
-        Headings across the table, by the index of the row below each.
+        Headings over the whole width of the table, by the index of the row that follows the heading.
     note
-        Sentence below the table.
+        Text below the table.
     wrap
-        Whether text in cells is wrapped; otherwise every row is one line.
+        Whether text in cells is wrapped; otherwise every row has one line.
     stacked
-        Whether the cells of a row are placed below one another on narrow screens.
+        Whether the cells of a row are placed below each other on narrow screens.
     """
 
     title: str
@@ -75,14 +77,14 @@ class Table:
     def from_groups(
         cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
     ) -> Table:
-        """Return a table from rows by heading, with the options of the class."""
+        """Return a table from rows by heading; `options` are further arguments of the class."""
         starts = accumulate((len(each) for each in rows.values()), initial=0)
         flat = [row for each in rows.values() for row in each]
         return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
 
     @property
     def is_numeric(self) -> list[bool]:
-        """Whether each column is numeric, and therefore right-aligned."""
+        """For each column, whether it has numbers only. Numeric columns are right-aligned."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return [
             bool(cells)
@@ -93,7 +95,7 @@ class Table:
 
     @property
     def starts_group(self) -> list[bool]:
-        """Whether each column is the first of its group."""
+        """For each column, whether it is the first column of a group with a header."""
         starts, at = [False] * len(self.columns), 0
         for text, width in self.groups:
             if text and at < len(starts):
@@ -109,7 +111,7 @@ class Table:
         kind = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
         kind += " stacked" if self.stacked else ""
         template = templates("ftlm.svg").get_template("table.html.j2")
-        return Markup(template.render(table=self, classes=classes, kind=kind))  # the template escapes
+        return Markup(template.render(table=self, classes=classes, kind=kind))  # safe: the template escapes all text
 
 
 @dataclass(frozen=True)
@@ -119,23 +121,23 @@ class Section:
     Parameters
     ----------
     heading
-        Heading.
+        Heading of the section.
     paragraphs
-        Text, escaped unless it is ``Markup``.
+        Paragraphs of text, escaped unless they are ``Markup``.
     warnings
-        Warnings in a box at the top.
+        Warnings that are shown in a box at the top.
     tables, figures
-        See :class:`ftlm.report.Table` and ``line_figure``.
+        Tables and charts of the section.
     small
         Whether two figures are placed side by side on wide screens.
     more
         Further warnings in a collapsed list.
     fold
-        Title of the collapsed part; it is open in print.
+        Title of a collapsed part of the section, which is expanded in print.
     folded_tables
-        Tables of the collapsed part.
+        Tables of this collapsed part.
     collapsed
-        Whether only the heading is shown until it is clicked; the section is open in print.
+        Whether only the heading is shown until it is clicked; the section is expanded in print.
     """
 
     heading: str
@@ -150,7 +152,7 @@ class Section:
     collapsed: bool = False
 
     def __post_init__(self) -> None:
-        # A str is a sequence of characters; treat it as one paragraph.
+        # A str is a sequence of characters, but is treated as a single paragraph.
         for name in ("paragraphs", "warnings", "more"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
@@ -158,7 +160,7 @@ class Section:
 
 @cache
 def templates(package: str) -> Environment:
-    """Templates of HTML in the files of a package; what they insert is escaped unless it is ``Markup``."""
+    """Return the environment of the HTML templates in a package. Inserted text is escaped unless it is ``Markup``."""
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,
@@ -172,21 +174,21 @@ def templates(package: str) -> Environment:
 
 @cache
 def read_resource(name: str, package: str = "ftlm.svg") -> str:
-    """Return the text of a file of a package."""
+    """Return the text of the file `name` of a package."""
     return resources.files(package).joinpath(name).read_text("utf-8")
 
 
 def style_sheet() -> Markup:
-    """Return the style sheet of all pages."""
-    return Markup(read_resource("style.css"))  # our own file
+    """Return the CSS style sheet of all pages."""
+    return Markup(read_resource("style.css"))  # safe: a file of this package
 
 
 @cache
 def _script() -> tuple[Markup, str]:
-    """Return the script element and its hash for the content security policy."""
+    """Return the text of the page script, and its hash for the content security policy."""
     text = read_resource("charts.js")
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-    return Markup(text), f"sha256-{digest}"  # our own file
+    return Markup(text), f"sha256-{digest}"  # safe: a file of this package
 
 
 def write_page(
@@ -205,20 +207,20 @@ def write_page(
     path
         File to write.
     title
-        Title.
+        Title of the page.
     sections
-        Sections in order.
+        Sections from top to bottom.
     lead
         Summary below the title.
     force
-        Overwrite an existing file.
+        Whether an existing file is overwritten.
     verdict
-        Content above everything else, escaped unless it is ``Markup``.
+        Content at the top of the page, escaped unless it is ``Markup``.
 
     Returns
     -------
     Path
-        The file.
+        The file that was written.
 
     Raises
     ------
@@ -244,13 +246,13 @@ def write_page(
             verdict=verdict,
         )
     )
-    # A name may hold half a surrogate pair, which no file can.
+    # A name may contain an unpaired surrogate, which UTF-8 cannot encode.
     return write_atomically(path, page.encode("utf-8", "backslashreplace"), force=force)
 
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a page: title, sections and summary."""
+    """Content of a report page: title, sections, and summary below the title (`lead`)."""
 
     title: str
     sections: Sequence[Section]
@@ -265,6 +267,9 @@ class ReportMixin(ABC):
         """Return the content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the result to an HTML file, with the arguments and errors of :meth:`ftlm.Identification.report`."""
+        """Write the result to an HTML file, and return its path.
+
+        Arguments and errors are those of :meth:`ftlm.Identification.report`.
+        """
         page = self._page()
         return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

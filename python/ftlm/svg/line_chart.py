@@ -1,4 +1,4 @@
-"""Line charts as SVG, with the data for a slider that reads out values."""
+"""Line charts as SVG, with the data of a slider that shows the values of all lines at one position."""
 
 from __future__ import annotations
 
@@ -40,33 +40,33 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, truncate_text
 from ftlm.utils.validation import Floats, as_floats
 
-#: Positions of a slider, more than its track has pixels.
+#: Approximate maximum number of slider positions; the track of the slider has fewer pixels.
 SLIDER_POSITIONS = 750
-#: Quantization levels over the range of a line: five digits.
+#: Number of quantization levels over the range of a line, which gives values of five digits.
 READOUT_LEVELS = 1e5
 
 
 def slider_readout(
     x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = SLIDER_POSITIONS
 ) -> str:
-    """Return, for each slider position of a chart, the values of all lines as a JSON string of integers.
+    """Return the values of all lines at the slider positions of a chart, as JSON text for the page script.
 
     Parameters
     ----------
     x
         Ascending values of the horizontal axis, shape (N,).
     lines
-        (name, style, values of shape (N,)) of each line; NaN marks a missing value.
+        (name, index in LINE_STYLES, values of shape (N,)) of each line; NaN marks a missing value.
     x_label, y_label
-        Text with a unit in brackets at its end.
+        Axis labels; each may end with a unit in brackets.
     places
         Approximate maximum number of positions.
 
     Returns
     -------
     str
-        JSON text. Every position is a sample. The position of the largest difference between the first two lines is
-        included and marked.
+        JSON object with integer values; empty without finite `x` or without lines. Every position is a sample. The
+        slider starts at the largest difference between the first two lines.
     """
     rows_present = np.flatnonzero(np.isfinite(x))
     if not rows_present.size or not lines:
@@ -92,33 +92,34 @@ def slider_readout(
 
 
 def _split_unit(label: str) -> tuple[str, str]:
-    """Split an axis label into name and unit."""
+    """Split an axis label such as "time [s]" into name and unit; the unit is empty without brackets."""
     bare, bracket, unit = label.rpartition(" [")
     return (bare, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
 
 
 def _scaled_integers(values: Floats) -> list[object]:
-    """Return a power of ten and the integers whose product with it gives the values; None for missing values."""
+    """Return [exponent, integers], where values = integers * 10**exponent; an integer is None for a missing value."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return [0, [None] * values.size]
     low, high = float(finite.min()), float(finite.max())
     largest = max(abs(low), abs(high))
-    # Integers of more than about twelve digits would not be exact in a browser.
+    # The integers have at most about twelve digits, which a browser represents exactly.
     fine = max((high / READOUT_LEVELS - low / READOUT_LEVELS), largest * 1e-12, 1e-290)
     power = math.floor(math.log10(fine))
     scaled = values / 10.0**power
     return [power, [None if math.isnan(v) else round(v) for v in scaled.tolist()]]
 
 
-#: Values beyond this are gaps, because their differences overflow.
+#: Maximum magnitude of a drawn value. Larger values are drawn as gaps, because their differences overflow.
 MAX_DRAWN_VALUE = 1e300
 #: Diameter of a dot [px].
 DOT_DIAMETER_PX = 4.6
-#: Longest label beside a line [characters]; the legend of the narrow chart allows twice as many.
+#: Maximum length of a label beside a line [characters]; the legend of a narrow chart allows twice this length.
 MAX_LABEL_CHARACTERS = 22
-#: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
-#: lightened for dark mode; dashes distinguish lines without color. The first style is neutral.
+#: Line styles: (color in light mode, color in dark mode, SVG dash pattern). The colors are those of Okabe and Ito,
+#: darkened to a contrast of 3:1 on white and lightened for dark mode. The dash patterns distinguish lines without
+#: color. The first style is neutral, for measured values.
 LINE_STYLES = (
     ("#3d4650", "#7f8b97", ""),
     ("#d1480a", "#ff8f45", ""),
@@ -127,7 +128,7 @@ LINE_STYLES = (
     ("#9b3f83", "#e99ac8", "9 3 2 3"),
     ("#7a6300", "#e6cb4f", "14 4"),
 )
-#: Name prefixes of lines in the neutral style.
+#: Prefixes of the names of lines that are drawn in the neutral style.
 NEUTRAL_PREFIXES = ("measured", "simulated arm", "designed")
 
 
@@ -136,7 +137,7 @@ class _Line:
     name: str
     style: int
     x: Floats
-    y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
+    y: Floats  # values, or their decimal logarithms on a logarithmic axis; NaN where nothing can be drawn
     dots: bool = False
     band: tuple[Floats, Floats] | None = None
 
@@ -144,39 +145,41 @@ class _Line:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class LineChart(Figure):
-    """Chart of lines over a common axis.
+    """Chart of one or more lines over a common horizontal axis.
 
     Parameters
     ----------
     x
         Values of the horizontal axis, shape (N,).
     lines
-        (name, values of shape (N,)) of each line; a single line may have an empty name. Lines whose name begins with
-        "measured", "simulated arm" or "designed" have the neutral style; the others get colors and dashes in sequence.
+        (name, values of shape (N,)) of each line; a single line may have an empty name. A line whose name begins with
+        "measured", "simulated arm" or "designed" has the neutral style. The other lines get colors and dashes in
+        sequence.
     title, x_label, y_label
-        Text, with units.
+        Title, and axis labels with their units.
     caption
-        Sentence below the chart, to which a note on omitted values is added.
+        Text shown below the chart. Notes on values that are not drawn are added to it.
     bands
-        Shaded bands (low, high) behind the first lines, in sequence; each edge has shape (N,).
+        (lower, upper) edge of a shaded band for the first lines, in the sequence of the lines; each edge has shape
+        (N,).
     log_x, log_y
         Whether the axis is logarithmic.
     stems
         Whether every value is drawn as a stem from 0 instead of a line.
     steps
-        Whether every value is constant until the next one.
+        Whether every value is held until the next one (staircase).
     dots
         Names of lines that are drawn as dots.
     bars
-        Edges of bars that start at 0, shape (M + 1,), and their heights, shape (M,).
+        (edges, heights) of bars that start at 0: shapes (M + 1,) and (M,).
     width, height
-        Size [px] of the drawing for wide screens, which scales with the page.
+        Size [px] of the drawing for wide screens. The page scales the drawing to the available width.
     points
-        Maximum number of points of a line.
+        Maximum number of drawn points of a line.
     slider
-        Whether data for a slider that reads out the samples are included; only on linear axes.
+        Whether data of a slider that shows sample values are included. It is ignored on logarithmic axes.
     description
-        Sentences for screen readers; by default the range of every line.
+        Sentences for screen readers; by default they state the range of every line.
 
     Raises
     ------
@@ -209,7 +212,10 @@ class LineChart(Figure):
 
     @cached_property
     def content(self) -> tuple[list[_Line], list[str]]:
-        """Lines that are ready to draw, and notes on values that cannot be drawn."""
+        """Lines in axis coordinates, and sentences on values that cannot be drawn.
+
+        Raise DataError without lines, or if a line or band has another length than x.
+        """
         if not self.lines:
             raise DataError("a chart needs at least one line; give (name, values) pairs")
         across = as_floats("x", self.x, gaps=True).copy()
@@ -236,20 +242,25 @@ class LineChart(Figure):
         return drawn, notes
 
     def _corners(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the corner points of a line; each step of a staircase has two."""
+        """Return the points to connect by straight lines: those of the line, or two per value of a staircase."""
         return (x.repeat(2)[1:], y.repeat(2)[:-1]) if self.steps else (x, y)
 
     def _edge(self, name: str, edge: ArrayLike, x: Floats) -> Floats:
-        """Return one edge of a band, with gaps at values that cannot be drawn."""
+        """Return one edge of the band of line `name` in axis coordinates, with NaN at values that cannot be drawn.
+
+        Raise DataError if the edge has another length than x.
+        """
         values = as_floats("bands", edge, gaps=True).copy()
         if values.shape != x.shape:
-            raise DataError(f"a band of {name!r} has shape {values.shape}, x {x.shape}; give one length")
+            raise DataError(
+                f"a band of {name!r} has shape {values.shape}, x has shape {x.shape}; give arrays of one length"
+            )
         values = _logarithms(values) if self.log_y else values
         return self._corners(x, np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan))[1]
 
     @cached_property
     def frame(self) -> tuple[float, float, float, float]:
-        """Axis limits left, right, bottom and top; logarithms of them on logarithmic axes."""
+        """Axis limits (left, right, bottom, top); decimal logarithms of the limits on logarithmic axes."""
         lines = self.content[0]
         x_low, x_high = limits([lines[0].x[np.isfinite(lines[0].x)]], 0.02 if self.stems else 0.0)
         if self.bars is not None:
@@ -264,16 +275,16 @@ class LineChart(Figure):
 
     @cached_property
     def _y_limits(self) -> tuple[float, float, list[tuple[str, float]]]:
-        """Return the limits of the vertical axis, and (name, extreme value) of lines that exceed them."""
+        """Limits (low, high) of the vertical axis, and (name, extreme value) of each line that exceeds them."""
         lines = self.content[0]
         every = [line.y[np.isfinite(line.y)] for line in lines]
-        # Bands widen the axis and are never said to have left it.
+        # Bands extend the axis, and are not reported if they exceed it.
         bands = [] if self.stems else [e[np.isfinite(e)] for line in lines if line.band for e in line.band]
         low, high = limits([*every, *bands], 0.05)
         neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
         if not neutral:
             return low, high, []
-        # A diverging simulation would flatten the measured curve.
+        # The measured lines limit the axis: with a diverging simulation they would appear flat.
         bottom, top = limits(neutral, 0.0)
         reach = MAX_STRAY_HEIGHTS * (top - bottom)
         floor, ceiling = bottom - reach, top + reach
@@ -286,7 +297,7 @@ class LineChart(Figure):
 
     @property
     def note(self) -> str:
-        """Caption, followed by notes on values and lines that are not drawn."""
+        """Caption, followed by sentences on values that are not drawn and on lines that exceed the axis."""
         strays = [
             f"{name} leaves the axis (to {number(10.0**far if self.log_y else far, 3)})."
             for name, far in self._y_limits[2]
@@ -294,7 +305,7 @@ class LineChart(Figure):
         return " ".join(part for part in (self.caption, *self.content[1], *strays) if part)
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
-        """Return the ticks of the horizontal and the vertical axis."""
+        """Return the ticks of the horizontal axis and of the vertical axis."""
         x_low, x_high, y_low, y_high = self.frame
         across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
@@ -307,7 +318,7 @@ class LineChart(Figure):
         named = [line for line in lines if line.name]
         legend = _legend(named, width) if narrow else []
         left = max(30.0, 10 + max(map(text_width, upward.labels)))
-        # Beside the lines: a gap, a swatch, the label.
+        # The space on the right of the lines contains a gap, a line sample and the label.
         side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
         right = 14.0 if narrow or not named else 34 + side
         top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
@@ -323,7 +334,7 @@ class LineChart(Figure):
         parts = [*plot.grid(across, upward), self._curves(plot, narrow=narrow), text_group(texts)]
         data = {} if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
         if self.slider and not (narrow or self.log_x or self.log_y):
-            # A page with many charts has few points a line, and so has the readout.
+            # The slider has fewer positions on a page with many charts, whose lines have fewer points.
             values = [(line.name, line.style, line.y) for line in lines]
             places = max(2, self.points // 2)
             data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, places)
@@ -338,7 +349,7 @@ class LineChart(Figure):
         return described + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
 
     def _curves(self, plot: PlotArea, *, narrow: bool) -> Markup:
-        """Return bars, bands and lines as SVG markup, in a nested drawing that clips them."""
+        """Return bars, bands and lines as a nested SVG element that clips them to the plot area."""
         points = max(4, self.points // 2) if narrow else self.points
         out = []
         zero = round(float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL)
@@ -355,7 +366,7 @@ class LineChart(Figure):
                 out.append(element("path", **shade, d=d))
         if self.stems:
             out.append(faint_path(f"M0 {zero}h{plot.width * TENTHS_PER_PIXEL:.0f}"))
-        # The neutral line lies beneath the others.
+        # The neutral line is drawn first, below the other lines.
         for line in sorted(self.content[0], key=lambda item: item.style != 0 or item.dots):
             if d := _stem_path(line, plot) if self.stems else _path(line, plot, points):
                 stroke = _stroke(line.style, dots=line.dots)
@@ -366,13 +377,13 @@ class LineChart(Figure):
 
 
 def line_styles(names: Iterable[str]) -> list[int]:
-    """Return the style number of each line: 0 (neutral) for names of measured lines, otherwise 1, 2, … in sequence."""
+    """Return the index in LINE_STYLES for each line name: 0 for a neutral prefix, otherwise 1, 2, … in sequence."""
     others = cycle(range(1, len(LINE_STYLES)))
     return [0 if name.startswith(NEUTRAL_PREFIXES) else next(others) for name in names]
 
 
 def _logarithms(values: Floats) -> Floats:
-    """Return logarithms of values; NaN for values that are not positive."""
+    """Return decimal logarithms of values; NaN for values that are not positive."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log10(np.where(values > 0, values, np.nan))
 
@@ -387,14 +398,14 @@ def _describe_line(line: _Line, log_y: bool) -> str:
 
 
 def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> dict[str, str]:
-    """Return attributes for the zoom script: axis limits, plot area, and powers of ten of the labels."""
+    """Return SVG attributes for the zoom script: axis limits, plot area [px], and powers of ten of the tick labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
     return {"data_frame": frame, "data_plot": place, "data_powers": f"{across.power} {upward.power}"}
 
 
 def _outline(line: _Line, plot: PlotArea, points: int) -> str:
-    """Return the SVG path data of a band, with gaps where an edge is not finite."""
+    """Return the SVG path data of a band as one polygon; points with an edge that is not finite are omitted."""
     if line.band is None:
         return ""
     low, high = line.band
@@ -416,37 +427,40 @@ def _stem_path(line: _Line, plot: PlotArea) -> str:
 
 
 def _stroke(style: int, *, dots: bool = False) -> dict[str, str]:
-    """Return the SVG attributes of a line in a style."""
+    """Return the SVG stroke attributes for an index in LINE_STYLES; dots have no dash pattern."""
     light, _, dashes = LINE_STYLES[style]
     dashes = "" if dots else dashes
-    # The measured line is wide enough to show on both sides of one that follows it exactly.
+    # The measured line is wider, so that it stays visible behind a simulated line that coincides with it.
     thickness = DOT_DIAMETER_PX if dots else 3.4 if style == 0 else 1.5
-    # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
+    # The style sheet of a page replaces the color in dark mode; the attribute applies without a style sheet.
     stroke = {"class_": f"line{style}", "fill": "none", "stroke": light, "stroke_width": f"{thickness:g}"}
     stroke |= {"stroke_linejoin": "round", "stroke_linecap": "butt" if dashes else "round"}
     return stroke | ({"stroke_dasharray": dashes} if dashes else {})
 
 
 def path_data(places: Iterable[tuple[float, float]]) -> str:
-    """Return the SVG path data of straight lines through points [px]."""
+    """Return the SVG path data of the polyline through points (x, y) [px]."""
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
 
 
 def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
-    """Return the SVG path through points [px] in the color of a style."""
+    """Return the polyline through points (x, y) [px] as SVG markup, in the color of a line style."""
     stroke = {"class_": f"line{style}", "fill": "none", "stroke": LINE_STYLES[style][0], "stroke_width": f"{width}"}
     dash = {"stroke_dasharray": dashes} if dashes else {}
     return element("path", **stroke, **dash, d=path_data(places))
 
 
 def _path(line: _Line, plot: PlotArea, points: int) -> str:
-    """Return SVG path data in integer tenths of a pixel, each point relative to the previous one, with gaps."""
+    """Return the SVG path data of a line with gaps, in integer tenths of a pixel.
+
+    Each point is relative to the previous one. At most `points` points are drawn.
+    """
     rows = decimate(line.y, points)
     if rows.size == 0:
         return ""
     xs, ys = plot.tenths(line.x[rows], line.y[rows])
     starts = np.diff(np.cumsum(~np.isfinite(line.y))[rows], prepend=-1) != 0
-    # A line of no length, h0: a lone point between gaps still shows, as a dot.
+    # A line of zero length (h0) shows a single point between two gaps as a dot.
     parts = [
         f"M{x} {y}h0" if start else f"l{x - x_before} {y - above}"
         for x, y, x_before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
@@ -455,19 +469,22 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
 
 
 def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
-    """Return a sample of a line's style as SVG markup, for a label."""
+    """Return a short sample of a line as SVG markup for its label: `length` [px] from (x, y), or a dot."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
     return element("path", **_stroke(line.style, dots=line.dots), d=f"M{at:.1f} {y:.1f}h{reach}")
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
-    """Return a sample and the name of every line at its end as SVG markup; overlapping labels are moved apart."""
+    """Return a line sample and a name at the right end of every line as SVG markup.
+
+    Overlapping labels are moved apart.
+    """
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
     ends = []
     for line in lines:
         finite = line.y[np.isfinite(line.y)]
         ends.append(float(np.clip(plot.y_pixels(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
-    # Lines that end together keep the order in which they were given.
+    # Lines that end at about the same height keep their sequence.
     order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE_HEIGHT_PX), i))
     places = [ends[i] for i in order]
     for k in range(1, len(places)):
@@ -484,7 +501,7 @@ def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
 
 
 def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
-    """Return the position of every legend entry above a narrow chart, as (line, x, row)."""
+    """Return (line, x position [px], row index) of every legend entry above a narrow chart."""
     entries, x, row = [], 4.0, 0
     for line in lines:
         needed = 26 + text_width(truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS)) + 14
@@ -505,12 +522,12 @@ def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
 
 
 def chart_css() -> Markup:
-    """Return the CSS rules of the line colors, for light and dark mode."""
+    """Return the CSS rules for the colors of all line styles in light and dark mode."""
     light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINE_STYLES))
     dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINE_STYLES))
     rules = "".join(
         f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINE_STYLES))
     )
     return Markup(
-        f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # our constants
+        f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # safe: constants
     )

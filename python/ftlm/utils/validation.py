@@ -298,7 +298,7 @@ def as_floats(name: str, values: object, *, gaps: bool = False) -> NDArray[np.fl
     """
     array = as_array(name, values, gaps=gaps)
     if array.dtype.kind not in _NUMBER_DTYPE_KINDS:
-        raise DataError(f"{name} holds {array.dtype} values; give real numbers")
+        raise DataError(f"{name} has {array.dtype} values; give real numbers")
     with np.errstate(over="ignore"):
         return np.asarray(array, dtype=np.float64, order="C")
 
@@ -313,7 +313,7 @@ def as_complex(name: str, values: object) -> NDArray[np.complex128]:
     """
     array = as_array(name, values)
     if array.dtype.kind not in _NUMBER_DTYPE_KINDS | {"c"}:
-        raise DataError(f"{name} holds {array.dtype} values; give numbers")
+        raise DataError(f"{name} has {array.dtype} values; give numbers")
     with np.errstate(over="ignore"):
         return np.asarray(array, dtype=np.complex128, order="C")
 

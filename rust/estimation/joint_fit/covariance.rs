@@ -44,7 +44,7 @@ pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: O
         series.iter().map(of).sum::<f64>()
     };
     let Some(shares) = shares else { return covariance_of_residuals(jacobian, &series, squares(&series)) };
-    jacobian.iter().try_for_each(|row| check_length("shares of residuals", row.len(), shares.len()))?;
+    jacobian.iter().try_for_each(|row| check_length("robust weights of residuals", row.len(), shares.len()))?;
     let whole = |(value, &share): (&f64, &f64)| value / if share > 0.0 { share } else { 1.0 };
     let rows: Vec<Vec<f64>> = jacobian.iter().map(|row| row.iter().zip(shares).map(whole).collect()).collect();
     let series = huber_pseudo_residuals(series, jacobian.len());

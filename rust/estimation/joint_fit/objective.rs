@@ -93,7 +93,7 @@ impl<'a> Objective<'a> {
     pub fn with_weights(&self, weights: Weights) -> Result<Self> {
         let mut experiments = Vec::clone(&self.experiments);
         if let Some(shares) = &weights.robust_weights {
-            check_length("runs with shares", experiments.len(), shares.len())?;
+            check_length("runs with robust weights", experiments.len(), shares.len())?;
         }
         for (k, experiment) in experiments.iter_mut().enumerate() {
             experiment.sample_weights.clone_from(&self.sample_mask[k]);

@@ -44,7 +44,10 @@ impl Problem {
             for (_, order, coefficient) in &equation.terms {
                 order.check(&model.order_bounds)?;
                 if missing(coefficient) {
-                    return refuse("an equation names a coefficient that is not there".into(), "number them from 0");
+                    return refuse(
+                        "an equation refers to a coefficient that does not exist".into(),
+                        "number them from 0",
+                    );
                 }
             }
         }
@@ -56,7 +59,7 @@ impl Problem {
         }
         let bounds = model.order_bounds.iter().copied().chain(model.inputs.iter().map(|input| input.bounds));
         if let Some((low, high)) = bounds.into_iter().find(|(low, high)| low.is_nan() || high.is_nan() || low > high) {
-            return refuse(format!("bounds {low} to {high}"), "give two rising numbers");
+            return refuse(format!("bounds {low} to {high}"), "give two increasing numbers");
         }
         for (_, law) in &frictions {
             law.speed.powers.iter().for_each(|&(j, _)| model.coordinates[j] = Coordinate::Logarithm);
@@ -89,7 +92,7 @@ impl Problem {
     /// # Errors
     /// [`Error::Length`] for a number of values that differs from the number of free parameters.
     pub fn point(&self, values: &[f64]) -> Result<ParameterPoint> {
-        check_length("values of what is free", self.size(), values.len())?;
+        check_length("values of the free parameters", self.size(), values.len())?;
         let (orders, rest) = values.split_at(self.model.order_bounds.len());
         let (coefficients, inputs) = rest.split_at(self.model.coordinates.len());
         Ok(ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
@@ -271,8 +274,8 @@ impl Problem {
     /// # Errors
     /// [`Error::Length`] for a number of values that differs from the number of free parameters.
     pub fn last_feasible_point(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
-        check_length("values to go from", self.size(), at.len())?;
-        check_length("values to go to", self.size(), towards.len())?;
+        check_length("point to start from", self.size(), at.len())?;
+        check_length("point to move towards", self.size(), towards.len())?;
         let constraints = self.constraints();
         let room: Vec<f64> = (constraints.iter())
             .map(|c| {

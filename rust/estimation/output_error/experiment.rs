@@ -108,13 +108,13 @@ impl Experiment {
     pub fn with_weights(mut self, outputs: &[f64], shares: Option<&[Vec<f64>]>) -> Result<Self> {
         self.weights = outputs.to_vec();
         let Some(shares) = shares else { return Ok(self) };
-        check_length("outputs with shares", self.samples.len(), shares.len())?;
+        check_length("outputs with robust weights", self.samples.len(), shares.len())?;
         if self.sample_weights.is_empty() {
             self.sample_weights = shares.to_vec();
             return Ok(self);
         }
         for (row, by) in self.sample_weights.iter_mut().zip(shares) {
-            check_length("shares of samples", row.len(), by.len())?;
+            check_length("robust weights of samples", row.len(), by.len())?;
             row.iter_mut().zip(by).for_each(|(share, by)| *share *= by);
         }
         Ok(self)
@@ -180,11 +180,11 @@ impl Experiment {
             check_length("jumps of signals", self.record.len(), own.jumps.len())?;
         }
         if !self.sample_weights.is_empty() {
-            check_length("outputs with shares", self.samples.len(), self.sample_weights.len())?;
+            check_length("outputs with robust weights", self.samples.len(), self.sample_weights.len())?;
         }
         for shares in &self.sample_weights {
-            check_finite("shares of samples", shares)?;
-            check_length("shares of samples", self.compared_count(), shares.len())?;
+            check_finite("robust weights of samples", shares)?;
+            check_length("robust weights of samples", self.compared_count(), shares.len())?;
         }
         check_finite("weights", &self.weights)?;
         check_length("weights", self.samples.len(), self.weights.len())

@@ -414,7 +414,7 @@ fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
             });
         }
     }
-    check_finite("orders of the start", &start.orders)?;
+    check_finite("orders of the initial guess", &start.orders)?;
     match start.inputs.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
         Some(index) => Err(Error::OutOfRange {

@@ -185,13 +185,13 @@ impl FreeModel {
             }
             let least = if law == InputLaw::Delay { f64::MIN } else { 0.0 };
             if !(least <= low && low <= high && high.is_finite()) {
-                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two rising values");
+                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two increasing values");
             }
         }
         if let Some((low, high)) =
             self.order_bounds.iter().find(|(low, high)| low.is_nan() || high.is_nan() || low > high)
         {
-            return refuse(format!("bounds {low} to {high} of an order"), "give two rising orders");
+            return refuse(format!("bounds {low} to {high} of an order"), "give two increasing orders");
         }
         Ok(())
     }

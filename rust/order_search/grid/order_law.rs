@@ -60,7 +60,7 @@ impl OrderLawGrid {
             check_finite(&format!("values of free order {axis}"), values)?;
         }
         if equations.is_empty() {
-            let what = "a stage without equations cannot be searched".into();
+            let what = "the coupled search has no equation".into();
             return Err(Error::Structure { what, remedy: "give at least one equation".into() });
         }
         equations.iter().try_for_each(|equation| equation.check(axes.len(), inputs.len()))?;
@@ -195,8 +195,8 @@ impl LawEquation {
         for signal in std::iter::once(self.output).chain(self.terms.iter().map(|term| term.0)) {
             if signal >= signals {
                 return Err(Error::Structure {
-                    what: format!("an equation of the stage names signal {signal}, but there are {signals}"),
-                    remedy: "give all signals of the equations".into(),
+                    what: format!("an equation contains signal {signal}, but the number of signals is {signals}"),
+                    remedy: "give the values of all signals, and number them from 0".into(),
                 });
             }
         }
@@ -205,8 +205,11 @@ impl LawEquation {
             check_finite("weights of an order law", &law.weights)?;
             if law.weights.len() > free {
                 return Err(Error::Structure {
-                    what: format!("an order law weighs {} free orders, but there are {free}", law.weights.len()),
-                    remedy: "give values for every free order".into(),
+                    what: format!(
+                        "an order law has {} weights, but the number of free orders is {free}",
+                        law.weights.len()
+                    ),
+                    remedy: "give values for every free order that the law contains".into(),
                 });
             }
         }

@@ -66,7 +66,7 @@ impl JointProblem {
         at: PyReadonlyArray1<'py, f64>,
         towards: PyReadonlyArray1<'py, f64>,
     ) -> PyResult<Array<'py>> {
-        let (at, towards) = (vector("values to go from", &at)?, vector("values to go to", &towards)?);
+        let (at, towards) = (vector("point to start from", &at)?, vector("point to move towards", &towards)?);
         let point = run_detached(py, || self.inner.problem.last_feasible_point(&at, &towards))?;
         Ok(PyArray1::from_vec(py, point))
     }

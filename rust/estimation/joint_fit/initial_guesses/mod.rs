@@ -166,8 +166,8 @@ impl<'a> OrderGrids<'a> {
                 let (order, signal) = (format_general(term.order.constant, 6), &signals[term.signal]);
                 let (alpha, output) = (format_general(alpha, 6), &signals[item.output]);
                 let what = format!(
-                    "order {order} of {signal} is above alpha = {alpha} of {output}, and the runs hold {signal} between \
-                     their samples: its jumps have no derivative"
+                    "order {order} of {signal} is above alpha = {alpha} of {output}, and the runs have a zero-order \
+                     hold for {signal}, whose jumps have no derivative"
                 );
                 let remedy = "reduce the order, or set intersample='foh' if the input is linear between samples".into();
                 return Err(Error::Structure { what, remedy });

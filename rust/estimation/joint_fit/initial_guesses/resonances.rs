@@ -130,7 +130,7 @@ fn scan_equation(
     let candidates: Option<Vec<_>> =
         grid.map(|(omega, damping)| resonance_coefficients(item, omega, damping)).collect();
     let Some(candidates) = candidates else { return Ok(Vec::new()) };
-    check_linear(structure, item, "what is linear in its coefficients")?;
+    check_linear(structure, item, "a scan of resonances by least squares")?;
     coarse.stop.check()?;
     // The Caputo exponents must be those of the full equation, including the autoregressive terms.
     let rest = ParametricEquation { terms: others, ..item.clone() };

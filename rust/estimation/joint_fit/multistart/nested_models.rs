@@ -136,7 +136,7 @@ impl IntegerOrderProblem {
     pub fn embed(&self, runner: &Candidate) -> Candidate {
         let mut candidate = runner.clone();
         candidate.result.iterate.point.orders.clone_from(&self.orders);
-        candidate.origin = format!("{}, from whole orders", runner.origin);
+        candidate.origin = format!("{}, from integer orders", runner.origin);
         candidate
     }
 }

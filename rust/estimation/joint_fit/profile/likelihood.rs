@@ -53,7 +53,7 @@ impl FitState {
         (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
         pulses_per_sample: usize,
     ) -> Result<Objective<'a>> {
-        check_length("values of what is free", free.problem.size(), self.estimate.len())?;
+        check_length("values of the free parameters", free.problem.size(), self.estimate.len())?;
         check_length("values on the grid", free.problem.size(), self.on_grid.len())?;
         let sampling = Sampling { pulses_per_sample, ..Sampling::default() };
         Objective::new((&free.problem, source, stop), self.weights.clone(), sampling, self.requires_stability)
