@@ -60,7 +60,7 @@ pub enum Initial {
     /// t^{α+1}/Γ(α+2).
     Offset {
         /// Other initial conditions, without an offset.
-        under: Box<Initial>,
+        base: Box<Initial>,
         /// True if there is an unknown ramp in addition to the constant.
         ramp: bool,
     },
@@ -70,7 +70,7 @@ pub enum Initial {
     /// from a reference. The equation error has no term for the level.
     Level {
         /// Other initial conditions, without an offset.
-        under: Box<Initial>,
+        base: Box<Initial>,
     },
     /// Sensor filter with nonzero initial conditions.
     ///
@@ -78,7 +78,7 @@ pub enum Initial {
     /// filter's responses to an impulse and to derivatives of an impulse.
     Filtered {
         /// Other initial conditions, which may include an offset or a level, but no filter transient.
-        under: Box<Initial>,
+        base: Box<Initial>,
         /// Number of filter responses in the transient, which is the relative degree of the filter.
         states: u8,
     },
@@ -136,8 +136,8 @@ impl Initial {
     pub fn with_offset(self, offset: u8) -> Result<Self> {
         match offset {
             0 => Ok(self),
-            1 | 2 => Ok(Self::Offset { under: Box::new(self.under().clone()), ramp: offset == 2 }),
-            3 => Ok(Self::Level { under: Box::new(self.under().clone()) }),
+            1 | 2 => Ok(Self::Offset { base: Box::new(self.base().clone()), ramp: offset == 2 }),
+            3 => Ok(Self::Level { base: Box::new(self.base().clone()) }),
             _ => Err(Error::OutOfRange {
                 name: "offset".into(),
                 value: f64::from(offset),
@@ -158,16 +158,16 @@ impl Initial {
     pub fn with_states(self, states: u8) -> Self {
         match (self, states) {
             (whole, 0) => whole,
-            (Self::Filtered { under, .. }, _) => Self::Filtered { under, states },
-            (whole, _) => Self::Filtered { under: Box::new(whole), states },
+            (Self::Filtered { base, .. }, _) => Self::Filtered { base, states },
+            (whole, _) => Self::Filtered { base: Box::new(whole), states },
         }
     }
 
     /// Return the initial conditions without offset, output level and filter transient.
     #[must_use]
-    pub fn under(&self) -> &Self {
+    pub fn base(&self) -> &Self {
         match self {
-            Self::Offset { under, .. } | Self::Level { under } | Self::Filtered { under, .. } => under.under(),
+            Self::Offset { base, .. } | Self::Level { base } | Self::Filtered { base, .. } => base.base(),
             other => other,
         }
     }
@@ -177,7 +177,7 @@ impl Initial {
     pub fn has_level(&self) -> bool {
         match self {
             Self::Level { .. } => true,
-            Self::Filtered { under, .. } => under.has_level(),
+            Self::Filtered { base, .. } => base.has_level(),
             _ => false,
         }
     }
@@ -187,16 +187,16 @@ impl Initial {
     /// ```
     /// use ftlm::equation::Initial;
     /// let ramped = Initial::Caputo.with_offset(2)?.with_states(1);
-    /// assert_eq!(ramped.with_under(Initial::Rest), Initial::Rest.with_offset(2)?.with_states(1));
+    /// assert_eq!(ramped.with_base(Initial::Rest), Initial::Rest.with_offset(2)?.with_states(1));
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[must_use]
-    pub fn with_under(&self, start: Self) -> Self {
+    pub fn with_base(&self, start: Self) -> Self {
         match self {
-            Self::Offset { ramp, .. } => Self::Offset { under: Box::new(start), ramp: *ramp },
-            Self::Level { .. } => Self::Level { under: Box::new(start) },
-            Self::Filtered { under, states } => {
-                Self::Filtered { under: Box::new(under.with_under(start)), states: *states }
+            Self::Offset { ramp, .. } => Self::Offset { base: Box::new(start), ramp: *ramp },
+            Self::Level { .. } => Self::Level { base: Box::new(start) },
+            Self::Filtered { base, states } => {
+                Self::Filtered { base: Box::new(base.with_base(start)), states: *states }
             }
             _ => start,
         }
@@ -213,9 +213,9 @@ impl Initial {
     #[must_use]
     pub fn without_offset(&self) -> Self {
         match self {
-            Self::Offset { under, .. } => Self::clone(under),
-            Self::Filtered { under, states } => {
-                Self::Filtered { under: Box::new(under.without_offset()), states: *states }
+            Self::Offset { base, .. } => Self::clone(base),
+            Self::Filtered { base, states } => {
+                Self::Filtered { base: Box::new(base.without_offset()), states: *states }
             }
             other => other.clone(),
         }
@@ -224,14 +224,14 @@ impl Initial {
     /// True if all signals were zero before the record, apart from an offset, an output level and the filter transient.
     #[must_use]
     pub fn is_at_rest(&self) -> bool {
-        *self.under() == Self::Rest
+        *self.base() == Self::Rest
     }
 
     /// Return the initial conditions without the transient of a sensor filter.
     #[must_use]
     pub(crate) fn without_filter(&self) -> &Self {
         match self {
-            Self::Filtered { under, .. } => under,
+            Self::Filtered { base, .. } => base,
             other => other,
         }
     }
@@ -240,7 +240,7 @@ impl Initial {
     #[must_use]
     pub fn follows_orders(&self) -> bool {
         match self {
-            Self::Filtered { under, .. } | Self::Level { under } => under.follows_orders(),
+            Self::Filtered { base, .. } | Self::Level { base } => base.follows_orders(),
             other => matches!(other, Self::Caputo | Self::Offset { .. }),
         }
     }
@@ -250,7 +250,7 @@ impl Initial {
         match self {
             Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
             Self::Offset { ramp: false, .. } => vec![tidy(alpha)],
-            Self::Filtered { under, .. } => under.offset_exponents(alpha),
+            Self::Filtered { base, .. } => base.offset_exponents(alpha),
             _ => Vec::new(),
         }
     }
@@ -266,7 +266,7 @@ impl Initial {
     /// # Errors
     /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`] for an exponent that is not finite.
     pub fn check(&self) -> Result<()> {
-        let Self::Powers(exponents) = self.under() else { return Ok(()) };
+        let Self::Powers(exponents) = self.base() else { return Ok(()) };
         check_finite("exponents of the initial terms", exponents)?;
         match exponents.iter().find(|&&e| e <= -1.0) {
             None => Ok(()),
@@ -340,7 +340,7 @@ impl Structure {
     /// collinear with it. An example is t^1 with an equation of order 1.0003, whose offset is t^1.0003.
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
-        let mut exponents = match initial.under() {
+        let mut exponents = match initial.base() {
             Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => Vec::new(),
             Initial::Powers(powers) => powers.clone(),
             Initial::Caputo => {
@@ -352,7 +352,7 @@ impl Structure {
             }
         };
         let offset = initial.offset_exponents(self.order);
-        if *initial.under() == Initial::Caputo {
+        if *initial.base() == Initial::Caputo {
             exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > OFFSET_EXPONENT_TOLERANCE));
         }
         exponents.extend(offset);

@@ -304,9 +304,9 @@ mod tests {
                 assert!(value.is_finite() && slopes.len() == 2 && values.fault().is_none());
                 for (i, slope) in slopes.iter().enumerate() {
                     let side = |by: f64| {
-                        let mut near = at;
-                        near[i] += by;
-                        expression.evaluate(&near, &mut Values::default())
+                        let mut shifted = at;
+                        shifted[i] += by;
+                        expression.evaluate(&shifted, &mut Values::default())
                     };
                     let difference = (side(1e-6) - side(-1e-6)) / 2e-6;
                     assert!((slope - difference).abs() < 1e-8 * (1.0 + slope.abs()), "{slope} {difference}");

@@ -92,23 +92,23 @@ impl Plans {
     /// Store a plan, unless there is a plan of the same length. Return the stored plan and the evicted plans.
     ///
     /// The caller drops the evicted plans outside the lock.
-    fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
+    fn insert(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
         let len = plan.len;
         if let Some(stored) = self.find(len) {
             return (stored, vec![plan]);
         }
-        let mut forgotten = Vec::new();
+        let mut evicted = Vec::new();
         if len > MAX_PERMANENT_PLAN_POINTS {
             self.uses += 1;
-            forgotten = self.make_room(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
+            evicted = self.evict(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
         }
         self.plans.insert(len, (plan.clone(), self.uses));
-        (plan, forgotten)
+        (plan, evicted)
     }
 
     /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until these have at most
     /// `points` points in total. Recently requested plans are not evicted. Return the evicted plans.
-    fn make_room(&mut self, points: usize) -> Vec<Plan> {
+    fn evict(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
             .plans
             .iter()
@@ -117,15 +117,15 @@ impl Plans {
             .collect();
         long.sort_unstable();
         let mut stored_points: usize = long.iter().map(|&(_, len)| len).sum();
-        let mut forgotten = Vec::new();
+        let mut evicted = Vec::new();
         for (last, len) in long {
             if stored_points <= points || self.uses - last <= IN_USE {
                 break;
             }
             stored_points -= len;
-            forgotten.extend(self.plans.remove(&len).map(|(plan, _)| plan));
+            evicted.extend(self.plans.remove(&len).map(|(plan, _)| plan));
         }
-        forgotten
+        evicted
     }
 }
 
@@ -150,14 +150,14 @@ pub fn plan(len: usize) -> Plan {
         None => {
             // Plans are computed outside the lock. If two threads compute the same one, the later one is dropped.
             let new_plan = Plan::new(len);
-            match SHARED_PLANS.with(|plans| plans.keep(new_plan.clone())) {
-                Some((plan, _forgotten)) => (plan, true),
+            match SHARED_PLANS.with(|plans| plans.insert(new_plan.clone())) {
+                Some((plan, _evicted)) => (plan, true),
                 None => (new_plan, false),
             }
         }
     };
     if len <= MAX_PERMANENT_PLAN_POINTS || !shared {
-        THREAD_PLANS.with_borrow_mut(|own| own.keep(plan.clone()));
+        THREAD_PLANS.with_borrow_mut(|own| own.insert(plan.clone()));
     }
     plan
 }
@@ -276,14 +276,14 @@ mod tests {
     fn long_plans_are_forgotten_that_nobody_asks_for() {
         let mut plans = Plans::new();
         let (short, long, next) = (64, MAX_CACHED_PLAN_POINTS / 2, MAX_CACHED_PLAN_POINTS / 2 + 2);
-        let keep = |plans: &mut Plans, len| plans.keep(Plan::new(len)).1.len();
+        let insert = |plans: &mut Plans, len| plans.insert(Plan::new(len)).1.len();
         for len in [short, long, next] {
-            assert_eq!(keep(&mut plans, len), 0, "in use");
+            assert_eq!(insert(&mut plans, len), 0, "in use");
         }
         for _ in 0..=IN_USE {
             assert!(plans.find(short).is_some() && plans.find(next).is_some());
         }
-        assert_eq!(keep(&mut plans, next + 2), 1);
+        assert_eq!(insert(&mut plans, next + 2), 1);
         assert!(plans.find(long).is_none() && plans.find(next).is_some() && plans.find(short).is_some());
         // A plan that is computed again works.
         assert!(is_sound(&plan(long)));
@@ -292,8 +292,8 @@ mod tests {
     #[test]
     fn of_two_plans_of_a_length_the_first_is_kept() {
         let mut plans = Plans::new();
-        let (first, _) = plans.keep(Plan::new(64));
-        let (first_plan, dropped) = plans.keep(Plan::new(64));
+        let (first, _) = plans.insert(Plan::new(64));
+        let (first_plan, dropped) = plans.insert(Plan::new(64));
         assert!(Arc::ptr_eq(&first.forward, &first_plan.forward) && dropped.len() == 1);
     }
 

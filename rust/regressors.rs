@@ -114,18 +114,18 @@ impl Record {
             let mut last = (0, 0.0);
             for jump in row {
                 let PulseJump { pulse, share, .. } = *jump;
-                let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+                let invalid_jump = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
                 if pulse >= self.m() {
                     let what = format!("signal {signal} jumps in pulse {pulse} of {}", self.m());
-                    return refuse(what, "count pulses from 0");
+                    return invalid_jump(what, "count pulses from 0");
                 }
                 if !(share > 0.0 && share < 1.0) {
                     let what = format!("signal {signal} jumps after a share of {share} of pulse {pulse}");
-                    return refuse(what, "give jumps within pulses, with shares between 0 and 1");
+                    return invalid_jump(what, "give jumps within pulses, with shares between 0 and 1");
                 }
                 if (pulse, share) <= last {
                     let what = format!("a jump of signal {signal} in pulse {pulse} is not after the one before it");
-                    return refuse(what, "sort the jumps by time");
+                    return invalid_jump(what, "sort the jumps by time");
                 }
                 check_finite("values around a jump", &[jump.before, jump.after])?;
                 last = (pulse, share);
@@ -162,7 +162,7 @@ impl Record {
     #[must_use]
     pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (transients, moving, answers) =
+        let (transients, moving, impulse_responses) =
             (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
         Self {
             step: self.step,
@@ -171,7 +171,7 @@ impl Record {
             clean: None,
             filter_transients: transients,
             deviations: moving,
-            impulse_responses: answers,
+            impulse_responses,
             jumps: self.jumps.clone(),
         }
     }
@@ -214,8 +214,8 @@ impl Record {
     /// Return the record with nonzero initial conditions.
     ///
     /// `transients` is true for each signal whose sensor filter may have an initial transient. `levels` are the initial
-    /// levels of the signals. `answers` are pulse means of the known responses of the filter to an impulse and its
-    /// derivatives.
+    /// levels of the signals. `impulse_responses` are pulse means of the known responses of the filter to an impulse
+    /// and its derivatives.
     ///
     /// A term whose order exceeds the order of its equation differentiates the deviation of a signal from its initial
     /// level. The start of the record therefore does not act as a jump. Initial terms describe the effect of earlier
@@ -233,11 +233,16 @@ impl Record {
     /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn with_initial_state(mut self, transients: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
+    pub fn with_initial_state(
+        mut self,
+        transients: Vec<bool>,
+        levels: &[f64],
+        impulse_responses: Vec<Vec<f64>>,
+    ) -> Result<Self> {
         check_length("flags of signals with a transient of the sensor filter", self.len(), transients.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
-        for answer in &answers {
+        for answer in &impulse_responses {
             check_length("response of the sensor filter", self.m(), answer.len())?;
             check_finite("response of the sensor filter", answer)?;
         }
@@ -246,7 +251,7 @@ impl Record {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
         self.deviations = self.signals.iter().zip(levels).map(above).collect();
-        (self.filter_transients, self.impulse_responses) = (transients, answers);
+        (self.filter_transients, self.impulse_responses) = (transients, impulse_responses);
         Ok(self)
     }
 
@@ -549,8 +554,8 @@ impl Bank {
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn new_interruptible(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
         let m = record.m();
-        let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
-        if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
+        let is_out_of_range = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
+        if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(is_out_of_range) {
             return Err(Error::Structure {
                 what: format!(
                     "a regressor refers to signal {signal}, but the number of signals of the record is {}",

@@ -84,8 +84,8 @@ impl<'a> System<'a> {
                 }
             }
         }
-        let held = outputs.iter().map(|&o| record.has_filter_transient(o)).collect();
-        Ok(Self { record, filter_transients: held, matrix, rhs })
+        let filter_transients = outputs.iter().map(|&o| record.has_filter_transient(o)).collect();
+        Ok(Self { record, filter_transients, matrix, rhs })
     }
 
     /// Return the system with its matrix at ρz instead of the one-step delay z, with ρ = e^{−decay}. A large enough

@@ -184,9 +184,9 @@ pub fn respond_with_initial(
         check_length("filter", record.m(), filter.series.len())?;
         check_length("filtered outputs", equations.len(), filter.applies.len())?;
     }
-    let behind = |i: usize| record.is_filtered() || filter.is_some_and(|f| f.applies[i]);
+    let is_filtered = |i: usize| record.is_filtered() || filter.is_some_and(|f| f.applies[i]);
     let exponents: Vec<Vec<f64>> = (equations.iter().enumerate())
-        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.without_filter() }))
+        .map(|(i, e)| e.structure.initial_exponents(if is_filtered(i) { initial } else { initial.without_filter() }))
         .collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {

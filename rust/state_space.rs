@@ -126,7 +126,7 @@ struct Realization {
     /// System matrix h A, where h is the sampling interval.
     system: Vec<f64>,
     /// Gains (h B, D) of each input on the states and on the outputs.
-    drives: Vec<(Vec<f64>, Vec<f64>)>,
+    input_vectors: Vec<(Vec<f64>, Vec<f64>)>,
     /// Output matrix C, one row per output.
     read: Vec<f64>,
     start: Vec<f64>,
@@ -166,19 +166,19 @@ impl Realization {
             return Ok(None);
         }
         let first: Vec<usize> = (0..count).map(|i| lengths[..i].iter().sum()).collect();
-        // Direct feedthrough: (I − E) y = w₁ + F u, with I − E in `tied` and the columns of F in `direct`.
-        let mut tied = vec![0.0; count * count];
+        // Direct feedthrough: (I − E) y = w₁ + F u, with I − E in `feedthrough` and the columns of F in `direct`.
+        let mut feedthrough = vec![0.0; count * count];
         let mut direct = vec![vec![0.0; count]; inputs.len()];
-        (0..count).for_each(|i| tied[i * count + i] = 1.0);
+        (0..count).for_each(|i| feedthrough[i * count + i] = 1.0);
         for &(i, _, source, c) in terms.iter().filter(|t| t.1 == 0) {
             match source.checked_sub(count) {
-                None => tied[i * count + source] -= c,
+                None => feedthrough[i * count + source] -= c,
                 Some(q) => direct[q][i] += c,
             }
         }
         let norm = |m: &[f64]| m.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        let Ok(through) = small::inverse(&tied, count) else { return Ok(None) };
-        let condition = norm(&tied) * norm(&through);
+        let Ok(through) = small::inverse(&feedthrough, count) else { return Ok(None) };
+        let condition = norm(&feedthrough) * norm(&through);
         if condition.is_nan() || condition > MAX_CONDITION {
             return Ok(None);
         }
@@ -186,7 +186,7 @@ impl Realization {
         for (i, row) in (0..count).flat_map(|i| (0..count).map(move |row| (i, row))).filter(|&(i, _)| lengths[i] > 0) {
             read[row * n + first[i]] = through[row * count + i];
         }
-        let mut drives: Vec<(Vec<f64>, Vec<f64>)> =
+        let mut input_vectors: Vec<(Vec<f64>, Vec<f64>)> =
             direct.iter().map(|f| (vec![0.0; n], dense::multiply(&through, f, count, count, 1))).collect();
         let mut system = vec![0.0; n * n];
         let mut start = vec![0.0; n];
@@ -204,12 +204,12 @@ impl Realization {
             match source.checked_sub(count) {
                 None => {
                     (0..n).for_each(|j| system[row * n + j] += gain * read[source * n + j]);
-                    drives.iter_mut().for_each(|(b, d)| b[row] += gain * d[source]);
+                    input_vectors.iter_mut().for_each(|(b, d)| b[row] += gain * d[source]);
                 }
-                Some(q) => drives[q].0[row] += gain,
+                Some(q) => input_vectors[q].0[row] += gain,
             }
         }
-        let mut model = Self { states: n, outputs: count, system, drives, read, start };
+        let mut model = Self { states: n, outputs: count, system, input_vectors, read, start };
         model.balance();
         Ok(Some(model))
     }
@@ -239,7 +239,7 @@ impl Realization {
                     self.system[i * n + j] /= factor;
                 });
                 self.read.iter_mut().skip(i).step_by(n).for_each(|v| *v *= factor);
-                self.drives.iter_mut().for_each(|(b, _)| b[i] /= factor);
+                self.input_vectors.iter_mut().for_each(|(b, _)| b[i] /= factor);
                 self.start[i] /= factor;
                 has_changed = true;
             }
@@ -251,7 +251,7 @@ impl Realization {
         let n = self.states;
         let Some(interval) = Transition::new(&self.system, n, 1.0) else { return Ok(None) };
         let mut channels = Vec::with_capacity(inputs.len());
-        for (input, (drive, direct)) in inputs.iter().zip(&self.drives) {
+        for (input, (input_vector, direct)) in inputs.iter().zip(&self.input_vectors) {
             let nearest = input.delay.round();
             let is_whole = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.abs().max(1.0);
             let delay = if is_whole { nearest } else { input.delay };
@@ -259,7 +259,7 @@ impl Realization {
             #[allow(clippy::cast_possible_truncation)]
             let whole = delay.floor().clamp(-1e18, 1e18) as isize;
             let Some(InputGains { now, later }) =
-                InputGains::new(&interval, &self.system, drive, input.between, fraction)
+                InputGains::new(&interval, &self.system, input_vector, input.between, fraction)
             else {
                 return Ok(None);
             };
@@ -320,8 +320,8 @@ impl Transition {
         for _ in 0..halvings {
             let squared = product(&first, &first);
             second.iter_mut().zip(&squared).for_each(|(v, s)| *v = 0.25 * (s + 2.0 * *v));
-            let risen = product(&growth, &first);
-            first.iter_mut().zip(&risen).for_each(|(v, r)| *v += 0.5 * r);
+            let increment = product(&growth, &first);
+            first.iter_mut().zip(&increment).for_each(|(v, r)| *v += 0.5 * r);
             let squared = product(&growth, &growth);
             growth.iter_mut().zip(&squared).for_each(|(v, s)| *v = 2.0 * *v + s);
         }
@@ -345,27 +345,27 @@ pub(crate) struct InputGains {
 }
 
 impl InputGains {
-    /// Gains of an input whose input vector is `drive`; None if they overflow.
+    /// Gains of an input whose input vector is `input_vector`; None if they overflow.
     ///
     /// `fraction` is the fraction of the interval after which the next value of a zero-order-hold input takes effect.
     /// It is 0 without a delay.
     pub(crate) fn new(
         interval: &Transition,
         system: &[f64],
-        drive: &[f64],
+        input_vector: &[f64],
         between: Intersample,
         fraction: f64,
     ) -> Option<Self> {
-        let n = drive.len();
-        let all = dense::multiply(&interval.first, drive, n, n, 1);
+        let n = input_vector.len();
+        let all = dense::multiply(&interval.first, input_vector, n, n, 1);
         let later: Vec<f64> = match between {
-            Intersample::Linear => dense::multiply(&interval.second, drive, n, n, 1),
+            Intersample::Linear => dense::multiply(&interval.second, input_vector, n, n, 1),
             Intersample::Hold if fraction == 0.0 => return Some(Self { now: all, later: vec![0.0; n] }),
             Intersample::Hold => {
                 // The next value takes effect within the interval and acts over the rest of it.
                 let rest = 1.0 - fraction;
                 let part = Transition::new(system, n, rest)?;
-                dense::multiply(&part.first, drive, n, n, 1).into_iter().map(|v| v * rest).collect()
+                dense::multiply(&part.first, input_vector, n, n, 1).into_iter().map(|v| v * rest).collect()
             }
         };
         let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();

@@ -655,12 +655,12 @@ class Sound:
             whole = _core.OrderSearch(*asked)
             _, waves = _core.search_plan(orders, inputs, terms, settings)
             ends = [0, *waves] if waves[0] else waves
-            parts = [whole.rounds(a, b, [], None, 1, None, None) for a, b in itertools.pairwise(ends)]
+            parts = [whole.evaluate_batches(a, b, [], None, 1, None, None) for a, b in itertools.pairwise(ends)]
             samples = sum(run[1].shape[1] for run in runs)
             self.kept["parts"] = orders, inputs, terms, settings, samples, parts
         return self.kept["parts"]
 
-    def order_search_rounds(self):
+    def order_search_evaluate_batches(self):
         place = ((0, 0, 0, 0, math.inf, 0), True, ([], (0,) * 7, []))
         seed = self.one([], [(0, 10.0)], [(0, 10.0), (3, 12.0)])
         save = self.one(None, lambda _: None)
@@ -688,21 +688,21 @@ class Sound:
 
     stage_search_state = stage_search_pending_spans
 
-    def stage_search_follow(self):
+    def stage_search_evaluate_spans(self):
         search = self.one_of("StageSearch")
         return search, (search.pending_spans(), 1, self.progress())
 
-    def stage_search_take(self):
+    def stage_search_record_outcomes(self):
         search = self.one_of("StageSearch")
         if not search.pending_spans():
             search = self.one_of("StageSearch", new=True)
-        values, kinds = search.follow(search.pending_spans(), 1, None)
+        values, kinds = search.evaluate_spans(search.pending_spans(), 1, None)
         return search, (values, kinds, 1)
 
     def stage_search_outcome(self):
         search = self.one_of("StageSearch")
         while search.pending_spans():
-            search.take(*search.follow(search.pending_spans(), 1, None), 1)
+            search.record_outcomes(*search.evaluate_spans(search.pending_spans(), 1, None), 1)
         return search, ()
 
     def points_new(self):

@@ -425,7 +425,7 @@ class _JointFit(TypedDict):
 
 @final
 class JointProblem:
-    def __new__(cls, told: _Named) -> JointProblem: ...
+    def __new__(cls, structure: _Named) -> JointProblem: ...
     @property
     def orders(self) -> list[str]: ...
     @property
@@ -441,10 +441,10 @@ class JointProblem:
         runs: Sequence[Experiment | _Experiment],
         start: tuple[Sequence[float], Sequence[Sequence[float]]],
         plain: bool,
-        held: Sequence[int],
+        fixed: Sequence[int],
         evaluations: int,
         tolerance: float,
-        steady: bool,
+        requires_stability: bool,
         stop: Stop | None = None,
     ) -> dict[str, Any]: ...
 
@@ -653,7 +653,7 @@ class OrderSearch:
         terms: _Initial,
         settings: _Options,
     ) -> OrderSearch: ...
-    def rounds(
+    def evaluate_batches(
         self,
         first: int,
         last: int,
@@ -688,12 +688,14 @@ class StageSearch:
         scales: Sequence[float],
         terms: _Initial,
         settings: _Options,
-        keeps_course: bool,
+        keeps_state: bool,
     ) -> StageSearch: ...
     def pending_spans(self) -> list[_Span]: ...
     def state(self) -> tuple[int, float | None]: ...
-    def follow(self, spans: Sequence[_Span], threads: int, progress: _Progress | None) -> tuple[bytes, bytes]: ...
-    def take(self, values: bytes, kinds: bytes, threads: int) -> None: ...
+    def evaluate_spans(
+        self, spans: Sequence[_Span], threads: int, progress: _Progress | None
+    ) -> tuple[bytes, bytes]: ...
+    def record_outcomes(self, values: bytes, kinds: bytes, threads: int) -> None: ...
     def outcome(self) -> _FoundStage: ...
 
 @final

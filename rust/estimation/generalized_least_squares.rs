@@ -166,9 +166,9 @@ impl Autoregression {
             (0..size).map(|i| factor[i * size + one] - factor[i * size + other]).collect()
         };
         let increments = triangular_factor(&(0..most).map(column).collect::<Vec<_>>());
-        let walk = Self::of_best_order(&increments, most, count, &[1.0, -1.0], 0.0);
-        if walk.criterion < direct.criterion {
-            walk
+        let random_walk = Self::of_best_order(&increments, most, count, &[1.0, -1.0], 0.0);
+        if random_walk.criterion < direct.criterion {
+            random_walk
         } else {
             direct
         }

@@ -168,9 +168,9 @@ impl StreamingOptions {
 #[derive(Debug, Clone)]
 pub struct Streaming {
     inputs: Vec<bool>,
-    keep: Vec<f64>,
+    decay_factors: Vec<f64>,
     share: Vec<f64>,
-    pasts: Vec<SignalHistory>,
+    histories: Vec<SignalHistory>,
     fits: Vec<EquationRecursion>,
     /// Last sample of every signal; empty before the first one.
     sample: Vec<f64>,
@@ -251,9 +251,9 @@ impl Streaming {
         let count = decays.len();
         Ok(Self {
             inputs: inputs.to_vec(),
-            keep: decays.iter().map(|d| d.0).collect(),
+            decay_factors: decays.iter().map(|d| d.0).collect(),
             share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
-            pasts: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
+            histories: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
             fits,
             sample: Vec::new(),
             means: vec![0.0; inputs.len()],
@@ -289,8 +289,8 @@ impl Streaming {
             *mean = if self.inputs[s] { self.sample[s] } else { 0.5 * (self.sample[s] + sample[s]) };
         }
         self.sample.copy_from_slice(sample);
-        let Self { fits, pasts, means, keep, share, .. } = self;
-        simd::dispatch_simd(Integration { fits, pasts, means, keep, share });
+        let Self { fits, histories, means, decay_factors, share, .. } = self;
+        simd::dispatch_simd(Integration { fits, histories, means, decay_factors, share });
         for fit in &mut self.fits {
             fit.step(&self.options, self.pulses)?;
         }
@@ -343,9 +343,9 @@ impl InitialColumn {
 /// SIMD task that integrates the newest pulse for every equation and then adds it to the histories.
 struct Integration<'a> {
     fits: &'a mut [EquationRecursion],
-    pasts: &'a mut [SignalHistory],
+    histories: &'a mut [SignalHistory],
     means: &'a [f64],
-    keep: &'a [f64],
+    decay_factors: &'a [f64],
     share: &'a [f64],
 }
 
@@ -354,16 +354,16 @@ impl simd::SimdKernel for Integration<'_> {
 
     #[inline(always)]
     fn run(self) {
-        let Self { fits, pasts, means, keep, share } = self;
+        let Self { fits, histories, means, decay_factors, share } = self;
         for fit in fits {
-            fit.values[0] = fit.target.next(means[fit.output], &pasts[fit.output]);
+            fit.values[0] = fit.target.next(means[fit.output], &histories[fit.output]);
             for (value, integral) in fit.values[1..].iter_mut().zip(&mut fit.integrals) {
-                *value = integral.next(means[integral.signal], &pasts[integral.signal]);
+                *value = integral.next(means[integral.signal], &histories[integral.signal]);
             }
         }
-        for (past, mean) in pasts.iter_mut().zip(means) {
-            for ((z, keep), share) in past.states.iter_mut().zip(keep).zip(share) {
-                *z = *z * keep + share * past.last;
+        for (past, mean) in histories.iter_mut().zip(means) {
+            for ((z, decay_factors), share) in past.states.iter_mut().zip(decay_factors).zip(share) {
+                *z = *z * decay_factors + share * past.last;
             }
             past.last = *mean;
         }

@@ -118,7 +118,7 @@ impl Rates {
 /// du.
 #[must_use]
 pub fn decay(x: f64) -> (f64, f64, f64) {
-    let keep = libm::exp(-x);
+    let factor = libm::exp(-x);
     if x < 0.1 {
         // Series of the divided differences. The closed forms would cancel to x².
         let (mut first, mut last, mut term) = (0.0, 0.0, 1.0);
@@ -129,10 +129,10 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
             first += term / (n + 2.0);
             term *= -x / (n + 1.0);
         }
-        return (keep, first, last);
+        return (factor, first, last);
     }
     let square = x * x;
-    (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
+    (factor, (1.0 - factor * (1.0 + x)) / square, (x - 1.0 + factor) / square)
 }
 
 /// Return the fractional integral I^q of a signal that is linear between samples, computed recursively with a sum of

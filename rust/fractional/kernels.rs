@@ -378,8 +378,8 @@ impl PowerMeans {
     /// Return the derivative of the mean of t^e over pulse k with respect to the exponent e.
     fn endpoint_slope(&self, k: f64) -> f64 {
         let a = self.a;
-        let turned = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
-        self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
+        let derivative = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
+        self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (derivative(k) - derivative(k - 1.0))
     }
 
     /// Return the sum Σ_j `sums[j]`·d^{−2j} with d = 2k + 1, where d/2 is the midpoint of pulse k + 1 in pulse lengths.
@@ -401,8 +401,8 @@ impl PowerMeans {
     /// Return the derivative of the mean of t^e over pulse k + 1 with respect to the exponent e. `power` is d^e and
     /// `logarithm` is ln d with d = 2k + 1.
     fn midpoint_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
-        let turned = self.ln_step - std::f64::consts::LN_2 + logarithm;
-        self.half * power * (Self::sum(&self.sums, k) * turned + Self::sum(&self.slopes, k))
+        let logarithm_sum = self.ln_step - std::f64::consts::LN_2 + logarithm;
+        self.half * power * (Self::sum(&self.sums, k) * logarithm_sum + Self::sum(&self.slopes, k))
     }
 }
 
@@ -428,8 +428,8 @@ pub fn power_pulses_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut slopes = power_means_slope(exponent, m, step);
     if is_singular(exponent) {
         let h = 1e-4_f64.min(0.5 * (exponent + 1.0));
-        let turned = (moment(exponent + h) - moment(exponent - h)) / (2.0 * h);
-        shift(&mut slopes, (turned + moment(exponent) * libm::log(step)) * libm::pow(step, exponent));
+        let moment_slope = (moment(exponent + h) - moment(exponent - h)) / (2.0 * h);
+        shift(&mut slopes, (moment_slope + moment(exponent) * libm::log(step)) * libm::pow(step, exponent));
     }
     slopes
 }

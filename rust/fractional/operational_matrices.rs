@@ -160,8 +160,8 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
     let count = m / columns.width;
     let (phases, stride) = ((columns.width / rows.width).max(1), (rows.width / columns.width).max(1));
     let values = if phases > 1 {
-        let stretch = |phase: usize| (0..2 * count - 1).map(move |k| (k + 1) * columns.width - phase * rows.width);
-        (0..phases).flat_map(stretch).map(&entry).collect()
+        let starts = |phase: usize| (0..2 * count - 1).map(move |k| (k + 1) * columns.width - phase * rows.width);
+        (0..phases).flat_map(starts).map(&entry).collect()
     } else {
         (rows.width..=2 * m - columns.width).step_by(columns.width).map(&entry).collect()
     };

@@ -142,8 +142,8 @@ impl FrictionProblem {
             *at = (0..n).map(|a| of(a, &forces)).collect();
             miss = wrong(at, &forces);
         }
-        let falls = self.laws.iter().any(|law| law.stribeck > 0.0);
-        if !falls && miss > MAX_FRICTION_ERROR_RATIO * size {
+        let has_stribeck = self.laws.iter().any(|law| law.stribeck > 0.0);
+        if !has_stribeck && miss > MAX_FRICTION_ERROR_RATIO * size {
             // NaN counts as overflow, which is better than a wrong solution.
             at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
@@ -154,7 +154,7 @@ impl FrictionProblem {
     /// [`FrictionProblem::solve`].
     #[must_use]
     pub fn force_slope(&self, body: usize, length: f64, velocity: f64, at: &(f64, Pulse)) -> f64 {
-        let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
+        let unit = PulseDerivatives { start: 0.0, free: 1.0, gain: 0.0, law: [0.0; 3] };
         self.laws[body].slope(velocity, at.0, length * self.own(body), &at.1, &unit).0
     }
 
@@ -189,8 +189,8 @@ pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     if first.is_nan() || first <= 0.0 {
         return false;
     }
-    let without: Vec<f64> = (1..n).flat_map(|i| (1..n).map(move |j| matrix[i * n + j])).collect();
-    let beside: Vec<f64> =
+    let submatrix: Vec<f64> = (1..n).flat_map(|i| (1..n).map(move |j| matrix[i * n + j])).collect();
+    let schur_complement: Vec<f64> =
         (1..n).flat_map(|i| (1..n).map(move |j| matrix[i * n + j] - matrix[i * n] * matrix[j] / first)).collect();
-    is_p_matrix(&without, n - 1) && is_p_matrix(&beside, n - 1)
+    is_p_matrix(&submatrix, n - 1) && is_p_matrix(&schur_complement, n - 1)
 }

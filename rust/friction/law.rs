@@ -52,7 +52,7 @@ pub struct PulseDerivatives {
     pub free: f64,
     /// Derivative of the friction gain, which is the decrease of the velocity at the end of the pulse per unit of
     /// friction force.
-    pub first: f64,
+    pub gain: f64,
     /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity.
     pub law: [f64; 3],
 }
@@ -123,7 +123,7 @@ impl FrictionLaw {
 
     /// Return the mean of exp(−(v/vs)²), with the Stribeck velocity vs, over a speed v that changes linearly from
     /// `from` to `to`. Both are nonnegative.
-    fn share(&self, from: f64, to: f64) -> f64 {
+    fn mean_stribeck_factor(&self, from: f64, to: f64) -> f64 {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         if d.abs() < QUADRATURE_SPEED_RATIO {
             return GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| w * libm::exp(-(x + u * d).powi(2))).sum();
@@ -132,12 +132,12 @@ impl FrictionLaw {
     }
 
     fn mean(&self, from: f64, to: f64) -> f64 {
-        self.coulomb + self.stribeck * self.share(from, to)
+        self.coulomb + self.stribeck * self.mean_stribeck_factor(from, to)
     }
 
     fn mean_with_slopes(&self, from: f64, to: f64) -> Mean {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
-        let share = self.share(from, to);
+        let mean_stribeck_factor = self.mean_stribeck_factor(from, to);
         let gauss = |z: f64| libm::exp(-z * z);
         let (by_from, by_to) = if d.abs() < QUADRATURE_SPEED_RATIO {
             let sloped = |weight: fn(f64) -> f64| -> f64 {
@@ -145,16 +145,16 @@ impl FrictionLaw {
             };
             (sloped(|u| 1.0 - u), sloped(|u| u))
         } else {
-            ((share - gauss(x)) / d, (gauss(x + d) - share) / d)
+            ((mean_stribeck_factor - gauss(x)) / d, (gauss(x + d) - mean_stribeck_factor) / d)
         };
         // The mean depends on vs only by x and x + d.
         let by_speed = -(x * by_from + (x + d) * by_to) / self.speed;
         let s = self.stribeck;
         Mean {
-            value: self.coulomb + s * share,
+            value: self.coulomb + s * mean_stribeck_factor,
             from: s * by_from / self.speed,
             to: s * by_to / self.speed,
-            law: [1.0, share, s * by_speed],
+            law: [1.0, mean_stribeck_factor, s * by_speed],
         }
     }
 
@@ -171,9 +171,9 @@ impl FrictionLaw {
             if next < 0.0 {
                 return None;
             }
-            let gone = (next - end).abs();
+            let change = (next - end).abs();
             end = next;
-            if gone <= rounding {
+            if change <= rounding {
                 break;
             }
         }
@@ -191,18 +191,18 @@ impl FrictionLaw {
             let (sign, end, phase) = pulse(v, p, self.coulomb * g, rounding);
             return Pulse { force: self.coulomb * sign, end, phase };
         }
-        let held = g * self.breakaway() + rounding;
-        let stuck = Pulse { force: if g > 0.0 { p / g } else { 0.0 }, end: 0.0, phase: Phase::Stick };
-        if v == 0.0 && p.abs() <= held {
-            return stuck;
+        let max_stick_change = g * self.breakaway() + rounding;
+        let at_rest = Pulse { force: if g > 0.0 { p / g } else { 0.0 }, end: 0.0, phase: Phase::Stick };
+        if v == 0.0 && p.abs() <= max_stick_change {
+            return at_rest;
         }
         let side = if v == 0.0 { p.signum() } else { v.signum() };
         if let Some(end) = self.slide(side * v, side * p, g) {
             let force = side * self.mean(side * v, end);
             return Pulse { force, end: p - g * force, phase: Phase::Slip };
         }
-        if (p - v).abs() <= held {
-            return stuck;
+        if (p - v).abs() <= max_stick_change {
+            return at_rest;
         }
         let (speed, push) = (side * v, side * (v - p));
         let before = self.mean(0.0, speed);
@@ -223,14 +223,14 @@ impl FrictionLaw {
         let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();
         match at.phase {
             Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => {
-                ((derivatives.free - at.force * derivatives.first) / g, 0.0)
+                ((derivatives.free - at.force * derivatives.gain) / g, 0.0)
             }
             Phase::Stick => (0.0, 0.0),
             Phase::Slip => {
                 let side = if v == 0.0 { at.end.signum() } else { v.signum() };
                 let mean = self.mean_with_slopes(side * v, (side * at.end).max(0.0));
                 let by_law = of(&mean) + mean.from * side * derivatives.start;
-                let end = (side * (derivatives.free - at.force * derivatives.first) - g * by_law) / (1.0 + g * mean.to);
+                let end = (side * (derivatives.free - at.force * derivatives.gain) - g * by_law) / (1.0 + g * mean.to);
                 (side * (by_law + mean.to * end), side * end)
             }
             Phase::Turn => {
@@ -242,12 +242,12 @@ impl FrictionLaw {
                 let before_derivative = of(&before) + before.to * speed_derivative;
                 let whole = g * before.value + push;
                 let until = speed / whole;
-                let whole_derivative = derivatives.first * before.value + g * before_derivative + push_derivative;
+                let whole_derivative = derivatives.gain * before.value + g * before_derivative + push_derivative;
                 let until_derivative = (speed_derivative - until * whole_derivative) / whole;
                 let left = 1.0 - until;
                 let after = self.mean_with_slopes(0.0, at.end.abs());
                 let by_law = of(&after);
-                let back = (left * (push_derivative - derivatives.first * after.value - g * by_law)
+                let back = (left * (push_derivative - derivatives.gain * after.value - g * by_law)
                     - until_derivative * (push - g * after.value))
                     / (1.0 + left * g * after.to);
                 let after_derivative = by_law + after.to * back;

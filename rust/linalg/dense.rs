@@ -14,7 +14,7 @@ const MAX_ROW_PARTS: usize = 16;
 /// Number of columns that are multiplied at a time in a Gram matrix product.
 const GRAM_TILE_COLUMNS: usize = 64;
 /// Number of rows of separately stored columns that are copied for one product. They fit in the cache.
-const LAID_OUT: usize = 1 << 10;
+const COPIED_ROWS: usize = 1 << 10;
 
 /// Return the row-major product of an a×b and a b×c matrix, computed on one thread. O(abc).
 #[must_use]
@@ -50,7 +50,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
         .map(|first| (first, x.subcols(first, GRAM_TILE_COLUMNS.min(k - first))))
         .collect();
     tiles.push((k, y));
-    let rows = pieces(m);
+    let rows = row_blocks(m);
     let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
     let tasks: Vec<_> = pairs.flat_map(|pair| rows.iter().map(move |&piece| (pair, piece))).collect();
     let tiles_of_products = parallel::map(
@@ -82,7 +82,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
 }
 
 /// Return (first row, number of rows) of each row block of a product of columns with `m` rows.
-fn pieces(m: usize) -> Vec<(usize, usize)> {
+fn row_blocks(m: usize) -> Vec<(usize, usize)> {
     let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
@@ -161,8 +161,8 @@ pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -
     if k == 0 {
         return Some(solution);
     }
-    let tall: Vec<Vec<f64>> = columns.iter().cloned().chain([target.to_vec()]).collect();
-    let factor = triangular_factor(&tall);
+    let augmented: Vec<Vec<f64>> = columns.iter().cloned().chain([target.to_vec()]).collect();
+    let factor = triangular_factor(&augmented);
     let column = |j: usize| -> Vec<f64> { (0..=k).map(|i| factor[i * (k + 1) + j]).collect() };
     let factors = singular_values(&(0..k).map(column).collect::<Vec<_>>())?;
     let (rest, least) = (column(k), share * factors.values.first().copied().unwrap_or(0.0));
@@ -183,12 +183,12 @@ pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -
 pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());
     let blocks = parallel::map(
-        pieces(m),
+        row_blocks(m),
         || (),
         |(), (from, len)| {
             let mut product = Mat::<f64>::zeros(right.len(), left.len());
-            for first in (from..from + len).step_by(LAID_OUT).take_while(|_| !stop.is_set()) {
-                let rows = LAID_OUT.min(from + len - first);
+            for first in (from..from + len).step_by(COPIED_ROWS).take_while(|_| !stop.is_set()) {
+                let rows = COPIED_ROWS.min(from + len - first);
                 let x = Mat::from_fn(rows, left.len(), |i, j| left[j][first + i]);
                 let y = Mat::from_fn(rows, right.len(), |i, j| right[j][first + i]);
                 matmul(product.as_mut(), Accum::Add, y.transpose(), x.as_ref(), 1.0, Par::Seq);

@@ -8,7 +8,7 @@ use crate::simd::{dispatch_simd, dot, SimdKernel};
 const QR_BLOCK_ROWS: usize = 1 << 10;
 
 /// Number of basis vectors that are projected out between two checks for a stop request.
-const AT_ONCE: usize = 16;
+const VECTORS_PER_STOP_CHECK: usize = 16;
 
 /// Minimum squared norm of a column in a factorization. Smaller sums of squares lose accuracy.
 const MIN_SQUARED_NORM: f64 = 1e-280;
@@ -38,9 +38,9 @@ impl SimdKernel for Reflections<'_> {
                 return false;
             }
             let first = reflected[0];
-            let turned = -square.sqrt().copysign(first);
-            reflected[0] = first - turned;
-            let factor = 1.0 / (turned * (turned - first));
+            let diagonal = -square.sqrt().copysign(first);
+            reflected[0] = first - diagonal;
+            let factor = 1.0 / (diagonal * (diagonal - first));
             for column in later {
                 let below = &mut column[j..];
                 let along = factor * dot(reflected, below);
@@ -48,7 +48,7 @@ impl SimdKernel for Reflections<'_> {
                     *v -= along * w;
                 }
             }
-            reflected[0] = turned;
+            reflected[0] = diagonal;
         }
         true
     }
@@ -115,29 +115,29 @@ pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
     dispatch_simd(Projection { basis, column, times: 1 });
 }
 
-/// Extend an orthonormal basis by a column, unless its distance from the span relative to its norm is at most `share`.
-/// O(k m) for k basis vectors of m values.
-pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
-    let whole = norm(&column);
+/// Extend an orthonormal basis by a column, unless its distance from the span relative to its norm is at most
+/// `relative_tolerance`. O(k m) for k basis vectors of m values.
+pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, relative_tolerance: f64) {
+    let norm_before = norm(&column);
     // Two passes are enough (Kahan, Parlett).
     dispatch_simd(Projection { basis, column: &mut column, times: 2 });
     let remainder = norm(&column);
-    if remainder > share * whole && remainder.is_finite() {
+    if remainder > relative_tolerance * norm_before && remainder.is_finite() {
         column.iter_mut().for_each(|v| *v /= remainder);
         basis.push(column);
     }
 }
 
-/// Return an orthonormal basis of the span of k columns of m values. Every column has a distance of at most `share`
-/// from the span, relative to its norm.
+/// Return an orthonormal basis of the span of k columns of m values. Every column has a distance of at most
+/// `relative_tolerance` from the span, relative to its norm.
 ///
 /// O(k² m) on the threads of the current pool. The column farthest from the basis is added next (pivoting). Rounding
-/// errors are therefore amplified once by 1/`share`, not once per column. Zero columns and columns whose squared norm
-/// overflows are skipped.
+/// errors are therefore amplified once by 1/`relative_tolerance`, not once per column. Zero columns and columns whose
+/// squared norm overflows are skipped.
 ///
 /// # Errors
 /// [`crate::error::Error::Interrupted`] after a stop request.
-pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, relative_tolerance: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let whole = |(): &mut (), mut column: Vec<f64>| {
         let size = if stop.is_set() { 0.0 } else { norm(&column) };
         let sound = size > 0.0 && size.is_finite();
@@ -149,12 +149,12 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
     loop {
         stop.check()?;
         let farther = |a: &usize, b: &usize| waiting[*a].0.total_cmp(&waiting[*b].0).then(b.cmp(a));
-        let Some(next) = (0..waiting.len()).max_by(farther).filter(|&next| waiting[next].0 > share) else {
+        let Some(next) = (0..waiting.len()).max_by(farther).filter(|&next| waiting[next].0 > relative_tolerance) else {
             return Ok(basis);
         };
         let (_, mut direction) = waiting.remove(next);
         // Two passes are enough (Kahan, Parlett).
-        for before in basis.chunks(AT_ONCE) {
+        for before in basis.chunks(VECTORS_PER_STOP_CHECK) {
             stop.check()?;
             project_out(before, &mut direction);
         }

@@ -66,7 +66,7 @@ pub(super) struct BodyState {
     /// Length of the interval as a fraction of the pulse.
     length: f64,
     /// Change of velocity in a whole pulse if the forces of this interval acted throughout and there were no friction.
-    rate: f64,
+    frictionless_change: f64,
     /// Velocity at the start of the interval.
     start_velocity: f64,
     /// Velocity at the end of the interval without the body's own friction.
@@ -190,7 +190,7 @@ struct IntervalWorkspace {
     velocities: Vec<f64>,
     forces: Vec<f64>,
     frictionless: Vec<f64>,
-    rates: Vec<f64>,
+    frictionless_changes: Vec<f64>,
     at: Vec<(f64, FrictionPulse)>,
 }
 
@@ -324,12 +324,11 @@ impl ContactOperators {
             for (a, state) in states.iter().enumerate() {
                 let pushed =
                     |b: usize| given.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
-                let rate = given.ends[a] - given.starts[a] + (0..n).map(pushed).sum::<f64>();
+                let frictionless_change = given.ends[a] - given.starts[a] + (0..n).map(pushed).sum::<f64>();
                 let by_others = |b: usize| if a == b { 0.0 } else { gain(a, b) * states[b].pulse.force };
-                let free =
-                    velocities[a] + change.length * state.rate + length * rate - (0..n).map(by_others).sum::<f64>();
-                let derivatives =
-                    PulseDerivatives { start: velocities[a], free, first: gain(a, a), law: given.laws[a] };
+                let free = velocities[a] + change.length * state.frictionless_change + length * frictionless_change
+                    - (0..n).map(by_others).sum::<f64>();
+                let derivatives = PulseDerivatives { start: velocities[a], free, gain: gain(a, a), law: given.laws[a] };
                 let (law, own) = (problem.law(a), length * problem.own(a));
                 ends[a] = free - gain(a, a) * state.pulse.force;
                 forces[a] = law.slope(state.start_velocity, state.free_velocity, own, &state.pulse, &derivatives).0;
@@ -555,16 +554,16 @@ impl ContactSolver<'_> {
     /// the pulse without friction.
     fn solve_intervals(&mut self, free: &[f64], intervals: &[Interval]) {
         let (problem, n) = (&self.contact.problem, self.contact.count());
-        let IntervalWorkspace { velocities, forces, frictionless, rates, at } = &mut self.work;
+        let IntervalWorkspace { velocities, forces, frictionless, frictionless_changes, at } = &mut self.work;
         velocities.clone_from(&self.velocities);
         forces.clone_from(&self.forces);
         self.contacts.clear();
         for Interval { length, forces: pushes } in intervals {
-            rates.clear();
+            frictionless_changes.clear();
             frictionless.clear();
             for (a, (&free, &start)) in free.iter().zip(&self.velocities).enumerate() {
                 let end = free + (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum::<f64>();
-                rates.push(end - start);
+                frictionless_changes.push(end - start);
                 // This value is exactly `free` if the interval is the whole pulse.
                 frictionless.push(length * end + (velocities[a] - length * start));
             }
@@ -572,7 +571,7 @@ impl ContactSolver<'_> {
             for (a, &(free_velocity, pulse)) in at.iter().enumerate() {
                 self.contacts.push(BodyState {
                     length: *length,
-                    rate: rates[a],
+                    frictionless_change: frictionless_changes[a],
                     start_velocity: velocities[a],
                     free_velocity,
                     is_resting: self.is_resting[a],

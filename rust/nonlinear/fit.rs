@@ -74,14 +74,14 @@ impl LeastSquaresProblem for OutputError<'_> {
 
     fn apply_step(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
         let mut next = point.clone();
-        let mut moved: f64 = 0.0;
+        let mut largest_change: f64 = 0.0;
         let (orders, rest) = steps.split_at(point.orders.len());
         let (coefficients, rest) = rest.split_at(point.coefficients.len());
         let (inputs, mut states) = rest.split_at(point.inputs.len());
         for ((order, &(low, high)), step) in next.orders.iter_mut().zip(&self.model.model.order_bounds).zip(orders) {
             let before = *order;
             *order = (before + step).clamp(low, high);
-            moved = moved.max((*order - before).abs());
+            largest_change = largest_change.max((*order - before).abs());
         }
         let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
@@ -90,22 +90,22 @@ impl LeastSquaresProblem for OutputError<'_> {
             if self.model.is_nonnegative(j) {
                 *value = value.max(0.0);
             }
-            moved = moved.max(share(before, *value));
+            largest_change = largest_change.max(share(before, *value));
         }
         for ((value, input), step) in next.inputs.iter_mut().zip(&self.model.model.inputs).zip(inputs) {
             let (before, (low, high)) = (*value, input.bounds);
             *value = (before + step).clamp(low, high);
-            moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+            largest_change = largest_change.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
         }
         for run in &mut next.states {
             let (own, others) = states.split_at(run.len());
             states = others;
             for (value, step) in run.iter_mut().zip(own) {
-                moved = moved.max(share(*value, *value + step));
+                largest_change = largest_change.max(share(*value, *value + step));
                 *value += step;
             }
         }
-        (next, moved)
+        (next, largest_change)
     }
 
     fn coordinate_derivative(&self, point: &Point, parameter: usize) -> f64 {

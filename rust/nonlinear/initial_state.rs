@@ -121,10 +121,10 @@ pub(super) fn derivative_powers(
             own.iter().filter(|p| (p.0 - whole).abs() < ORDER_GRAIN).map(|p| p.1).sum()
         };
         let given: Vec<f64> = powers.iter().map(at).collect();
-        let begun = solve_feedthrough(&given, links)?;
+        let initial_outputs = solve_feedthrough(&given, links)?;
         for link in links[equation].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
             let exponent = link.integration + whole;
-            let value = begun[link.output] * libm::tgamma(whole + 1.0);
+            let value = initial_outputs[link.output] * libm::tgamma(whole + 1.0);
             sum.add(exponent, link.coefficient * value / libm::tgamma(exponent + 1.0));
         }
         whole += 1.0;
@@ -220,7 +220,7 @@ impl InitialTerm {
         let followed = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
         let mut all: Vec<Self> = Vec::new();
         for (i, Equation { structure, .. }) in equations.iter().enumerate() {
-            match initial.under() {
+            match initial.base() {
                 Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => {}
                 Initial::Powers(powers) => all.extend(powers.iter().map(|&e| Self::Power(i, e))),
                 Initial::Caputo => {
@@ -258,7 +258,7 @@ impl InitialTerm {
     /// Return the powers of t in the outputs per unit of this state, as (equation, exponent, coefficient).
     pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
         // Caputo derivatives of a constant are zero, so only terms of order 0 respond to a level.
-        let unseen = |output: usize, whole: f64| {
+        let powers_of_value = |output: usize, whole: f64| {
             let mut all = vec![(output, whole, 1.0)];
             for (i, row) in links.iter().enumerate() {
                 for link in row.iter().filter(|link| link.output == output && link.order > whole + ORDER_GRAIN) {
@@ -269,8 +269,8 @@ impl InitialTerm {
             all
         };
         match self {
-            Self::Level(i) => unseen(i, 0.0),
-            Self::Rate(i) => unseen(i, 1.0),
+            Self::Level(i) => powers_of_value(i, 0.0),
+            Self::Rate(i) => powers_of_value(i, 1.0),
             Self::Jump { at: (i, term), more } => {
                 let structure = &equations[i].structure;
                 vec![(i, structure.order - structure.terms[term].order + f64::from(more), 1.0)]

@@ -37,7 +37,7 @@ const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
 /// Argument of an expression, by its index: a state channel, or a known channel (an input or a derivative of one).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Place {
+enum ExpressionArgument {
     State(usize),
     Known(usize),
 }
@@ -47,7 +47,7 @@ struct NonlinearTerm {
     equation: usize,
     term: usize,
     signal: usize,
-    places: Vec<Place>,
+    arguments: Vec<ExpressionArgument>,
 }
 
 /// Contribution of a source to a state channel. A source is a state channel, a non-linear term or a friction force.
@@ -60,14 +60,14 @@ struct Contribution {
 }
 
 /// Contributions to one state channel that share a kernel. One online convolution of their weighted sum computes them.
-struct Lane {
+struct KernelContributions {
     state: usize,
     kernel: usize,
     contributions: Vec<Contribution>,
 }
 
 /// Contribution of an input to a state channel. `at` holds the indices of the equation and of the term in it.
-struct InputLane {
+struct InputContribution {
     state: usize,
     kernel: usize,
     at: (usize, usize),
@@ -86,8 +86,8 @@ pub(super) struct Operators {
     integrals: Vec<IntegralKernel>,
     /// Convolution kernel of each entry of `integrals`.
     kernels: Vec<ConvolutionKernel>,
-    lanes: Vec<Lane>,
-    inputs: Vec<InputLane>,
+    kernel_contributions: Vec<KernelContributions>,
+    inputs: Vec<InputContribution>,
     /// Weights within a pulse, row-major. A row is a state channel. Columns are the state channels, the non-linear
     /// terms and the friction forces that contribute to it.
     gains: Vec<f64>,
@@ -149,30 +149,30 @@ impl Operators {
         for (i, equation) in system.equations.iter().enumerate() {
             for (k, term) in equation.structure.terms.iter().enumerate().filter(|(_, t)| t.signal >= system.recorded) {
                 let signal = term.signal - system.recorded;
-                let mut places = Vec::new();
+                let mut arguments = Vec::new();
                 for &(signal, order) in &system.derived[signal].channels {
                     let output = system.output_index(i, signal);
                     let state = output.and_then(|equation| find(StateChannel::Mean { equation, order }));
-                    places.push(match state {
-                        Some(state) => Place::State(state),
-                        None => Place::Known(known_index(&mut known, (signal, order), record)?),
+                    arguments.push(match state {
+                        Some(state) => ExpressionArgument::State(state),
+                        None => ExpressionArgument::Known(known_index(&mut known, (signal, order), record)?),
                     });
                 }
-                terms.push(NonlinearTerm { equation: i, term: k, signal, places });
+                terms.push(NonlinearTerm { equation: i, term: k, signal, arguments });
             }
         }
         // The optimizer shortens its step after this error.
         let beyond = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
-        let (mut integrals, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
+        let (mut integrals, mut groups, mut inputs) = (Vec::new(), Vec::<KernelContributions>::new(), Vec::new());
         let mut algebraic = false;
         for (state, &channel) in states.iter().enumerate() {
             let (j, rho, at_ends) = (channel.equation(), channel.order(), channel.is_at_ends());
-            let add = |lanes: &mut Vec<Lane>, kernel: usize, contribution: Contribution| match lanes
+            let add = |groups: &mut Vec<KernelContributions>, kernel: usize, contribution: Contribution| match groups
                 .iter_mut()
-                .find(|lane| lane.state == state && lane.kernel == kernel)
+                .find(|group| group.state == state && group.kernel == kernel)
             {
-                Some(lane) => lane.contributions.push(contribution),
-                None => lanes.push(Lane { state, kernel, contributions: vec![contribution] }),
+                Some(group) => group.contributions.push(contribution),
+                None => groups.push(KernelContributions { state, kernel, contributions: vec![contribution] }),
             };
             let Equation { structure, coefficients } = &system.equations[j];
             for (k, (term, &weight)) in structure.terms.iter().zip(coefficients).enumerate() {
@@ -188,14 +188,15 @@ impl Operators {
                         (find(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
                     }
                 } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
-                    let driven = terms[q].places.iter().any(|place| matches!(place, Place::Known(_)));
+                    let driven =
+                        terms[q].arguments.iter().any(|argument| matches!(argument, ExpressionArgument::Known(_)));
                     let left = eta - rho;
                     let least = if at_ends { MAX_FEEDTHROUGH_ORDER } else { -ORDER_GRAIN };
                     if left < least || (driven && eta < MIN_INTEGRATION_ORDER) {
                         return Err(beyond());
                     }
-                    algebraic |=
-                        left < MIN_INTEGRATION_ORDER && !terms[q].places.iter().all(|p| matches!(p, Place::Known(_)));
+                    algebraic |= left < MIN_INTEGRATION_ORDER
+                        && !terms[q].arguments.iter().all(|p| matches!(p, ExpressionArgument::Known(_)));
                     (Some(states.len() + q), kernel_index(&mut integrals, left.max(0.0), at_ends))
                 } else {
                     let left = eta - rho;
@@ -204,11 +205,11 @@ impl Operators {
                     }
                     let left = if at_ends { left } else { left.max(0.0) };
                     let kernel = kernel_index(&mut integrals, left, at_ends);
-                    inputs.push(InputLane { state, kernel, at: (j, k), signal: term.signal });
+                    inputs.push(InputContribution { state, kernel, at: (j, k), signal: term.signal });
                     continue;
                 };
                 if let Some(source) = source {
-                    add(&mut lanes, kernel, Contribution { source, at: (j, k), weight });
+                    add(&mut groups, kernel, Contribution { source, at: (j, k), weight });
                 }
             }
             if let Some(friction) = system.frictions.iter().position(|friction| friction.0 == j) {
@@ -217,16 +218,16 @@ impl Operators {
                 }
                 let kernel = kernel_index(&mut integrals, structure.order - rho, at_ends);
                 let source = states.len() + terms.len() + friction;
-                add(&mut lanes, kernel, Contribution { source, at: (j, structure.terms.len()), weight: -1.0 });
+                add(&mut groups, kernel, Contribution { source, at: (j, structure.terms.len()), weight: -1.0 });
             }
         }
         let kernels: Vec<ConvolutionKernel> = integrals.iter().map(|integral| integral.kernel(m, step)).collect();
         let count = states.len() + terms.len() + system.frictions.len();
         let mut gains = vec![0.0; states.len() * count];
-        for lane in &lanes {
-            let first = kernels[lane.kernel].values().first().copied().unwrap_or(0.0);
-            for part in &lane.contributions {
-                gains[lane.state * count + part.source] += first * part.weight;
+        for group in &groups {
+            let first = kernels[group.kernel].values().first().copied().unwrap_or(0.0);
+            for part in &group.contributions {
+                gains[group.state * count + part.source] += first * part.weight;
             }
         }
         let bodies = system.frictions.iter().filter_map(|&(equation, law)| {
@@ -245,7 +246,7 @@ impl Operators {
             terms,
             integrals,
             kernels,
-            lanes,
+            kernel_contributions: groups,
             inputs,
             gains,
             algebraic,
@@ -301,12 +302,12 @@ impl Operators {
 
     /// Add the contributions of the inputs to the forcing of the state channels.
     pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut ForcingTerms) {
-        for (signal, lanes) in self.inputs_by_signal() {
+        for (signal, inputs) in self.inputs_by_signal() {
             let spectrum = Kernel::new(record.signal(signal));
-            for lane in lanes {
-                let weight = system.equations[lane.at.0].coefficients[lane.at.1];
-                let part = self.integrate(&spectrum, lane.kernel, self.kernels[lane.kernel].values());
-                forcing.channels[lane.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
+            for input in inputs {
+                let weight = system.equations[input.at.0].coefficients[input.at.1];
+                let part = self.integrate(&spectrum, input.kernel, self.kernels[input.kernel].values());
+                forcing.channels[input.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
             }
         }
     }
@@ -322,12 +323,12 @@ impl Operators {
         }
     }
 
-    fn inputs_by_signal(&self) -> Vec<(usize, Vec<&InputLane>)> {
-        let mut out: Vec<(usize, Vec<&InputLane>)> = Vec::new();
-        for lane in &self.inputs {
-            match out.iter_mut().find(|(signal, _)| *signal == lane.signal) {
-                Some((_, lanes)) => lanes.push(lane),
-                None => out.push((lane.signal, vec![lane])),
+    fn inputs_by_signal(&self) -> Vec<(usize, Vec<&InputContribution>)> {
+        let mut out: Vec<(usize, Vec<&InputContribution>)> = Vec::new();
+        for input in &self.inputs {
+            match out.iter_mut().find(|(signal, _)| *signal == input.signal) {
+                Some((_, inputs)) => inputs.push(input),
+                None => out.push((input.signal, vec![input])),
             }
         }
         out
@@ -351,15 +352,15 @@ impl Operators {
             inverses: Vec::with_capacity(self.m * states * states),
             contacts: ContactStates::empty(),
         };
-        let mut lanes: Vec<OnlineConvolution<'_>> =
-            self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
+        let mut convolutions: Vec<OnlineConvolution<'_>> =
+            self.kernel_contributions.iter().map(|group| OnlineConvolution::new(&self.kernels[group.kernel])).collect();
         let mut pulse = Pulse::new(self, system);
         let mut sign = None;
         let mut motion = self.contact.as_ref().map(|contact| contact.start(forcing));
         for k in 0..self.m {
             pulse.free.iter_mut().zip(&forcing.channels).for_each(|(free, row)| *free = row[k]);
-            for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                pulse.free[lane.state] += convolution.past_contribution();
+            for (group, convolution) in self.kernel_contributions.iter().zip(&convolutions) {
+                pulse.free[group.state] += convolution.past_contribution();
             }
             pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
@@ -390,9 +391,9 @@ impl Operators {
             if let Some(motion) = &mut motion {
                 run.contacts.push(motion.advance(&pulse.z));
             }
-            for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
+            for (group, convolution) in self.kernel_contributions.iter().zip(&mut convolutions) {
                 let of = |part: &Contribution| part.weight * pulse.source(part.source);
-                convolution.push(lane.contributions.iter().map(of).sum());
+                convolution.push(group.contributions.iter().map(of).sum());
             }
         }
         (run, None)
@@ -491,17 +492,17 @@ impl<'a> Pulse<'a> {
         self.fault = None;
         for (q, term) in self.operators.terms.iter().enumerate() {
             self.arguments.clear();
-            let value = |place: &Place| match *place {
-                Place::State(state) => self.z[state],
-                Place::Known(known) => self.known[known],
+            let value = |argument: &ExpressionArgument| match *argument {
+                ExpressionArgument::State(state) => self.z[state],
+                ExpressionArgument::Known(known) => self.known[known],
             };
-            self.arguments.extend(term.places.iter().map(value));
+            self.arguments.extend(term.arguments.iter().map(value));
             self.values[q] = self.system.derived[term.signal].expression.evaluate(&self.arguments, &mut self.work);
             self.fault = self.fault.or(self.work.fault());
-            for (place, slope) in term.places.iter().zip(self.work.slopes()) {
-                let at = match *place {
-                    Place::State(state) => state,
-                    Place::Known(known) => states + known,
+            for (argument, slope) in term.arguments.iter().zip(self.work.slopes()) {
+                let at = match *argument {
+                    ExpressionArgument::State(state) => state,
+                    ExpressionArgument::Known(known) => states + known,
                 };
                 self.slopes[q * width + at] += slope;
             }
@@ -671,7 +672,7 @@ const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces it
 
 /// Cache for the sensitivities of one simulated run. It contains convolutions of simulated pulse means with kernels and
 /// with derivatives of kernels, and responses to friction forces. Each is computed when it is first needed.
-pub(super) struct FrozenProducts<'a> {
+pub(super) struct SensitivityCache<'a> {
     operators: &'a Operators,
     run: &'a LinearizedRun,
     spectra: Vec<Option<Kernel>>,
@@ -680,7 +681,7 @@ pub(super) struct FrozenProducts<'a> {
     contacts: Option<ContactResponses>,
 }
 
-impl<'a> FrozenProducts<'a> {
+impl<'a> SensitivityCache<'a> {
     pub(super) fn new(operators: &'a Operators, run: &'a LinearizedRun) -> Self {
         let spectra = (0..operators.sources()).map(|_| None).collect();
         let slopes = vec![None; operators.integrals.len()];
@@ -735,7 +736,7 @@ impl Operators {
         system: &NonlinearSystem,
         record: &Record,
         run: &LinearizedRun,
-        frozen: &mut FrozenProducts<'_>,
+        cache: &mut SensitivityCache<'_>,
         derivatives: &SystemDerivatives,
     ) -> Result<Vec<Vec<f64>>> {
         let states = self.states.len();
@@ -744,38 +745,38 @@ impl Operators {
         let add = |row: &mut Vec<f64>, weight: f64, part: &[f64]| {
             row.iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
         };
-        for lane in &self.lanes {
-            for part in &lane.contributions {
+        for group in &self.kernel_contributions {
+            for part in &group.contributions {
                 let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
                 if coefficient != 0.0 {
-                    add(&mut forcing[lane.state], coefficient, frozen.of(lane.kernel, part.source, false));
+                    add(&mut forcing[group.state], coefficient, cache.of(group.kernel, part.source, false));
                 }
                 if order != 0.0 && part.weight != 0.0 {
-                    add(&mut forcing[lane.state], order * part.weight, frozen.of(lane.kernel, part.source, true));
+                    add(&mut forcing[group.state], order * part.weight, cache.of(group.kernel, part.source, true));
                 }
             }
         }
-        for (signal, lanes) in self.inputs_by_signal() {
+        for (signal, inputs) in self.inputs_by_signal() {
             let moved =
                 derivatives.inputs.iter().find(|input| input.signal == signal).map(|input| Kernel::new(&input.means));
             let mut spectrum = None;
-            for lane in lanes {
-                let (coefficient, order) = derivatives.terms[lane.at.0][lane.at.1];
-                let weight = system.equations[lane.at.0].coefficients[lane.at.1];
+            for input in inputs {
+                let (coefficient, order) = derivatives.terms[input.at.0][input.at.1];
+                let weight = system.equations[input.at.0].coefficients[input.at.1];
                 if coefficient != 0.0 || order != 0.0 {
                     let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
                     if coefficient != 0.0 {
-                        let part = self.integrate(spectrum, lane.kernel, self.kernels[lane.kernel].values());
-                        add(&mut forcing[lane.state], coefficient, &part);
+                        let part = self.integrate(spectrum, input.kernel, self.kernels[input.kernel].values());
+                        add(&mut forcing[input.state], coefficient, &part);
                     }
                     if order != 0.0 {
-                        let part = self.integrate(spectrum, lane.kernel, frozen.kernel_slope(lane.kernel));
-                        add(&mut forcing[lane.state], order * weight, &part);
+                        let part = self.integrate(spectrum, input.kernel, cache.kernel_slope(input.kernel));
+                        add(&mut forcing[input.state], order * weight, &part);
                     }
                 }
                 if let Some(moved) = &moved {
-                    let part = self.integrate(moved, lane.kernel, self.kernels[lane.kernel].values());
-                    add(&mut forcing[lane.state], weight, &part);
+                    let part = self.integrate(moved, input.kernel, self.kernels[input.kernel].values());
+                    add(&mut forcing[input.state], weight, &part);
                 }
             }
         }
@@ -787,25 +788,25 @@ impl Operators {
         }
         let bodies = match &self.contact {
             Some(contact) => {
-                let gain_derivatives = self.gain_derivatives(derivatives, frozen);
+                let gain_derivatives = self.gain_derivatives(derivatives, cache);
                 Some((contact, contact.derivatives(&self.gains, &gain_derivatives, derivatives)?))
             }
             None => None,
         };
-        frozen.linearize_contacts()?;
-        self.linear_run(run, &forcing, &known, bodies, (derivatives, frozen.contacts.as_ref()))
+        cache.linearize_contacts()?;
+        self.linear_run(run, &forcing, &known, bodies, (derivatives, cache.contacts.as_ref()))
     }
 
     /// Return the derivatives of `gains` with respect to a parameter, in the same layout.
-    fn gain_derivatives(&self, derivatives: &SystemDerivatives, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
+    fn gain_derivatives(&self, derivatives: &SystemDerivatives, cache: &mut SensitivityCache<'_>) -> Vec<f64> {
         let count = self.sources();
         let mut out = vec![0.0; self.gains.len()];
-        for lane in &self.lanes {
-            let first = self.kernels[lane.kernel].values().first().copied().unwrap_or(0.0);
-            for part in &lane.contributions {
+        for group in &self.kernel_contributions {
+            let first = self.kernels[group.kernel].values().first().copied().unwrap_or(0.0);
+            for part in &group.contributions {
                 let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
-                let slope = if order == 0.0 { 0.0 } else { frozen.kernel_slope(lane.kernel)[0] };
-                out[lane.state * count + part.source] += coefficient * first + part.weight * order * slope;
+                let slope = if order == 0.0 { 0.0 } else { cache.kernel_slope(group.kernel)[0] };
+                out[group.state * count + part.source] += coefficient * first + part.weight * order * slope;
             }
         }
         out
@@ -828,14 +829,14 @@ impl Operators {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
         let mut out = vec![Vec::with_capacity(self.m); self.outputs];
-        let mut lanes: Vec<OnlineConvolution<'_>> =
-            self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
+        let mut convolutions: Vec<OnlineConvolution<'_>> =
+            self.kernel_contributions.iter().map(|group| OnlineConvolution::new(&self.kernels[group.kernel])).collect();
         let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
         let mut bodies = bodies.map(|(contact, bodies)| (contact, MotionDerivatives::start(&bodies), bodies));
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
-            for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                free[lane.state] += convolution.past_contribution();
+            for (group, convolution) in self.kernel_contributions.iter().zip(&convolutions) {
+                free[group.state] += convolution.past_contribution();
             }
             let slopes = &run.slopes[k * values * width..(k + 1) * values * width];
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];
@@ -863,8 +864,8 @@ impl Operators {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();
             }
             out.iter_mut().zip(&x).for_each(|(row, v)| row.push(*v));
-            for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
-                convolution.push(lane.contributions.iter().map(|part| part.weight * x[part.source]).sum());
+            for (group, convolution) in self.kernel_contributions.iter().zip(&mut convolutions) {
+                convolution.push(group.contributions.iter().map(|part| part.weight * x[part.source]).sum());
             }
         }
         Ok(out)

@@ -2,7 +2,7 @@
 
 use super::channels::{ForcingTerms, InputDerivative, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
-use super::march::{FrozenProducts, LinearizedRun, Operators};
+use super::march::{LinearizedRun, Operators, SensitivityCache};
 use super::system::NonlinearSystem;
 use crate::equation::Equation;
 use crate::error::{Error, Result};
@@ -102,7 +102,7 @@ pub(super) struct Point {
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,
     pub(super) size: f64,
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<ExperimentLinearization>,
 }
 
 impl Evaluation {
@@ -141,7 +141,7 @@ impl Parameter {
 }
 
 /// Intermediate results of one experiment, from which the derivatives of its residuals follow.
-pub(super) struct Part {
+pub(super) struct ExperimentLinearization {
     system: NonlinearSystem,
     record: Option<Record>,
     operators: Operators,
@@ -185,7 +185,13 @@ impl NonlinearModel {
     }
 
     /// Return the derivatives of the system of a run with respect to the parameter `moved`.
-    fn derivatives(&self, point: &Point, run: usize, part: &Part, moved: &Parameter) -> Result<SystemDerivatives> {
+    fn derivatives(
+        &self,
+        point: &Point,
+        run: usize,
+        part: &ExperimentLinearization,
+        moved: &Parameter,
+    ) -> Result<SystemDerivatives> {
         let (values, equations) = (&point.states[run], &self.model.equations);
         let mut derivatives = SystemDerivatives {
             terms: equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len() + 1]).collect(),
@@ -292,21 +298,24 @@ impl NonlinearModel {
     /// coefficient, nonuniform samples, or runs with different filters. A friction coefficient must be a non-negative
     /// multiple of one free coefficient. The errors of [`FreeModel::check`] occur as well.
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
-        let refuse = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
+        let invalid = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
         let Some(recorded) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
         if self.derived.iter().flat_map(|d| &d.channels).any(|(signal, _)| *signal >= recorded) {
-            return refuse("an expression contains the number of a signal that does not exist", "count signals from 0");
+            return invalid(
+                "an expression contains the number of a signal that does not exist",
+                "count signals from 0",
+            );
         }
         self.model.check_structure(recorded, self.derived.len())?;
         if self.frictions.iter().any(|friction| friction.0 >= self.model.equations.len()) {
-            return refuse("friction is given for an equation that does not exist", "count equations from 0");
+            return invalid("friction is given for an equation that does not exist", "count equations from 0");
         }
         let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.model.coordinates.len());
         let mut numbers = self.frictions.iter().flat_map(|(_, law)| law.numbers());
         if numbers.any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
-            return refuse(
+            return invalid(
                 "a friction coefficient is not a non-negative multiple of one free coefficient",
                 "give one such factor",
             );
@@ -315,11 +324,11 @@ impl NonlinearModel {
             self.model.check_experiment(experiment)?;
             if experiment.nonuniform.is_some() {
                 let terms = if self.derived.is_empty() { "friction" } else { "non-linear terms" };
-                return refuse(&format!("{terms} with samples at nonuniform times"), "resample the runs");
+                return invalid(&format!("{terms} with samples at nonuniform times"), "resample the runs");
             }
             let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
             if passes != self.filtered {
-                return refuse("experiments whose outputs pass different filters", "give all runs the same filter");
+                return invalid("experiments whose outputs pass different filters", "give all runs the same filter");
             }
         }
         self.model.initial.check()
@@ -375,8 +384,8 @@ impl NonlinearModel {
             let record = acting.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
             // The optimizer shortens its step after this error.
-            let far = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
-            system.check().map_err(far)?;
+            let overflow = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
+            system.check().map_err(overflow)?;
             let operators = Operators::new(&system, record)?;
             let mut forcing = self.initial_forcing(&operators, (&point.orders, &point.coefficients, values))?;
             operators.add_inputs(&system, record, &mut forcing);
@@ -392,10 +401,10 @@ impl NonlinearModel {
             let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
-                return Err(Error::Diverged { what: "free run".into(), index });
+                return Err(Error::Diverged { what: "simulation".into(), index });
             }
             out.residuals.extend(residuals);
-            out.parts.push(Part { system, record: acting, operators, run, input_slopes });
+            out.parts.push(ExperimentLinearization { system, record: acting, operators, run, input_slopes });
         }
         Ok(out)
     }
@@ -415,7 +424,7 @@ impl NonlinearModel {
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
             let record = part.record.as_ref().unwrap_or(&experiment.record);
-            let mut frozen = FrozenProducts::new(&part.operators, &part.run);
+            let mut cache = SensitivityCache::new(&part.operators, &part.run);
             for (column, moved) in columns.iter_mut().zip(&all) {
                 if matches!(moved, Parameter::InitialTerm(run, _) if *run != index) {
                     column.extend(std::iter::repeat_n(0.0, self.model.equations.len() * experiment.compared_count()));
@@ -439,7 +448,7 @@ impl NonlinearModel {
                     }
                     _ => {
                         let derivatives = self.derivatives(point, index, part, moved)?;
-                        part.operators.sensitivity(&part.system, record, &part.run, &mut frozen, &derivatives)?
+                        part.operators.sensitivity(&part.system, record, &part.run, &mut cache, &derivatives)?
                     }
                 };
                 // Residuals are measurement minus response.
@@ -461,11 +470,12 @@ fn state_guesses(
     frictions: &[(usize, FrictionLaw)],
     experiment: &Experiment,
 ) -> Vec<Vec<f64>> {
-    let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
+    let initial_values: Vec<(f64, f64)> =
+        experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
     let with_force = |body: usize, force: f64| -> Vec<f64> {
         let value = |state: &InitialTerm| match *state {
-            InitialTerm::Level(i) => begun[i].0,
-            InitialTerm::Rate(i) => begun[i].1,
+            InitialTerm::Level(i) => initial_values[i].0,
+            InitialTerm::Rate(i) => initial_values[i].1,
             InitialTerm::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
             _ => 0.0,
         };
@@ -485,14 +495,14 @@ fn state_guesses(
 
 /// Return the initial position and velocity of an output by linear regression over its first samples.
 fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
-    let near = &samples[..samples.len().min(FIRST_SAMPLES)];
+    let first_samples = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
-    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
+    let (count, step) = (first_samples.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
     let middle = 0.5 * (count - 1.0);
-    let mean = near.iter().sum::<f64>() / count.max(1.0);
+    let mean = first_samples.iter().sum::<f64>() / count.max(1.0);
     #[allow(clippy::cast_precision_loss)]
     let (mut across, mut along) = (0.0, 0.0);
-    for (k, value) in near.iter().enumerate() {
+    for (k, value) in first_samples.iter().enumerate() {
         #[allow(clippy::cast_precision_loss)]
         let x = k as f64 - middle;
         across += x * (value - mean);

@@ -57,27 +57,27 @@ impl NonlinearSystem {
     /// [`Equation::check`] for an invalid equation.
     pub fn check(&self) -> Result<()> {
         let signals = self.recorded + self.derived.len();
-        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        let invalid = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         for (i, equation) in self.equations.iter().enumerate() {
             equation.check(signals)?;
             let output = equation.structure.output;
             if output >= self.recorded {
-                return refuse("a derived signal as output of an equation".into(), "simulate recorded signals only");
+                return invalid("a derived signal as output of an equation".into(), "simulate recorded signals only");
             }
             if self.equations[..i].iter().any(|other| other.structure.output == output) {
                 let what = format!("two equations have signal {output} as their output");
-                return refuse(what, "give each output one equation");
+                return invalid(what, "give each output one equation");
             }
         }
         match self.derived.iter().flat_map(|d| &d.channels).find(|(signal, _)| *signal >= self.recorded) {
             None => self.check_frictions(),
-            Some((signal, _)) => refuse(format!("signal {signal} of {} in an expression", self.recorded), "record it"),
+            Some((signal, _)) => invalid(format!("signal {signal} of {} in an expression", self.recorded), "record it"),
         }
     }
 
     /// Return an error for an invalid friction law, and for an equation whose orders do not support friction.
     fn check_frictions(&self) -> Result<()> {
-        let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
+        let invalid = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
         for (k, &(place, _)) in self.frictions.iter().enumerate() {
@@ -95,7 +95,7 @@ impl NonlinearSystem {
             check_finite("friction", &[coulomb, stribeck, speed])?;
             let alpha = self.equations[place].structure.order;
             if !(alpha > 1.0 && alpha <= 2.0) {
-                return refuse(
+                return invalid(
                     "order of a body with friction",
                     alpha,
                     "(1, 2]",
@@ -103,7 +103,7 @@ impl NonlinearSystem {
                 );
             }
             if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
-                return refuse(
+                return invalid(
                     "friction",
                     force,
                     "[0, ∞)",
@@ -112,7 +112,7 @@ impl NonlinearSystem {
             }
             if speed <= 0.0 {
                 let remedy = "give the positive speed below which friction increases";
-                return refuse("speed of Stribeck friction", speed, "(0, ∞)", remedy);
+                return invalid("speed of Stribeck friction", speed, "(0, ∞)", remedy);
             }
         }
         if self.frictions.is_empty() {
@@ -125,10 +125,13 @@ impl NonlinearSystem {
             if let Some(term) =
                 structure.terms.iter().find(|t| above(t.order) && self.output_index(i, t.signal).is_none())
             {
-                let rubs = self.frictions.iter().any(|f| f.0 == i);
-                let name =
-                    if rubs { "order of a term of a body with friction" } else { "order of an input term of a body" };
-                return refuse(name, term.order, "below that of the body", "reduce it");
+                let has_friction = self.frictions.iter().any(|f| f.0 == i);
+                let name = if has_friction {
+                    "order of a term of a body with friction"
+                } else {
+                    "order of an input term of a body"
+                };
+                return invalid(name, term.order, "below that of the body", "reduce it");
             }
         }
         check_regular(&self.equations)?;

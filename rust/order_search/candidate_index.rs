@@ -16,7 +16,7 @@ use crate::regressors::Record;
 /// All candidates of an order grid for one equation, with the regressors and bounds that they share.
 pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
-    pub(crate) lattice: Cow<'a, OrderGrid>,
+    pub(crate) grid: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
     /// Unused part of the memory limit \[bytes\].
     pub(crate) spare_bytes: u64,
@@ -29,35 +29,35 @@ impl<'a> CandidateIndex<'a> {
     /// Build the regressors, their inner products and the fixed test vectors for all candidates.
     pub(crate) fn new(
         records: &[Record],
-        lattice: Cow<'a, OrderGrid>,
+        grid: Cow<'a, OrderGrid>,
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
         stop: &Stop,
     ) -> Result<Self> {
-        check_length("fixed coefficients", lattice.width(), fixed.len())?;
+        check_length("fixed coefficients", grid.width(), fixed.len())?;
         for record in records {
-            lattice.structure(0).check(record.len(), |_| true)?;
+            grid.structure(0).check(record.len(), |_| true)?;
         }
         let mut needed = RequiredRegressors::new(&options.initial);
-        for block in lattice.blocks() {
+        for block in grid.blocks() {
             needed.add_alpha(block.alpha);
-            for (group, slice) in lattice.groups().iter().zip(&block.tuples) {
+            for (group, slice) in grid.groups().iter().zip(&block.tuples) {
                 for (axis, &first) in group.axes.iter().zip(&slice.first) {
                     axis[first..].iter().for_each(|&order| needed.add_term(block.alpha, group.signal, order));
                 }
             }
         }
-        let (output, index, mut budget) = (lattice.output(), needed.into_index(), Budget::default());
+        let (output, index, mut budget) = (grid.output(), needed.into_index(), Budget::default());
         budget.add(records, output, &index, options, Bound::MAX_TEST_VECTORS);
         budget.check(options.memory)?;
         let spare = budget.remaining_bytes(options.memory);
         let problem = pool.install(|| {
-            Ok(Problem::new(records, output, index, fixed, options, stop)?.with_bound(lattice.count(), stop))
+            Ok(Problem::new(records, output, index, fixed, options, stop)?.with_bound(grid.count(), stop))
         })?;
         stop.check()?;
-        let tables = tables(&lattice, &problem)?;
-        Ok(Self { problem, lattice, options: options.clone(), spare_bytes: spare, tables })
+        let tables = tables(&grid, &problem)?;
+        Ok(Self { problem, grid, options: options.clone(), spare_bytes: spare, tables })
     }
 
     /// Write the column of each term of the candidate at the cursor to `positions`.
@@ -96,13 +96,12 @@ impl<'a> CandidateIndex<'a> {
 
 /// Return the column of every grid value of every term, by block. A table avoids a lookup of each regressor per
 /// candidate.
-fn tables(lattice: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
-    lattice
-        .blocks()
+fn tables(grid: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
+    grid.blocks()
         .iter()
         .map(|block| {
-            let mut table = vec![Vec::new(); lattice.width()];
-            for (group, slice) in lattice.groups().iter().zip(&block.tuples) {
+            let mut table = vec![Vec::new(); grid.width()];
+            for (group, slice) in grid.groups().iter().zip(&block.tuples) {
                 for ((&term, axis), &first) in group.terms.iter().zip(&group.axes).zip(&slice.first) {
                     table[term] = axis
                         .iter()

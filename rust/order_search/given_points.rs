@@ -129,7 +129,7 @@ impl Points {
         #[allow(clippy::cast_precision_loss)]
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
-        let marches = PerThread::<BlockSimulation>::new(&pool);
+        let simulations = PerThread::<BlockSimulation>::new(&pool);
         let this = &*self;
         let raw: Vec<f64> = pool.install(|| {
             structures
@@ -137,8 +137,8 @@ impl Points {
                 .zip(points)
                 .map(|(structure, point)| {
                     let Some(structure) = structure else { return f64::INFINITY };
-                    marches.with(|march| {
-                        let error = this.error(structure, &point.coefficients, raw_limit, march, control);
+                    simulations.with(|simulation| {
+                        let error = this.error(structure, &point.coefficients, raw_limit, simulation, control);
                         error.unwrap_or(f64::INFINITY)
                     })
                 })
@@ -193,7 +193,7 @@ impl Points {
         structure: &Structure,
         coefficients: &[f64],
         limit: f64,
-        march: &mut BlockSimulation,
+        simulation: &mut BlockSimulation,
         control: &Control,
     ) -> Option<f64> {
         let mut sum = 0.0;
@@ -207,7 +207,7 @@ impl Points {
                 .collect();
             let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
             let target = record.signal(self.output);
-            match march.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
+            match simulation.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
                 // A NaN limit excludes all candidates.
                 Verdict::Score(raw) if raw <= limit => sum = raw,
                 _ => return None,

@@ -151,7 +151,7 @@ impl Options {
                 settings.check()?;
             }
         }
-        if let Initial::Powers(powers) = self.initial.under() {
+        if let Initial::Powers(powers) = self.initial.base() {
             check_finite("exponents of the initial terms", powers)?;
             if let Some(&bad) = powers.iter().find(|&&e| e <= -1.0) {
                 let remedy = "t to this power has no mean over the first pulse";

@@ -86,7 +86,7 @@ pub struct Part {
 }
 
 impl Part {
-    /// Merge the result of other batches into this one. Only the best `keep` rows remain.
+    /// Merge the result of other batches into this one. Only the best `top` rows remain.
     ///
     /// ```
     /// # use ftlm::order_search::options::Norm;
@@ -96,13 +96,13 @@ impl Part {
     ///     ..Part::default()
     /// };
     /// let mut all = part(7, 2.0);
-    /// all.join(part(3, 1.0), 1);
+    /// all.merge(part(3, 1.0), 1);
     /// assert_eq!(all.seed(), [(3, 1.0)]);
     /// assert_eq!(all.outcome(Norm::L1, 100).counts.table_rows, 1);
     /// ```
-    pub fn join(&mut self, other: Self, keep: usize) {
+    pub fn merge(&mut self, other: Self, top: usize) {
         self.rows.extend(other.rows);
-        trim(&mut self.rows, keep);
+        trim(&mut self.rows, top);
         self.counts.add(&other.counts);
         self.failures.extend(other.failures);
         self.failures.sort_unstable();
@@ -155,29 +155,29 @@ impl Counts {
     }
 }
 
-/// Sort the rows by score, then by index, and keep the first `keep` rows.
-fn trim(rows: &mut Vec<Row>, keep: usize) {
+/// Sort the rows by score, then by index, and keep the first `top` rows.
+fn trim(rows: &mut Vec<Row>, top: usize) {
     rows.sort_by(|a, b| a.score.total_cmp(&b.score).then(a.index.cmp(&b.index)));
-    rows.truncate(keep);
+    rows.truncate(top);
 }
 
 /// Best rows found by a search, and the limit that they imply.
 pub(crate) struct TopRows {
     pub(crate) rows: Vec<Row>,
-    keep: usize,
+    top: usize,
     /// Raw score (Σ|e| or Σe²) above which no candidate can enter the table.
     pub(crate) limit: f64,
 }
 
 impl TopRows {
-    pub(crate) fn new(keep: usize, limit: f64) -> Self {
-        Self { rows: Vec::new(), keep, limit }
+    pub(crate) fn new(top: usize, limit: f64) -> Self {
+        Self { rows: Vec::new(), top, limit }
     }
 
-    /// Insert rows, and remove rows that are not among the best `keep`.
+    /// Insert rows, and remove rows that are not among the best `top`.
     pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
-        trim(&mut self.rows, self.keep);
+        trim(&mut self.rows, self.top);
     }
 
     /// Return true if this row is in the table.
@@ -188,8 +188,8 @@ impl TopRows {
 
     /// Lower the limit to the score of the worst row if pruning is enabled (`stopping`) and the table is full.
     pub(crate) fn lower_limit(&mut self, stopping: bool) {
-        if stopping && self.rows.len() == self.keep {
-            self.limit = self.limit.min(self.rows[self.keep - 1].score);
+        if stopping && self.rows.len() == self.top {
+            self.limit = self.limit.min(self.rows[self.top - 1].score);
         }
     }
 }

@@ -28,13 +28,18 @@ pub(crate) fn sort_by_guess(open: &mut [OpenCandidate]) {
 
 /// Screen candidates `lo … hi − 1` against a limit of the raw score (Σ|e| or Σe²). Return the candidates that no bound
 /// excludes, and the indices of the singular ones. It is compiled for the widest vector instructions available.
-pub(crate) fn screen(catalogue: &CandidateIndex<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<OpenCandidate>, Vec<u64>) {
-    simd::dispatch_simd(Screening { catalogue, lo, hi, limit })
+pub(crate) fn screen(
+    candidate_index: &CandidateIndex<'_>,
+    lo: u64,
+    hi: u64,
+    limit: f64,
+) -> (Vec<OpenCandidate>, Vec<u64>) {
+    simd::dispatch_simd(Screening { candidate_index, lo, hi, limit })
 }
 
 /// Arguments of [`screen`] as a task that is compiled for the widest vector instructions available.
 struct Screening<'a> {
-    catalogue: &'a CandidateIndex<'a>,
+    candidate_index: &'a CandidateIndex<'a>,
     lo: u64,
     hi: u64,
     limit: f64,
@@ -45,25 +50,25 @@ impl simd::SimdKernel for Screening<'_> {
 
     #[inline(always)]
     fn run(self) -> Self::Output {
-        let Self { catalogue, lo, hi, limit } = self;
+        let Self { candidate_index, lo, hi, limit } = self;
         let mut screened = (Vec::new(), Vec::new());
-        let mut cursor = Cursor::at(&catalogue.lattice, lo);
+        let mut cursor = Cursor::at(&candidate_index.grid, lo);
         let mut index = lo;
-        let width = catalogue.lattice.width();
+        let width = candidate_index.grid.width();
         // Candidates differ in their Caputo terms and in the exponent of an offset. They therefore cannot be solved in
         // parallel lanes.
-        if !catalogue.options.initial.follows_orders() {
+        if !candidate_index.options.initial.follows_orders() {
             let mut screen = Screen::<LANE_COUNT>::new(width);
-            catalogue.positions(&cursor, &mut screen.terms);
-            let sharing = RowBoundContext::of(catalogue, limit);
+            candidate_index.positions(&cursor, &mut screen.terms);
+            let sharing = RowBoundContext::of(candidate_index, limit);
             while index < hi {
-                let shared = sharing
-                    .as_ref()
-                    .and_then(|sharing| screen.screen_row(catalogue, sharing, &mut cursor, (index, hi), &mut screened));
+                let shared = sharing.as_ref().and_then(|sharing| {
+                    screen.screen_row(candidate_index, sharing, &mut cursor, (index, hi), &mut screened)
+                });
                 if let Some(candidates) = shared {
                     index += candidates;
                 } else if index + LANE_COUNT as u64 <= hi {
-                    screen.screen_next(catalogue, &mut cursor, index, limit, &mut screened);
+                    screen.screen_next(candidate_index, &mut cursor, index, limit, &mut screened);
                     index += LANE_COUNT as u64;
                 } else {
                     break;
@@ -71,9 +76,9 @@ impl simd::SimdKernel for Screening<'_> {
             }
         }
         let mut screen = Screen::<1>::new(width);
-        catalogue.positions(&cursor, &mut screen.terms);
+        candidate_index.positions(&cursor, &mut screen.terms);
         while index < hi {
-            screen.screen_next(catalogue, &mut cursor, index, limit, &mut screened);
+            screen.screen_next(candidate_index, &mut cursor, index, limit, &mut screened);
             index += 1;
         }
         screened
@@ -90,8 +95,8 @@ struct RowBoundContext<'a> {
 impl<'a> RowBoundContext<'a> {
     /// Return the data of a search. `None` if the limit is infinite, a coefficient is fixed, or candidates are not
     /// ranked by squared equation error.
-    fn of(catalogue: &'a CandidateIndex<'_>, limit: f64) -> Option<Self> {
-        let Problem { residual_sums: squares, equations, .. } = &catalogue.problem;
+    fn of(candidate_index: &'a CandidateIndex<'_>, limit: f64) -> Option<Self> {
+        let Problem { residual_sums: squares, equations, .. } = &candidate_index.problem;
         let squares =
             squares.as_ref().filter(|_| limit < f64::INFINITY && equations.unconstrained_equations().is_some())?;
         Some(Self { squares, limit })
@@ -144,7 +149,7 @@ impl<const L: usize> Screen<L> {
     #[inline(always)]
     fn screen_row(
         &mut self,
-        catalogue: &CandidateIndex<'_>,
+        candidate_index: &CandidateIndex<'_>,
         &RowBoundContext { squares, limit }: &RowBoundContext<'_>,
         cursor: &mut Cursor<'_>,
         (index, hi): (u64, u64),
@@ -155,7 +160,7 @@ impl<const L: usize> Screen<L> {
         if len < L {
             return None;
         }
-        let columns = &catalogue.term_columns(cursor, term)[digit..digit + len];
+        let columns = &candidate_index.term_columns(cursor, term)[digit..digit + len];
         let shared = CommonFactor::new(squares, &self.terms, term)?;
         let mut open_positions = std::mem::take(&mut self.open_positions);
         open_positions.clear();
@@ -169,11 +174,11 @@ impl<const L: usize> Screen<L> {
             let indices = at.map(|n| index + n as u64);
             self.positions[term] = Columns::new(at.map(|n| columns[n]));
             self.positions[term].compare();
-            self.screen_positions(catalogue, indices, part.len(), limit, screened);
+            self.screen_positions(candidate_index, indices, part.len(), limit, screened);
         }
         self.open_positions = open_positions;
         cursor.skip(len - 1);
-        catalogue.next(cursor, &mut self.terms);
+        candidate_index.next(cursor, &mut self.terms);
         Some(len as u64)
     }
 
@@ -181,32 +186,32 @@ impl<const L: usize> Screen<L> {
     #[inline(always)]
     fn screen_next(
         &mut self,
-        catalogue: &CandidateIndex<'_>,
+        candidate_index: &CandidateIndex<'_>,
         cursor: &mut Cursor<'_>,
         index: u64,
         limit: f64,
         screened: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self { positions, initial, terms, .. } = self;
-        catalogue.initial(cursor, initial);
+        candidate_index.initial(cursor, initial);
         if let Some((term, digit)) = cursor.adjacent_block(L) {
             for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
                 *columns = Columns::one(column);
             }
-            positions[term].at = part_of(&catalogue.term_columns(cursor, term)[digit..]);
+            positions[term].at = part_of(&candidate_index.term_columns(cursor, term)[digit..]);
             positions[term].compare();
             cursor.skip(L - 1);
-            catalogue.next(cursor, terms);
+            candidate_index.next(cursor, terms);
         } else {
             for n in 0..L {
                 for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
                     columns.at[n] = column;
                 }
-                catalogue.next(cursor, terms);
+                candidate_index.next(cursor, terms);
             }
             positions.iter_mut().for_each(Columns::compare);
         }
-        self.screen_positions(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, screened);
+        self.screen_positions(candidate_index, std::array::from_fn(|n| index + n as u64), L, limit, screened);
     }
 
     /// Screen the first `count` of the L candidates whose columns have been set. Append to the candidates that no bound
@@ -214,7 +219,7 @@ impl<const L: usize> Screen<L> {
     #[inline(always)]
     fn screen_positions(
         &mut self,
-        catalogue: &CandidateIndex<'_>,
+        candidate_index: &CandidateIndex<'_>,
         indices: [u64; L],
         count: usize,
         limit: f64,
@@ -223,9 +228,9 @@ impl<const L: usize> Screen<L> {
         let Self {
             solve, positions, initial, columns, coefficients, weights, norm_cache: memory, lookup, path, ..
         } = self;
-        let failed = catalogue.problem.equations.solve(positions, initial, solve);
+        let failed = candidate_index.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
-        let squares = match &catalogue.problem.residual_sums {
+        let squares = match &candidate_index.problem.residual_sums {
             Some(squares) => Some(squares.error(positions, &solve.coefficients)),
             None => None,
         };
@@ -234,11 +239,11 @@ impl<const L: usize> Screen<L> {
                 singular.push(index);
                 continue;
             }
-            let (bound, guess) = match (&squares, &catalogue.problem.bound) {
+            let (bound, guess) = match (&squares, &candidate_index.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
                     // Unrefined coefficients give an estimate of the score but no valid bound.
-                    let refined = catalogue.problem.refines();
+                    let refined = candidate_index.problem.refines();
                     let limit = if refined { f64::INFINITY } else { limit };
                     columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
                     coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
@@ -256,18 +261,19 @@ impl<const L: usize> Screen<L> {
             if bound > limit {
                 continue;
             }
-            if let Some(adapted) = &catalogue.problem.tailored_vectors
-                && adapted.excludes_candidate(columns, coefficients, limit, memory)
+            if let Some(tailored) = &candidate_index.problem.tailored_vectors
+                && tailored.excludes_candidate(columns, coefficients, limit, memory)
             {
                 continue;
             }
-            if let (Some(tangents), true) = (&catalogue.problem.linearized_vectors, limit < f64::INFINITY)
-                && tangents.excludes_candidate(columns, coefficients, limit, lookup)
+            if let (Some(linearized_vectors), true) =
+                (&candidate_index.problem.linearized_vectors, limit < f64::INFINITY)
+                && linearized_vectors.excludes_candidate(columns, coefficients, limit, lookup)
             {
                 continue;
             }
-            if let (Some(roots), true) = (&catalogue.problem.unstable_zeros, limit < f64::INFINITY)
-                && roots.excludes_candidate(columns, coefficients, limit, path)
+            if let (Some(unstable_zeros), true) = (&candidate_index.problem.unstable_zeros, limit < f64::INFINITY)
+                && unstable_zeros.excludes_candidate(columns, coefficients, limit, path)
             {
                 continue;
             }
@@ -280,8 +286,8 @@ impl<const L: usize> Screen<L> {
     #[inline(always)]
     pub(crate) fn screen_slice_candidates(
         &mut self,
-        catalogue: &CandidateIndex<'_>,
-        slab: &GridSlice,
+        candidate_index: &CandidateIndex<'_>,
+        slice: &GridSlice,
         columns: &[usize],
         candidates: &[(u64, usize, usize)],
         limit: f64,
@@ -294,10 +300,16 @@ impl<const L: usize> Screen<L> {
         let of = |n: usize| candidates.get(n).unwrap_or(last);
         let outer: [usize; L] = std::array::from_fn(|n| of(n).1);
         let inner: [usize; L] = std::array::from_fn(|n| of(n).2);
-        for (term, at) in [(slab.outer, outer), (slab.inner, inner)] {
+        for (term, at) in [(slice.outer, outer), (slice.inner, inner)] {
             self.positions[term].at = at;
             self.positions[term].compare();
         }
-        self.screen_positions(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, screened);
+        self.screen_positions(
+            candidate_index,
+            std::array::from_fn(|n| of(n).0),
+            candidates.len().min(L),
+            limit,
+            screened,
+        );
     }
 }

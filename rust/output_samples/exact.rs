@@ -111,13 +111,13 @@ impl OutputSimulation {
         if self.recording.is_coupled {
             return together(&self.equations, terms);
         }
-        let alone = self.equations.iter().zip(terms).map(|(equation, terms)| {
+        let outputs = self.equations.iter().zip(terms).map(|(equation, terms)| {
             if !is_driven && terms.is_empty() {
                 return Ok(Some(vec![vec![0.0; self.recording.len()]]));
             }
             together(std::slice::from_ref(equation), std::slice::from_ref(terms))
         });
-        Ok(alone.collect::<Result<Option<Vec<Rows>>>>()?.map(|rows| rows.concat()))
+        Ok(outputs.collect::<Result<Option<Vec<Rows>>>>()?.map(|rows| rows.concat()))
     }
 
     fn input(&self, signal: usize) -> InputSignal {

@@ -87,10 +87,11 @@ pub fn fit_initial_terms(
     let mut scaled: Vec<Vec<f64>> = columns.iter().map(weighted).collect();
     let sizes: Vec<f64> = scaled.iter().map(|column| norm(column)).collect();
     let usable: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k].is_finite() && sizes[k] > 0.0).collect();
-    let tall: Vec<Vec<f64>> =
+    let columns_of_matrix: Vec<Vec<f64>> =
         usable.iter().map(|&k| std::mem::take(&mut scaled[k]).into_iter().map(|v| v / sizes[k]).collect()).collect();
     let error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
-    let solution = minimum_norm_solution(&tall, &weighted(&missing), COLLINEARITY_TOLERANCE).ok_or_else(error)?;
+    let solution =
+        minimum_norm_solution(&columns_of_matrix, &weighted(&missing), COLLINEARITY_TOLERANCE).ok_or_else(error)?;
     let mut values = vec![0.0; units.len()];
     for (&k, value) in usable.iter().zip(solution) {
         values[k] = value / sizes[k];

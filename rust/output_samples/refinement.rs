@@ -16,10 +16,10 @@ use crate::signal::nonuniform::interpolate_gaps;
 /// a zero-order-hold input at its time.
 pub(super) const FIRST_REFINEMENT: usize = 2;
 /// Ratio of the end times of successive time ranges into which responses are divided. The shortest range has at least
-/// [`MIN_PIECE_INTERVALS`] sampling intervals. With this ratio, halving the step on a range costs as much as the whole
+/// [`MIN_RANGE_INTERVALS`] sampling intervals. With this ratio, halving the step on a range costs as much as the whole
 /// response on the coarser grid.
 const PIECE_RATIO: usize = 8;
-const MIN_PIECE_INTERVALS: usize = 128;
+const MIN_RANGE_INTERVALS: usize = 128;
 /// Pulses per sampling interval of the grids that cover whole responses. The coarsest of these grids is not used for
 /// the first time range, in which responses have jumps.
 const FULL_GRID_REFINEMENTS: [usize; 3] = [1, 2, 4];
@@ -157,7 +157,7 @@ struct SampleResponses<'a> {
 
 /// Time range of all responses: first sample, end, pulses per sampling interval of its finest grid, and Richardson
 /// table.
-struct Piece {
+struct TimeRange {
     first: usize,
     end: usize,
     refinement: usize,
@@ -183,8 +183,8 @@ impl<'a> SampleResponses<'a> {
                 // A delayed input depends on values before the run, and direct feedthrough has a value at the last
                 // sample. Neither is a response to one of its samples.
                 let delay = channel.delay.unwrap_or(0.0);
-                let late = delay > 0.0 && (direct || !recording.is_at_rest);
-                if channel.role == Role::Derived || delay < 0.0 || late {
+                let depends_on_other_samples = delay > 0.0 && (direct || !recording.is_at_rest);
+                if channel.role == Role::Derived || delay < 0.0 || depends_on_other_samples {
                     return None;
                 }
                 let samples = interpolate_gaps(&recording.acting_samples(term.signal)).into_owned();
@@ -236,8 +236,8 @@ impl<'a> SampleResponses<'a> {
         rows.extend(first);
         if !self.units.is_empty() {
             self.stop.check()?;
-            let still = self.unit(None, intervals);
-            let grid = Grid::new(&still, every)?;
+            let zero_inputs = self.unit(None, intervals);
+            let grid = Grid::new(&zero_inputs, every)?;
             let (_, responses) = grid.rest_and_units(&self.units)?;
             for (unit, means) in self.units.iter().zip(responses) {
                 rows.extend(grid.unit_samples(*unit, &means)?);
@@ -325,9 +325,9 @@ fn refine_long_record(
     if !grids[1..].iter().all(decays) {
         return Ok(None);
     }
-    let rough = responses.samples(&grids[grids.len() - 1], initial)?;
-    let sizes: Vec<f64> = rough.outputs.iter().map(|row| peak(row)).collect();
-    let mut terms: Vec<f64> = rough.initial.iter().flatten().filter(|t| t.0.is_finite()).map(|t| t.1).collect();
+    let estimate = responses.samples(&grids[grids.len() - 1], initial)?;
+    let sizes: Vec<f64> = estimate.outputs.iter().map(|row| peak(row)).collect();
+    let mut terms: Vec<f64> = estimate.initial.iter().flatten().filter(|t| t.0.is_finite()).map(|t| t.1).collect();
     terms.resize(responses.units.len(), 0.0);
     let measure = |first: usize, new: &Rows, old: &Rows| -> Vec<f64> {
         let by = combine(new, old, |n, o| n - o);
@@ -343,51 +343,51 @@ fn refine_long_record(
     };
     let part =
         |rows: &Rows, first: usize, end: usize| rows.iter().map(|row| row[first..end].to_vec()).collect::<Rows>();
-    let mut pieces = Vec::new();
-    for (first, end) in piece_ranges(intervals) {
+    let mut ranges = Vec::new();
+    for (first, end) in time_ranges(intervals) {
         let mut limit = RichardsonTable::default();
         for rows in &grids[usize::from(first == 0)..] {
             limit.add(part(rows, first, end), Vec::new(), &|new, old| measure(first, new, old));
         }
-        pieces.push(Piece { first, end, refinement: FINEST_FULL_GRID, limit });
+        ranges.push(TimeRange { first, end, refinement: FINEST_FULL_GRID, limit });
     }
     drop(grids);
-    let (count, share) = (pieces.len(), options.tolerance / pieces.len() as f64);
+    let (count, share) = (ranges.len(), options.tolerance / ranges.len() as f64);
     let (best, refinement, change) = loop {
         let estimates =
-            pieces.iter().map(|piece| piece.limit.estimate(&[], 0.0, &|new, old| measure(piece.first, new, old)));
+            ranges.iter().map(|range| range.limit.estimate(&[], 0.0, &|new, old| measure(range.first, new, old)));
         let error = || Error::Internal { what: "no grid of a response".into() };
         let estimates = estimates.collect::<Option<Vec<_>>>().ok_or_else(error)?;
         let of = |i: usize| estimates.iter().filter_map(|estimate| estimate.change.get(i)).sum::<f64>();
         let change: Vec<f64> = (0..responses.outputs()).map(of).collect();
         let widest = (0..count).rev().find(|&k| {
             !estimates[k].change.iter().all(|c| *c <= share)
-                && (2 * pieces[k].refinement).saturating_mul(pieces[k].end) <= options.max_pulses
+                && (2 * ranges[k].refinement).saturating_mul(ranges[k].end) <= options.max_pulses
         });
         let widest = widest.filter(|_| !change.iter().all(|c| *c <= options.tolerance));
-        let Some((end, every)) = widest.map(|k| (pieces[k].end, 2 * pieces[k].refinement)) else {
+        let Some((end, every)) = widest.map(|k| (ranges[k].end, 2 * ranges[k].refinement)) else {
             let mut best = vec![Vec::new(); estimates[0].samples.len()];
             for estimate in estimates {
                 best.iter_mut().zip(estimate.samples).for_each(|(row, more)| row.extend(more));
             }
-            break (best, pieces[count - 1].refinement, change);
+            break (best, ranges[count - 1].refinement, change);
         };
         stop.check()?;
         let finer = responses.compute(every, end - 1)?;
-        for piece in pieces.iter_mut().filter(|piece| piece.end <= end && 2 * piece.refinement == every) {
-            let (first, end) = (piece.first, piece.end);
-            piece.limit.add(part(&finer, first, end), Vec::new(), &|new, old| measure(first, new, old));
-            piece.refinement = every;
+        for range in ranges.iter_mut().filter(|range| range.end <= end && 2 * range.refinement == every) {
+            let (first, end) = (range.first, range.end);
+            range.limit.add(part(&finer, first, end), Vec::new(), &|new, old| measure(first, new, old));
+            range.refinement = every;
         }
     };
     Ok(Some(RefinedSamples { samples: responses.samples(&best, initial)?, refinement, change }))
 }
 
 /// Divide responses over `intervals` sampling intervals into time ranges. Return (first sample, end) of each range.
-fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
+fn time_ranges(intervals: usize) -> Vec<(usize, usize)> {
     let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / PIECE_RATIO));
     let mut ends: Vec<usize> =
-        ends.enumerate().take_while(|(k, end)| *k == 0 || *end >= MIN_PIECE_INTERVALS).map(|(_, end)| end).collect();
+        ends.enumerate().take_while(|(k, end)| *k == 0 || *end >= MIN_RANGE_INTERVALS).map(|(_, end)| end).collect();
     ends.reverse();
     let firsts = std::iter::once(0).chain(ends.iter().copied());
     firsts.zip(ends.iter().copied()).collect()

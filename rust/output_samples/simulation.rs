@@ -403,10 +403,10 @@ impl<'a> Grid<'a> {
         if recording.is_coupled {
             return simulate::respond(equations, &self.record, terms);
         }
-        let alone = equations.iter().zip(terms).map(|(equation, own)| {
+        let outputs = equations.iter().zip(terms).map(|(equation, own)| {
             simulate::respond(std::slice::from_ref(equation), &self.record, std::slice::from_ref(own))
         });
-        Ok(alone.collect::<Result<Vec<_>>>()?.concat())
+        Ok(outputs.collect::<Result<Vec<_>>>()?.concat())
     }
 
     /// Return the pulse means of the outputs with zero initial conditions, and those for a unit of each initial term
@@ -422,8 +422,9 @@ impl<'a> Grid<'a> {
         for (i, equation) in equations.iter().enumerate() {
             let own: Vec<usize> = (0..units.len()).filter(|&k| units[k].0 == i).collect();
             let exponents: Vec<(usize, f64)> = own.iter().map(|&k| (0, units[k].1)).collect();
-            let (alone, rows) = simulate::respond_and_units(std::slice::from_ref(equation), &self.record, &exponents)?;
-            rest.extend(alone);
+            let (outputs, rows) =
+                simulate::respond_and_units(std::slice::from_ref(equation), &self.record, &exponents)?;
+            rest.extend(outputs);
             own.into_iter().zip(rows).for_each(|(k, row)| responses[k].splice(i..=i, row).for_each(drop));
         }
         Ok((rest, responses))
@@ -449,7 +450,7 @@ impl<'a> Grid<'a> {
         let mut system = identity(n);
         let (mut now, mut start) = (vec![vec![0.0; count]; n], vec![vec![0.0]; n]);
         // This array is as long as the grid, so it is allocated only for direct feedthrough.
-        let mut drive: Option<Rows> = None;
+        let mut input_part: Option<Rows> = None;
         let degree = recording.filter.as_ref().map_or(0.0, relative_degree);
         let after_filter = |i: usize| {
             recording.filter.as_ref().map_or(0.0, |f| coefficient(&terms[i], -degree) * leading_gain(f, degree))
@@ -465,18 +466,18 @@ impl<'a> Grid<'a> {
                 if let Some(j) = self.simulation.simulated_output(term.signal) {
                     system[i * n + j] -= c;
                 } else if is_driven {
-                    let drive = drive.get_or_insert_with(|| vec![vec![0.0; m]; n]);
-                    add_multiple(&mut drive[i], c, self.record.signal(term.signal));
+                    let input_part = input_part.get_or_insert_with(|| vec![vec![0.0; m]; n]);
+                    add_multiple(&mut input_part[i], c, self.record.signal(term.signal));
                     add_multiple(&mut now[i], c, &self.values_at_samples(term.signal)?);
                 }
             }
         }
         let through = if system == identity(n) { None } else { Some(small::inverse(&system, n)?) };
         let through = through.as_ref();
-        let (drive, now, start) =
-            (drive.map(|drive| apply(through, drive)), apply(through, now), apply(through, start));
-        let mut rest = match &drive {
-            Some(drive) => combine(means, drive, |mean, driven| mean - driven),
+        let (input_part, now, start) =
+            (input_part.map(|input_part| apply(through, input_part)), apply(through, now), apply(through, start));
+        let mut rest = match &input_part {
+            Some(input_part) => combine(means, input_part, |mean, driven| mean - driven),
             None => means.clone(),
         };
         let (mut gains, mut offsets) = (vec![1.0; n], vec![0.0; n]);
@@ -490,8 +491,8 @@ impl<'a> Grid<'a> {
                     offsets[i] = after_filter(i);
                 }
                 rest[i] = series::multiply(series, &means[i], m);
-                if let Some(drive) = &drive {
-                    add_multiple(&mut rest[i], -gains[i], &drive[i]);
+                if let Some(input_part) = &input_part {
+                    add_multiple(&mut rest[i], -gains[i], &input_part[i]);
                 }
             }
         }
@@ -510,7 +511,7 @@ impl<'a> Grid<'a> {
             }
             _ => {
                 let improper = self.simulation.has_improper_term();
-                let early = if improper && is_driven { Some(self.early_responses()?) } else { None };
+                let excess = if improper && is_driven { Some(self.responses_after_sample()?) } else { None };
                 let of = |i: usize| {
                     let row = &rest[i];
                     let mut out = Vec::with_capacity(count);
@@ -524,8 +525,8 @@ impl<'a> Grid<'a> {
                             // An improper term differentiates. At one order above its equation this is nearly Tustin's
                             // rule, so the pulse means have a component of alternating sign. The average of the pulses
                             // on both sides eliminates it.
-                            let early = early.as_ref().filter(|_| gains[i] == 1.0).map_or(0.0, |early| early[i][k]);
-                            0.5 * (row[at - 1] + row[at]) - early
+                            let excess = excess.as_ref().filter(|_| gains[i] == 1.0).map_or(0.0, |excess| excess[i][k]);
+                            0.5 * (row[at - 1] + row[at]) - excess
                         });
                     }
                     out
@@ -571,7 +572,7 @@ impl<'a> Grid<'a> {
     ///
     /// It is half of the response in the first pulse after a jump or a slope discontinuity of an input. At the sample
     /// time only direct feedthrough acts, as in the joint fit.
-    fn early_responses(&self) -> Result<Rows> {
+    fn responses_after_sample(&self) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let (n, m, every) = (equations.len(), self.record.m(), self.every);
         let signals = recording.channels().len();

@@ -98,9 +98,9 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
     let record = Record::from_rows(*step, rows(signals)?, filter)?;
     Ok(match initial_state {
-        Some((states, levels, answers)) => {
-            let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
-            record.with_initial_state(states.to_vec(), levels, answers)?
+        Some((states, levels, impulse_responses)) => {
+            let impulse_responses = impulse_responses.as_ref().map(rows).transpose()?.unwrap_or_default();
+            record.with_initial_state(states.to_vec(), levels, impulse_responses)?
         }
         None => record,
     })
@@ -146,12 +146,12 @@ pub fn initial(argument: InitialArg) -> PyResult<Initial> {
     };
     let powers = Initial::Powers(powers.into());
     powers.check()?;
-    let under = match powers {
+    let base = match powers {
         _ if caputo => Initial::Caputo,
         Initial::Powers(powers) if powers.is_empty() => Initial::Rest,
         powers => powers,
     };
-    Ok(under.with_offset(offset)?.with_states(states))
+    Ok(base.with_offset(offset)?.with_states(states))
 }
 
 /// Convert a row-major matrix with `rows` rows to an array.

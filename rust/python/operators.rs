@@ -221,9 +221,10 @@ fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 
 #[pyfunction]
 pub fn triangular_factor<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    let tall = finite(&given)?;
-    let count = tall.len();
-    let factor = run_interruptible(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&tall)))?;
+    let columns_of_matrix = finite(&given)?;
+    let count = columns_of_matrix.len();
+    let factor =
+        run_interruptible(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&columns_of_matrix)))?;
     matrix(py, factor, count)
 }
 
@@ -233,9 +234,9 @@ pub fn singular_values<'py>(
     py: Python<'py>,
     given: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
-    let tall = finite(&given)?;
+    let columns_of_matrix = finite(&given)?;
     let factors = run_interruptible(py, columns(&given), None, move |_| {
-        dense::singular_values(&tall).ok_or_else(|| Error::Structure {
+        dense::singular_values(&columns_of_matrix).ok_or_else(|| Error::Structure {
             what: "singular values are not found".into(),
             remedy: "scale the columns".into(),
         })

@@ -212,12 +212,12 @@ impl VirtualArm {
     }
 
     fn inject(&mut self, what: &str, channel: usize, sample: u64, value: f64) -> PyResult<()> {
-        let stage = channel;
+        let joint = channel;
         let injection = match what {
-            "dead encoder" => Injection::DeadEncoder { stage, from: sample },
-            "saturated gauge" => Injection::SaturatedGauge { stage, from: sample },
+            "dead encoder" => Injection::DeadEncoder { joint, from: sample },
+            "saturated gauge" => Injection::SaturatedGauge { joint, from: sample },
             "limit switch" => Injection::LimitSwitch { line: channel, from: sample },
-            "deflection" => Injection::Deflection { stage, from: sample, angle: value },
+            "deflection" => Injection::Deflection { joint, from: sample, angle: value },
             "late" => Injection::Late { at: sample, seconds: value },
             "lost samples" => Injection::LostSamples { from: sample },
             _ => {
@@ -273,7 +273,7 @@ impl VirtualArm {
         check_length("noise", 4, noise.ncols())?;
         check_length("noise", commands.nrows(), noise.nrows())?;
         for (command, noise) in commands.outer_iter().zip(noise.outer_iter()) {
-            let late = self.wait(py)? + self.plant.delay();
+            let delay = self.wait(py)? + self.plant.delay();
             if !self.plant.sampling() {
                 guard.inner.fail(Fault::Rig("the board returned no sample: samples were lost".into()));
                 self.write(output, [0.0; 2])?;
@@ -281,12 +281,12 @@ impl VirtualArm {
             }
             let volts = run_attached(|| {
                 let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
-                let v = guard.inner.read(&reading, late);
+                let v = guard.inner.read(&reading, delay);
                 let volts = guard.inner.command([command[0], command[1]]);
                 let [i1, i2] = guard.inner.last_currents();
                 // A reading that is not finite latches a fault and is not stored.
                 if v.iter().all(|x| x.is_finite()) {
-                    self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
+                    self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], delay]);
                 }
                 Ok(volts)
             })?;

@@ -115,7 +115,7 @@ impl Channel {
     }
 
     /// Return samples with the known saturations and dead zones of the channel applied.
-    pub(super) fn behind_limits<'a>(&self, samples: &'a [f64]) -> Cow<'a, [f64]> {
+    pub(super) fn apply_limits<'a>(&self, samples: &'a [f64]) -> Cow<'a, [f64]> {
         let mut limited = Cow::Borrowed(samples);
         for (law, limit) in self.nonlinearities.iter().filter_map(|(law, value)| value.map(|value| (law, value))) {
             for v in limited.to_mut() {

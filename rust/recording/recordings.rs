@@ -75,7 +75,7 @@ impl Recordings {
     /// Return the sampling interval and the duration of each run \[s\].
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn spans(&self) -> Vec<(f64, f64)> {
+    pub fn intervals_and_durations(&self) -> Vec<(f64, f64)> {
         self.runs.iter().map(|run| (run.step(), run.len() as f64 * run.step())).collect()
     }
 

@@ -443,7 +443,7 @@ impl Recording {
     #[must_use]
     pub fn acting_samples(&self, signal: usize) -> Cow<'_, [f64]> {
         let channel = &self.channels[signal];
-        let limited = channel.behind_limits(&channel.samples);
+        let limited = channel.apply_limits(&channel.samples);
         match self.transient(signal, &limited) {
             Some(transient) => limited.iter().zip(transient).map(|(v, offset)| v - offset).collect(),
             None => limited,
@@ -453,8 +453,8 @@ impl Recording {
     /// Return the nonuniform samples of a signal as it enters the equations; None if it has no nonuniform samples.
     fn acting_nonuniform_samples(&self, signal: usize) -> Option<Cow<'_, [f64]>> {
         let (channel, times) = (&self.channels[signal], self.times.as_ref()?);
-        let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
-        let uniform = channel.behind_limits(&channel.samples);
+        let limited = channel.apply_limits(channel.nonuniform.as_ref()?);
+        let uniform = channel.apply_limits(&channel.samples);
         let Some(transient) = self.transient(signal, &uniform) else { return Some(limited) };
         let held_values: Vec<f64> =
             uniform.iter().zip(transient).map(|(v, held_values)| v - (v - held_values)).collect();
@@ -600,7 +600,7 @@ impl Recording {
         if self.is_at_rest || channel.role == Role::Derived || (channel.is_filtered && self.is_all_filtered()) {
             return 0.0;
         }
-        let first = channel.behind_limits(&channel.samples[..1])[0];
+        let first = channel.apply_limits(&channel.samples[..1])[0];
         if first.is_finite() {
             first
         } else {
@@ -878,7 +878,7 @@ impl Recording {
             (Some(times), Some(read)) => (Cow::Borrowed(times.as_slice()), read),
             _ => (Cow::Owned(self.uniform_times()), &channel.samples),
         };
-        let samples = channel.behind_limits(read);
+        let samples = channel.apply_limits(read);
         let line = NonuniformSignal::new_unchecked(&times, &samples, channel.intersample());
         Some(of(line.with_delay(channel.lag(), self.value_before(&samples))))
     }

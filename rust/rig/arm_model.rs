@@ -73,7 +73,7 @@ pub struct Arm {
     /// substep.
     solve: [[f64; 4]; 4],
     implicit: [[f64; 4]; 4],
-    keep: Vec<f64>,
+    decay_factors: Vec<f64>,
     first: Vec<f64>,
     last: Vec<f64>,
     past: [Vec<f64>; 4],
@@ -135,7 +135,7 @@ impl Arm {
         let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
         let count = steps.len();
         // Angles that are differentiated by integer orders only have no history.
-        let remembered: [bool; 4] =
+        let has_history: [bool; 4] =
             std::array::from_fn(|s| operators.iter().any(|o| o.signal == s && !o.weights.is_empty()));
         let arm = Self {
             substep: h,
@@ -145,10 +145,10 @@ impl Arm {
             coulomb: parameters.coulomb,
             solve,
             implicit,
-            keep: steps.iter().map(|s| s.0).collect(),
+            decay_factors: steps.iter().map(|s| s.0).collect(),
             first: steps.iter().map(|s| h * s.1).collect(),
             last: steps.iter().map(|s| h * s.2).collect(),
-            past: remembered.map(|any| vec![0.0; if any { count } else { 0 }]),
+            past: has_history.map(|any| vec![0.0; if any { count } else { 0 }]),
             rate: [0.0; 4],
             angle: [0.0; 4],
             linear: [0.0; 4],
@@ -231,8 +231,10 @@ impl Arm {
             self.linear[i] = history[i] + implicit[i];
             self.angle[i] += h / 2.0 * (self.rate[i] + rate[i]);
             let (before, after) = (self.rate[i], rate[i]);
-            for (((z, keep), first), last) in self.past[i].iter_mut().zip(&self.keep).zip(&self.first).zip(&self.last) {
-                *z = *z * keep + first * before + last * after;
+            for (((z, decay_factors), first), last) in
+                self.past[i].iter_mut().zip(&self.decay_factors).zip(&self.first).zip(&self.last)
+            {
+                *z = *z * decay_factors + first * before + last * after;
             }
         }
         self.rate = rate;

@@ -99,18 +99,18 @@ impl GuardSettings {
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Fault {
     /// Command that is NaN or infinite.
-    #[error("the command of motor {stage} is {value}, not a finite current; correct the input")]
+    #[error("the command of motor {joint} is {value}, not a finite current; correct the input")]
     Command {
         /// Number of the motor: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Value of the command \[A\].
         value: f64,
     },
     /// Encoder that does not count although its motor has current.
-    #[error("encoder {stage} has not changed for {seconds:.2} s under {current:.2} A or more; the encoder is faulty or the hub is blocked; check its cable and the gear")]
+    #[error("encoder {joint} has not changed for {seconds:.2} s under {current:.2} A or more; the encoder is faulty or the joint is blocked; check its cable and the gear")]
     DeadEncoder {
         /// Number of the joint: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Duration of the standstill \[s\].
         seconds: f64,
         /// Current from which on the joint must move \[A\].
@@ -118,27 +118,27 @@ pub enum Fault {
     },
     /// Encoder jump that exceeds the highest plausible joint speed.
     #[error(
-        "encoder {stage} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
+        "encoder {joint} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
     )]
     EncoderJump {
         /// Number of the joint: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Size of the jump in counts.
         counts: i64,
     },
     /// Strain gauge in saturation.
-    #[error("strain gauge {stage} is saturated at {volts:.2} V; check its amplifier and cable")]
+    #[error("strain gauge {joint} is saturated at {volts:.2} V; check its amplifier and cable")]
     Saturated {
         /// Number of the link: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Voltage of the sensor \[V\].
         volts: f64,
     },
     /// Strain gauge that does not respond to its motor.
-    #[error("strain gauge {stage} has not changed from {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is faulty and would not detect a bent link; check its amplifier and cable")]
+    #[error("strain gauge {joint} has not changed from {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is faulty and would not detect a bent link; check its amplifier and cable")]
     DeadGauge {
         /// Number of the link: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Voltage of the sensor \[V\].
         volts: f64,
         /// Duration without a response \[s\].
@@ -147,18 +147,18 @@ pub enum Fault {
         current: f64,
     },
     /// Current sensor whose voltage is not finite.
-    #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
+    #[error("the current sense of motor {joint} reads {volts} V; check the board's analog inputs")]
     Sense {
         /// Number of the motor: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Voltage of the sensor \[V\].
         volts: f64,
     },
     /// Deflection above its limit.
-    #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
+    #[error("link {joint} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
     Deflection {
         /// Number of the link: 1 or 2.
-        stage: usize,
+        joint: usize,
         /// Deflection \[degrees\].
         degrees: f64,
         /// Limit of the deflection \[degrees\].
@@ -201,10 +201,10 @@ pub struct Guard {
     bias: [f64; 2],
     zero: [i32; 2],
     previous: Option<[i32; 2]>,
-    still: [f64; 2],
+    unchanged_time: [f64; 2],
     gauges: [Gauge; 2],
-    written: [f64; 2],
-    heat: [f64; 2],
+    last_current: [f64; 2],
+    mean_square_current: [f64; 2],
     missed: u32,
     missed_in_all: u64,
     filters: Option<[Filter; 2]>,
@@ -254,10 +254,10 @@ impl Guard {
             bias: [0.0; 2],
             zero: [0; 2],
             previous: None,
-            still: [0.0; 2],
+            unchanged_time: [0.0; 2],
             gauges: [Gauge::default(); 2],
-            written: [0.0; 2],
-            heat: [0.0; 2],
+            last_current: [0.0; 2],
+            mean_square_current: [0.0; 2],
             missed: 0,
             missed_in_all: 0,
             filters,
@@ -278,7 +278,7 @@ impl Guard {
     /// Currents of the last command, after all limits \[A\].
     #[must_use]
     pub fn last_currents(&self) -> [f64; 2] {
-        self.written
+        self.last_current
     }
 
     /// Mean voltages of the strain gauges at rest \[V\].
@@ -321,7 +321,7 @@ impl Guard {
             bends[j] = -(reading.analog[j] - self.bias[j]) * s.strain_scale[j];
             if bends[j].abs() > s.deflection_limit[j] {
                 let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
-                self.fail(Fault::Deflection { stage: j + 1, degrees, limit });
+                self.fail(Fault::Deflection { joint: j + 1, degrees, limit });
             }
             self.check_encoder(j, reading.counts[j]);
             self.check_gauge(j, reading.analog[j]);
@@ -344,11 +344,11 @@ impl Guard {
     pub fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
         for (j, value) in current.iter().enumerate() {
             if !value.is_finite() {
-                self.fail(Fault::Command { stage: j + 1, value: *value });
+                self.fail(Fault::Command { joint: j + 1, value: *value });
             }
         }
         if self.fault.is_some() {
-            self.written = [0.0; 2];
+            self.last_current = [0.0; 2];
             return [0.0; 2];
         }
         let s = &self.settings;
@@ -358,14 +358,15 @@ impl Guard {
             let change = s.slew[j] * s.step;
             let slewed = current[j]
                 .clamp(-s.current_limit[j], s.current_limit[j])
-                .clamp(self.written[j] - change, self.written[j] + change);
+                .clamp(self.last_current[j] - change, self.last_current[j] + change);
             // Largest current that keeps the mean square within the continuous limit.
-            let room = self.heat[j] + (s.continuous[j] * s.continuous[j] - self.heat[j]) / share;
+            let room =
+                self.mean_square_current[j] + (s.continuous[j] * s.continuous[j] - self.mean_square_current[j]) / share;
             let bearable = room.max(0.0).sqrt().min(s.current_limit[j]);
-            let written = slewed.clamp(-bearable, bearable);
-            self.heat[j] += share * (written * written - self.heat[j]);
-            self.written[j] = written;
-            volts[j] = 0.0 - written / s.command_scale;
+            let last_current = slewed.clamp(-bearable, bearable);
+            self.mean_square_current[j] += share * (last_current * last_current - self.mean_square_current[j]);
+            self.last_current[j] = last_current;
+            volts[j] = 0.0 - last_current / s.command_scale;
         }
         volts
     }
@@ -379,11 +380,11 @@ impl Guard {
         for j in 0..2 {
             let volts = reading.analog[j];
             if volts.is_nan() || volts.abs() >= self.settings.saturation {
-                self.fail(Fault::Saturated { stage: j + 1, volts });
+                self.fail(Fault::Saturated { joint: j + 1, volts });
             }
             let volts = reading.analog[2 + j];
             if !volts.is_finite() {
-                self.fail(Fault::Sense { stage: j + 1, volts });
+                self.fail(Fault::Sense { joint: j + 1, volts });
             }
         }
     }
@@ -393,18 +394,18 @@ impl Guard {
         let change = i64::from(counts) - i64::from(previous[j]);
         let s = &self.settings;
         #[allow(clippy::cast_precision_loss)]
-        let far = (change.abs() as f64) * s.encoder_scale[j] > s.fastest * s.step + 2.0 * s.encoder_scale[j];
-        if far {
-            self.fail(Fault::EncoderJump { stage: j + 1, counts: change });
+        let exceeds_speed = (change.abs() as f64) * s.encoder_scale[j] > s.fastest * s.step + 2.0 * s.encoder_scale[j];
+        if exceeds_speed {
+            self.fail(Fault::EncoderJump { joint: j + 1, counts: change });
         }
         let s = &self.settings;
         if change != 0 {
-            self.still[j] = 0.0;
-        } else if self.written[j].abs() >= s.moving_current {
-            self.still[j] += s.step;
-            if self.still[j] > s.standstill {
-                let (seconds, current) = (self.still[j], s.moving_current);
-                self.fail(Fault::DeadEncoder { stage: j + 1, seconds, current });
+            self.unchanged_time[j] = 0.0;
+        } else if self.last_current[j].abs() >= s.moving_current {
+            self.unchanged_time[j] += s.step;
+            if self.unchanged_time[j] > s.standstill {
+                let (seconds, current) = (self.unchanged_time[j], s.moving_current);
+                self.fail(Fault::DeadEncoder { joint: j + 1, seconds, current });
             }
         }
     }
@@ -415,12 +416,12 @@ impl Guard {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
         if gauge.volts != volts {
-            *gauge = Gauge { volts, written: self.written[j], still: 0.0 };
-        } else if (self.written[j] - gauge.written).abs() >= s.moving_current {
-            gauge.still += s.step;
-            if gauge.still > s.standstill {
-                let (seconds, current) = (gauge.still, s.moving_current);
-                self.fail(Fault::DeadGauge { stage: j + 1, volts, seconds, current });
+            *gauge = Gauge { volts, last_current: self.last_current[j], unchanged_time: 0.0 };
+        } else if (self.last_current[j] - gauge.last_current).abs() >= s.moving_current {
+            gauge.unchanged_time += s.step;
+            if gauge.unchanged_time > s.standstill {
+                let (seconds, current) = (gauge.unchanged_time, s.moving_current);
+                self.fail(Fault::DeadGauge { joint: j + 1, volts, seconds, current });
             }
         }
     }
@@ -441,13 +442,13 @@ impl Guard {
     }
 }
 
-/// Monitor of one strain gauge: its last voltage, and the motor current when this voltage was first read. `still` is
-/// the time \[s\] for which the voltage has not changed although the current has.
+/// Monitor of one strain gauge: its last voltage, and the motor current when this voltage was first read.
+/// `unchanged_time` is the time \[s\] for which the voltage has not changed although the current has.
 #[derive(Debug, Clone, Copy, Default)]
 struct Gauge {
     volts: f64,
-    written: f64,
-    still: f64,
+    last_current: f64,
+    unchanged_time: f64,
 }
 
 /// Second-order low-pass filter, discretized by the bilinear transform.

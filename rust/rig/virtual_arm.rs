@@ -40,14 +40,14 @@ pub enum Injection {
     /// Encoder that stops counting.
     DeadEncoder {
         /// Index of the joint, from 0.
-        stage: usize,
+        joint: usize,
         /// Index of the first sample with the fault.
         from: u64,
     },
     /// Strain gauge whose amplifier is saturated, so that its voltage stays at the limit of the converter.
     SaturatedGauge {
         /// Index of the joint, from 0.
-        stage: usize,
+        joint: usize,
         /// Index of the first sample with the fault.
         from: u64,
     },
@@ -61,7 +61,7 @@ pub enum Injection {
     /// Deflection increased by a constant angle.
     Deflection {
         /// Index of the joint, from 0.
-        stage: usize,
+        joint: usize,
         /// Index of the first sample with the fault.
         from: u64,
         /// Angle that is added to the deflection \[rad\].
@@ -128,10 +128,10 @@ impl Plant {
             Err(outside(name, index as f64, &format!("[0, {count})")))
         };
         match injection {
-            Injection::DeadEncoder { stage, .. } | Injection::SaturatedGauge { stage, .. } => place("stage", stage, 2)?,
+            Injection::DeadEncoder { joint, .. } | Injection::SaturatedGauge { joint, .. } => place("joint", joint, 2)?,
             Injection::LimitSwitch { line, .. } => place("line", line, 4)?,
-            Injection::Deflection { stage, angle, .. } => {
-                place("stage", stage, 2)?;
+            Injection::Deflection { joint, angle, .. } => {
+                place("joint", joint, 2)?;
                 check_finite("injected deflection", &[angle])?;
             }
             Injection::Late { seconds, .. } => check_finite("injected delay", &[seconds])?,
@@ -158,9 +158,9 @@ impl Plant {
         let mut rail = [false; 2];
         for injection in &self.injections {
             match *injection {
-                Injection::SaturatedGauge { stage, from } => rail[stage] |= self.sample >= from,
+                Injection::SaturatedGauge { joint, from } => rail[joint] |= self.sample >= from,
                 Injection::LimitSwitch { line, from } if self.sample >= from => switches[line] = 0,
-                Injection::Deflection { stage, from, angle } if self.sample >= from => bend[stage] += angle,
+                Injection::Deflection { joint, from, angle } if self.sample >= from => bend[joint] += angle,
                 _ => {}
             }
         }
@@ -179,10 +179,10 @@ impl Plant {
         #[allow(clippy::cast_possible_truncation)]
         let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
         for injection in &self.injections {
-            if let Injection::DeadEncoder { stage, from } = *injection
+            if let Injection::DeadEncoder { joint, from } = *injection
                 && self.sample >= from
             {
-                counts[stage] = *self.frozen[stage].get_or_insert(counts[stage]);
+                counts[joint] = *self.frozen[joint].get_or_insert(counts[joint]);
             }
         }
         Reading { analog, counts, switches }
@@ -197,11 +197,11 @@ impl Plant {
     /// Delay that is injected into the control loop at the current sample \[s\].
     #[must_use]
     pub fn delay(&self) -> f64 {
-        let late = |i: &Injection| match *i {
+        let injected_delay = |i: &Injection| match *i {
             Injection::Late { at, seconds } if at == self.sample => seconds,
             _ => 0.0,
         };
-        self.injections.iter().map(late).sum()
+        self.injections.iter().map(injected_delay).sum()
     }
 
     /// Advance by one sample with these voltages at the amplifiers \[V\]. Disabled amplifiers supply no current.

@@ -568,14 +568,14 @@ impl<'a> Solver<'a> {
     /// [`Error::Length`] for a wrong number of series, or for series of unequal length or of more than m terms.
     pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         check_length("right-hand sides", self.matrix.len(), rhs.len())?;
-        let asked = rhs.first().map_or(0, Vec::len).min(self.division.terms());
+        let terms = rhs.first().map_or(0, Vec::len).min(self.division.terms());
         for b in rhs {
-            check_length("right-hand side", asked, b.len())?;
+            check_length("right-hand side", terms, b.len())?;
         }
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         self.division.restart();
-        self.division.run_to(asked, &self.matrix, &self.inverse, &borrowed);
-        Ok(self.division.quotients().iter().map(|quotient| quotient[..asked].to_vec()).collect())
+        self.division.run_to(terms, &self.matrix, &self.inverse, &borrowed);
+        Ok(self.division.quotients().iter().map(|quotient| quotient[..terms].to_vec()).collect())
     }
 
     /// Return the series of the inverse A⁻¹ of the matrix. Element `[j][i]` is the response of unknown j to a unit

@@ -113,20 +113,20 @@ impl Kernel {
 
     /// Return the spectrum as [`Kernel::new`] does, with buffers of the caller.
     #[must_use]
-    pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
+    pub(crate) fn with_buffers(series: &[f64], buffers: &mut Buffers) -> Self {
         Self::from_plan(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
     }
 
     /// Return the spectrum of a series, computed by the transform `plan`.
     fn from_plan(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        let mut made = Self { plan, spectrum };
-        made.read(series.iter().copied(), buffers);
-        made
+        let mut kernel = Self { plan, spectrum };
+        kernel.read(series.iter().copied(), buffers);
+        kernel
     }
 
     /// Return the spectrum of a zero series of `m` terms.
-    pub(crate) fn noughts(m: usize) -> Self {
+    pub(crate) fn zeros(m: usize) -> Self {
         let plan = fft::plan(fft::fast_length(2 * m));
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         Self { plan, spectrum }

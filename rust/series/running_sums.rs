@@ -146,20 +146,20 @@ impl RunningSumSystem {
             .collect();
         let mut out = vec![vec![0.0; m]; lists.len()];
         let mut states = [[0.0; RIGHT_SIDE_LANES]; L];
-        let mut drive = vec![[[0.0; RIGHT_SIDE_LANES]; L]; CHUNK_TERMS.min(m)];
+        let mut inputs = vec![[[0.0; RIGHT_SIDE_LANES]; L]; CHUNK_TERMS.min(m)];
         let mut answer = vec![[0.0; RIGHT_SIDE_LANES]; CHUNK_TERMS.min(m)];
         for start in (0..m).step_by(CHUNK_TERMS) {
             let length = CHUNK_TERMS.min(m - start);
-            drive[..length].fill([[0.0; RIGHT_SIDE_LANES]; L]);
+            inputs[..length].fill([[0.0; RIGHT_SIDE_LANES]; L]);
             for (lane, sources) in driven.iter().enumerate() {
                 for (weights, series) in sources {
-                    for (given, value) in drive.iter_mut().zip(&series[start..start + length]) {
-                        given.iter_mut().zip(weights).for_each(|(sum, w)| sum[lane] += w * value);
+                    for (input, value) in inputs.iter_mut().zip(&series[start..start + length]) {
+                        input.iter_mut().zip(weights).for_each(|(sum, w)| sum[lane] += w * value);
                     }
                 }
             }
-            let (drive, answer) = (&drive[..length], &mut answer[..length]);
-            dispatch_simd(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
+            let (inputs, answer) = (&inputs[..length], &mut answer[..length]);
+            dispatch_simd(Block { own: &own, inverse: self.inverse[0], states: &mut states, inputs, answer });
             for (lane, series) in out.iter_mut().enumerate() {
                 series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
             }
@@ -176,20 +176,20 @@ impl RunningSumSystem {
     fn solve_coupled(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
         let (n, stride) = (self.n, self.sums + 1);
         // Inputs of each sum, term by term, then equation by equation.
-        let mut drive = vec![0.0; m * n * stride];
+        let mut inputs = vec![0.0; m * n * stride];
         for source in sources {
             let weights = self.weights(source);
-            for (row, &value) in drive.chunks_exact_mut(n * stride).zip(source.series) {
+            for (row, &value) in inputs.chunks_exact_mut(n * stride).zip(source.series) {
                 let part = &mut row[source.equation * stride..][..weights.len()];
                 part.iter_mut().zip(&weights).for_each(|(sum, w)| *sum += w * value);
             }
         }
         let mut out: Vec<Vec<f64>> = (0..n).map(|_| Vec::with_capacity(m)).collect();
         let (mut sums, mut open, mut y) = (vec![0.0; n * stride], vec![0.0; n], vec![0.0; n]);
-        for given in drive.chunks_exact(n * stride) {
+        for input in inputs.chunks_exact(n * stride) {
             for (i, sum) in open.iter_mut().enumerate() {
                 let at = i * stride;
-                *sum = given[at] + (1..stride).map(|l| given[at + l] + sums[at + l]).sum::<f64>();
+                *sum = input[at] + (1..stride).map(|l| input[at + l] + sums[at + l]).sum::<f64>();
             }
             for (i, value) in y.iter_mut().enumerate() {
                 *value = (0..n).map(|j| self.inverse[i * n + j] * open[j]).sum();
@@ -200,7 +200,7 @@ impl RunningSumSystem {
                 for l in (1..stride).rev() {
                     let at = i * stride + l;
                     let of_unknowns: f64 = (0..n).map(|j| self.own[at * n + j] * y[j]).sum();
-                    sums[at] += given[at] + of_unknowns + above;
+                    sums[at] += input[at] + of_unknowns + above;
                     above = sums[at];
                 }
             }
@@ -219,7 +219,7 @@ struct Block<'a, const L: usize> {
     /// Values of the running sums, updated in place.
     states: &'a mut [[f64; RIGHT_SIDE_LANES]; L],
     /// Input of each running sum for each right-hand side, by term.
-    drive: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
+    inputs: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
     /// Values of the unknown for each right-hand side, by term.
     answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
@@ -230,11 +230,11 @@ impl<const L: usize> SimdKernel for Block<'_, L> {
     #[inline(always)]
     fn run(self) {
         let mut states = *self.states;
-        for (given, y) in self.drive.iter().zip(self.answer) {
-            let mut open = given[0];
+        for (input, y) in self.inputs.iter().zip(self.answer) {
+            let mut open = input[0];
             for l in 1..L {
                 for w in 0..RIGHT_SIDE_LANES {
-                    open[w] += given[l][w] + states[l][w];
+                    open[w] += input[l][w] + states[l][w];
                 }
             }
             let mut above = [0.0; RIGHT_SIDE_LANES];
@@ -243,7 +243,7 @@ impl<const L: usize> SimdKernel for Block<'_, L> {
             }
             for l in (1..L).rev() {
                 for w in 0..RIGHT_SIDE_LANES {
-                    states[l][w] += given[l][w] + self.own[l] * y[w] + above[w];
+                    states[l][w] += input[l][w] + self.own[l] * y[w] + above[w];
                 }
                 above = states[l];
             }

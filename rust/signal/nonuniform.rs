@@ -194,8 +194,8 @@ impl<'a> NonuniformSignal<'a> {
 pub(crate) fn check_times(times: &[f64]) -> Result<()> {
     check_length("sample times", times.len().max(1), times.len())?;
     check_finite("sample times", times)?;
-    let falls = times.windows(2).position(|pair| pair[0] > pair[1]).map(|k| k + 1);
-    match falls.or((times[0] < 0.0).then_some(0)) {
+    let first_decrease = times.windows(2).position(|pair| pair[0] > pair[1]).map(|k| k + 1);
+    match first_decrease.or((times[0] < 0.0).then_some(0)) {
         None => Ok(()),
         Some(row) => Err(Error::Structure {
             what: format!("sample time {row} is {} s", times[row]),

@@ -85,14 +85,14 @@ pub fn robust_deviation(values: &[f64]) -> f64 {
 /// missing samples.
 #[must_use]
 pub fn white_noise_deviation(samples: &[f64]) -> f64 {
-    let bends = |samples: &[f64]| -> Vec<f64> {
+    let second_differences = |samples: &[f64]| -> Vec<f64> {
         let second = samples.windows(3).map(|w| (w[2] - w[1]) - (w[1] - w[0]));
-        second.filter(|bend| !bend.is_nan()).collect()
+        second.filter(|difference| !difference.is_nan()).collect()
     };
-    let mut differences = bends(samples);
+    let mut differences = second_differences(samples);
     if differences.is_empty() {
         // No three neighboring samples are present. The samples that are present then count as neighbors.
-        differences = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
+        differences = second_differences(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
     }
     robust_deviation(&differences) / 6.0_f64.sqrt()
 }
@@ -224,8 +224,8 @@ pub fn is_white(series: &[f64], lags: usize) -> bool {
 /// The error is at most 0.3 % from five degrees of freedom on, and at most 1 % from one degree on.
 #[must_use]
 pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
-    let spread = 2.0 / (9.0 * degrees);
-    degrees * libm::pow(1.0 - spread + quantile * spread.sqrt(), 3.0)
+    let scaled_variance = 2.0 / (9.0 * degrees);
+    degrees * libm::pow(1.0 - scaled_variance + quantile * scaled_variance.sqrt(), 3.0)
 }
 
 /// Minimum number of samples in the shortest run per coefficient of an autoregression.
@@ -270,8 +270,8 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
         let reflection =
             -current.iter().zip(covariance[1..=order].iter().rev()).map(|(a, c)| a * c).sum::<f64>() / power;
         current.push(0.0);
-        let turned: Vec<f64> = current.iter().rev().copied().collect();
-        current.iter_mut().zip(turned).for_each(|(a, b)| *a += reflection * b);
+        let reversed: Vec<f64> = current.iter().rev().copied().collect();
+        current.iter_mut().zip(reversed).for_each(|(a, b)| *a += reflection * b);
         power *= 1.0 - reflection * reflection;
         if power.is_nan() || power <= 0.0 {
             break;
@@ -329,8 +329,8 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
             (forward[t], backward[t]) = (one + reflection * other, other + reflection * one);
         }
         current.push(0.0);
-        let turned: Vec<f64> = current.iter().rev().copied().collect();
-        current.iter_mut().zip(turned).for_each(|(a, b)| *a += reflection * b);
+        let reversed: Vec<f64> = current.iter().rev().copied().collect();
+        current.iter_mut().zip(reversed).for_each(|(a, b)| *a += reflection * b);
         let criterion = count * libm::log(power) + libm::log(count) * order as f64;
         if criterion < least {
             (least, remaining) = (criterion, power);

@@ -46,7 +46,7 @@ def main():
     job = make_job(given, structure, lattice, settings, m=32, threads=1)
     with Store(folder / "half.ftlm", [job.request("y")]) as store:
         work = job.equation_problem()
-        part = work.build_evaluator().rounds(0, 1, [], None, 1, None, None)
+        part = work.build_evaluator().evaluate_batches(0, 1, [], None, 1, None, None)
         store.append_block(Rounds(0, 0, 1, part))
         # A stretch that has only begun.
         store.save(0, 1, 2, ((1, 0, 0, 0, float("inf")), ((), (0,) * 7, ())))

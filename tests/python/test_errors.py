@@ -543,7 +543,7 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
                 "iterations": 0,
                 "memory": 1 << 31,
             },
-        ).rounds(0, signal, [(output, coefficient)], None, 1, None, None),
+        ).evaluate_batches(0, signal, [(output, coefficient)], None, 1, None, None),
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),
         lambda: _core.fractional_derivative(means, order, step, "caputo", means),

@@ -147,7 +147,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
         parts, seed, first = [], [], 0
         waves = []
         for last in cuts:
-            waves.append(ready.rounds(first, last, seed, None, threads, None, None))
+            waves.append(ready.evaluate_batches(first, last, seed, None, threads, None, None))
             if last in ends:
                 parts += waves[::-1]
                 waves = []
@@ -606,7 +606,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
     """What a forger would write: whole frames, under digests that are right."""
     job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.OrderGrid(orders=STAGE), m=64, top=8)
     work = job.coupled_problem()
-    wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_course=True).pending_spans())
+    wave = sum(last - first for _, first, last, _ in work.build_evaluator(keeps_state=True).pending_spans())
     for number, (first, last, kind, message) in enumerate(
         [
             (0, wave + 1, 0, "are divided into other blocks"),
@@ -911,18 +911,18 @@ def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
         (0, 1, ((0, 0, 0, 0, 1.0, 0), False, (((1 << 60, 1.0, (1.0, 2.0, 3.0), ((),)),), counts, ()))),
     ):
         with pytest.raises(ftlm.ModelError, match="start the search again"):
-            ready.rounds(first, last, [], start, 1, None, None)
-    part = ready.rounds(0, 1, [], None, 1, None, None)
+            ready.evaluate_batches(first, last, [], start, 1, None, None)
+    part = ready.evaluate_batches(0, 1, [], None, 1, None, None)
     # One that lies in a round of another visiting order is left for the start of its stretch.
-    assert ready.rounds(0, 1, [], ((0, 0, 5000, 256, 1.0, 0), False, ((), counts, ())), 1, None, None) == part
+    assert ready.evaluate_batches(0, 1, [], ((0, 0, 5000, 256, 1.0, 0), False, ((), counts, ())), 1, None, None) == part
     for parts in ([], [part], [part] * 5, [(((1 << 40, *row[1:]),), counts, ())], [((), (19_295, *counts[1:]), ())]):
         with pytest.raises(ftlm.ModelError, match="start the search again"):
             work.join(parts)
     with pytest.raises(ftlm.ModelError, match="threads"):
-        ready.rounds(0, 1, [], None, 0, None, None)
+        ready.evaluate_batches(0, 1, [], None, 0, None, None)
     assert isinstance(ready, _core.OrderSearch)
     with ThreadPoolExecutor(2) as pool:
-        again = list(pool.map(lambda _: ready.rounds(0, 1, [], None, 1, None, None), range(4)))
+        again = list(pool.map(lambda _: ready.evaluate_batches(0, 1, [], None, 1, None, None), range(4)))
     assert all(a == part for a in again)
     assert np.isfinite(part[0][0][1])
 

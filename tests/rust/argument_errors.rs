@@ -361,9 +361,9 @@ fn an_arm_that_would_never_end() {
         refused(Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), bad));
     }
     let mut plant = Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), sensors()).unwrap();
-    refused(plant.inject(Injection::DeadEncoder { stage: 2, from: 0 }));
+    refused(plant.inject(Injection::DeadEncoder { joint: 2, from: 0 }));
     refused(plant.inject(Injection::LimitSwitch { line: 4, from: 0 }));
-    refused(plant.inject(Injection::Deflection { stage: 0, from: 0, angle: f64::NAN }));
+    refused(plant.inject(Injection::Deflection { joint: 0, from: 0, angle: f64::NAN }));
     refused(plant.inject(Injection::Late { at: 0, seconds: f64::NAN }));
     for step in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e300] {
         refused(Pace::new(step));

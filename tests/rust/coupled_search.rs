@@ -11,7 +11,7 @@ use ftlm::order_search::control::Control;
 use ftlm::order_search::grid::{LawEquation, OrderLawGrid, MAX_TUPLES};
 use ftlm::order_search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::order_search::result::Failure;
-use ftlm::order_search::stage_join::{search, Span, Stage, StageOutcome};
+use ftlm::order_search::stage_join::{search, CoupledSearch, Span, StageOutcome};
 use ftlm::regressors::Record;
 use ftlm::simulate::{equation_error, respond};
 
@@ -371,7 +371,7 @@ fn candidates_may_be_followed_in_any_pieces_and_order() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
     let make = || {
         let lattice = std::borrow::Cow::Borrowed(&lattice);
-        Stage::new(&records, lattice, &free(), &scales(&records), &options, &pool, &control).unwrap()
+        CoupledSearch::new(&records, lattice, &free(), &scales(&records), &options, &pool, &control).unwrap()
     };
     let ((stage, mut course), (elsewhere, _)) = (make(), make());
     let (mut waves, mut followed) = (0, 0);

@@ -96,17 +96,17 @@ fn from_one(m: usize) -> (Equation, ftlm::regressors::Record) {
 #[test]
 fn an_offset_is_one_more_power_of_time_under_every_kind_of_initial_terms() {
     let plant = structure(0, 0.8, &[(0, 0.3), (2, 0.0)]);
-    for (under, before) in
+    for (base, before) in
         [(Initial::Rest, vec![]), (Initial::Caputo, vec![0.0, 0.5]), (Initial::Powers(vec![0.0, 0.8]), vec![0.0, 0.8])]
     {
-        assert_eq!(plant.initial_exponents(&under.clone().with_offset(0).unwrap()), before);
+        assert_eq!(plant.initial_exponents(&base.clone().with_offset(0).unwrap()), before);
         for (offset, more) in [(1, vec![0.8]), (2, vec![0.8, 1.8])] {
             let mut expected = [before.clone(), more].concat();
             expected.sort_by(f64::total_cmp);
             expected.dedup();
-            let initial = under.clone().with_offset(offset).unwrap();
+            let initial = base.clone().with_offset(offset).unwrap();
             assert_eq!(plant.initial_exponents(&initial), expected);
-            assert_eq!((initial.under(), initial.is_at_rest()), (&under, under == Initial::Rest));
+            assert_eq!((initial.base(), initial.is_at_rest()), (&base, base == Initial::Rest));
         }
     }
     // A level is added to the output, so the equation has no term for it.

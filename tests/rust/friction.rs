@@ -128,7 +128,7 @@ fn slopes_of_a_pulse_are_those_of_differences() {
             let (up, down) = (near(1e-6), near(-1e-6));
             assert_eq!((up.phase, down.phase), (at.phase, at.phase));
             let moves =
-                PulseDerivatives { start: unit[0], free: unit[1], first: unit[2], law: [unit[3], unit[4], unit[5]] };
+                PulseDerivatives { start: unit[0], free: unit[1], gain: unit[2], law: [unit[3], unit[4], unit[5]] };
             let (force, end) = law.slope(v, p, g, &at, &moves);
             assert!((force - (up.force - down.force) / 2e-6).abs() < 1e-6 * (1.0 + force.abs()), "{v} {p} {moved}");
             assert!((end - (up.end - down.end) / 2e-6).abs() < 1e-6 * (1.0 + end.abs()), "{v} {p} {moved}");

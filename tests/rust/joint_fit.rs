@@ -271,7 +271,7 @@ fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
         Err(Error::Length { .. })
     ));
     assert!(problem.point(&[1.0]).is_err());
-    assert_eq!(source.spans(), [(0.02, 8.0)]);
+    assert_eq!(source.intervals_and_durations(), [(0.02, 8.0)]);
     stop.set();
     assert!(matches!(fit_reweighted(&start, grid, Loss::Squares).map(|_| ()), Err(Error::Interrupted)));
 }

@@ -112,7 +112,7 @@ fn few_evaluations_and_bad_columns_are_said() {
     let short = Closed { residuals: |_: &[f64]| Ok(vec![1.0, 2.0]), jacobian: |_: &[f64]| vec![vec![1.0]] };
     assert!(matches!(minimize(&short, vec![0.0], settings(3)), Err(Error::Length { .. })));
     let nowhere = Closed {
-        residuals: |_: &[f64]| Err(Error::Diverged { what: "free run".into(), index: 3 }),
+        residuals: |_: &[f64]| Err(Error::Diverged { what: "simulation".into(), index: 3 }),
         jacobian: |_: &[f64]| Vec::new(),
     };
     assert!(matches!(minimize(&nowhere, vec![0.0], settings(3)), Err(Error::Diverged { .. })));
@@ -131,7 +131,7 @@ impl LeastSquaresProblem for Boxed {
 
     fn evaluate(&self, x: &[f64; 2]) -> Result<Vec<f64>> {
         if x[0] > self.wall {
-            return Err(Error::Diverged { what: "free run".into(), index: 0 });
+            return Err(Error::Diverged { what: "simulation".into(), index: 0 });
         }
         // With a corner at 2 the way back is as steep as the way on.
         let turned = if self.corner && x[0] > 2.0 { 4.0 - x[0] } else { x[0] };

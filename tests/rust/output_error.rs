@@ -740,7 +740,7 @@ fn a_filter_that_all_outputs_pass_may_come_first() {
     for (name, coupled, initial) in [
         ("coupled", true, Initial::Caputo),
         ("measured coupling", false, Initial::Caputo),
-        ("with impulses", false, Initial::Filtered { under: Box::new(Initial::Powers(vec![0.0])), states: 1 }),
+        ("with impulses", false, Initial::Filtered { base: Box::new(Initial::Powers(vec![0.0])), states: 1 }),
         ("from rest", true, Initial::Rest),
     ] {
         let runs: Vec<Experiment> = [(150, 420), (131, 421)]

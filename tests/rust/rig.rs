@@ -63,7 +63,7 @@ fn a_command_that_is_not_finite_latches_zero() {
         let mut guard = Guard::new(settings()).unwrap();
         assert_ne!(guard.command([0.05, 0.05]), [0.0; 2]);
         assert_eq!(guard.command([0.05, bad]), [0.0; 2]);
-        assert!(matches!(guard.fault(), Some(Fault::Command { stage: 2, .. })));
+        assert!(matches!(guard.fault(), Some(Fault::Command { joint: 2, .. })));
         assert_eq!(guard.command([0.05, 0.05]), [0.0; 2]);
     }
 }
@@ -78,7 +78,7 @@ fn the_first_fault_stays() {
     guard.read(&reading, 0.0);
     reading.switches[2] = 0;
     guard.read(&reading, 0.0);
-    assert!(matches!(guard.fault(), Some(Fault::Saturated { stage: 1, .. })));
+    assert!(matches!(guard.fault(), Some(Fault::Saturated { joint: 1, .. })));
 }
 
 #[test]

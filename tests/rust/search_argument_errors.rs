@@ -10,7 +10,7 @@ use ftlm::order_search::control::{BatchPosition, Checkpoint, Control};
 use ftlm::order_search::grid::{LawEquation, OrderGrid, OrderLawGrid, TermAxis};
 use ftlm::order_search::options::{Estimator, Options};
 use ftlm::order_search::result::{Counts, Failure, Part, Row, Verdict};
-use ftlm::order_search::stage_join::{self, Span, Stage};
+use ftlm::order_search::stage_join::{self, CoupledSearch, Span};
 use ftlm::parallel::{pool, MAX_THREADS};
 use ftlm::regressors::{Bank, Index, Key, Record};
 use ftlm::signal::block_pulse::PulseMeans;
@@ -186,7 +186,7 @@ fn stages_refuse_scales_spans_and_verdicts_that_are_not_theirs() {
     let (options, control, pool) = (Options::default(), Control::default(), pool(1).unwrap());
     let lattice = |values: &[f64]| OrderLawGrid::new(&[values.to_vec()], &[one_law()], &[false, true]).unwrap();
     let made = |lattice: OrderLawGrid, scale: f64| {
-        Stage::new(&[data()], Cow::Owned(lattice), &[vec![None; 2]], &[scale], &options, &pool, &control)
+        CoupledSearch::new(&[data()], Cow::Owned(lattice), &[vec![None; 2]], &[scale], &options, &pool, &control)
     };
     for scale in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         assert!(matches!(made(lattice(&[1.0]), scale).err(), Some(Error::OutOfRange { .. })));

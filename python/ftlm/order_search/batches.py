@@ -167,12 +167,12 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
         """Run the whole search in this process, and return its result table."""
         return _core.search_stage(*self.core(progress))
 
-    def build_evaluator(self, *, keeps_course: bool = False) -> _core.StageSearch:
+    def build_evaluator(self, *, keeps_state: bool = False) -> _core.StageSearch:
         """Return an object of the Rust core that evaluates candidates.
 
-        With `keeps_course` it also stores the search state and collects the results.
+        With `keeps_state` it also stores the search state and collects the results.
         """
-        return _core.StageSearch(*self.core(keeps_course))
+        return _core.StageSearch(*self.core(keeps_state))
 
 
 _cached_searches: OrderedDict[str, _core.OrderSearch | _core.StageSearch] = OrderedDict()
@@ -205,7 +205,7 @@ def evaluate_rounds(
     that `key` identifies.
     """
     return _run_cached(
-        key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None))
+        key, work, lambda search: cast("Part", search.evaluate_batches(first, last, seed, start, threads, None, None))
     )
 
 
@@ -217,7 +217,7 @@ def evaluate_candidates(
     `spans` are blocks of candidates: (equation, first, exclusive end, limit of the score). Return (computing time [s],
     outcomes). Return None if `work` is None and the worker has not cached the search that `key` identifies.
     """
-    return _run_cached(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
+    return _run_cached(key, work, lambda search: cast("Outcomes", search.evaluate_spans(spans, threads, None)))
 
 
 def _run_cached(key: str, work: SearchProblem[Any] | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
@@ -480,7 +480,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
             first, last = block.first, block.last
             listener = None if progress is None else partial(self._report_progress, progress, self.done)
             saved = None if save is None else partial(save, first, last)
-            part = self._search.rounds(first, last, self._seed, block.start, self.threads, listener, saved)
+            part = self._search.evaluate_batches(first, last, self._seed, block.start, self.threads, listener, saved)
             yield block, cast("Part", part)
 
     def _report_progress(
@@ -521,7 +521,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
 
     def __init__(self, work: CoupledProblem) -> None:
         super().__init__(work, Throughput(min_count=MIN_BLOCK_CANDIDATES))
-        self.search = work.build_evaluator(keeps_course=True)
+        self.search = work.build_evaluator(keeps_state=True)
         self._first = 0
         self._spans: list[Span] = []
         self._wave: list[Verdicts] = []
@@ -533,7 +533,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
             self._spans, self._wave = spans, []
             self.total, _ = self.search.state()
             yield self._first, end
-            self.search.take(*_join_verdicts(self._wave, self._first, end), self.threads)
+            self.search.record_outcomes(*_join_verdicts(self._wave, self._first, end), self.threads)
             self._first = end
         self.total = self._first
 
@@ -546,7 +546,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
             while at < block.last:
                 piece = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
                 began = time.monotonic()
-                outcomes = self.search.follow(self._cut(piece), self.threads, None)
+                outcomes = self.search.evaluate_spans(self._cut(piece), self.threads, None)
                 self.throughput.update(time.monotonic() - began, piece.last - piece.first)
                 yield piece, outcomes
                 at = piece.last

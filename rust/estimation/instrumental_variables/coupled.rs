@@ -261,7 +261,7 @@ impl CoupledProblem<'_> {
         }
         let mut covariances = Vec::new();
         if with_covariance {
-            let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
+            let (mut score_covariance, inverse) = (vec![0.0; k * k], solved.inverse());
             for (((phi, target), run_instruments), record) in parts.iter().zip(&instruments).zip(self.records) {
                 let RecordInstruments { columns: psi, unknown_indices: places } = run_instruments;
                 let mut rest = target.clone();
@@ -273,9 +273,10 @@ impl CoupledProblem<'_> {
                     .iter()
                     .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * rest[j * m + t]).sum()).collect())
                     .collect();
-                add_long_run_covariance(&scores, places, &mut meat, k);
+                add_long_run_covariance(&scores, places, &mut score_covariance, k);
             }
-            let half = |i: usize, j: usize| -> f64 { (0..k).map(|b| meat[i * k + b] * inverse[j * k + b]).sum() };
+            let half =
+                |i: usize, j: usize| -> f64 { (0..k).map(|b| score_covariance[i * k + b] * inverse[j * k + b]).sum() };
             for i in 0..n {
                 let own: Vec<usize> = (0..k)
                     .filter(|&a| matches!(unknowns[a], FreeCoefficient::Term(equation, _) if equation == i))

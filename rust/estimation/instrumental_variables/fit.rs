@@ -123,7 +123,7 @@ pub fn fit(
     let mut refined: Vec<&[Solution]> = Vec::new();
     for (start, ended) in ends.iter().filter(|_| structures.len() > 1) {
         // Most initial guesses end at the same estimates, which have one refinement.
-        if refined.iter().any(|earlier| problem.agree(earlier, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
+        if refined.iter().any(|earlier| problem.has_converged_to(earlier, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
             continue;
         }
         refined.push(&ended.solutions);
@@ -207,12 +207,12 @@ impl<'a> CoupledProblem<'a> {
         let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<EquationSpectra<'a>> {
             records.iter().map(|record| EquationSpectra::new(record, structure, exponents)).collect()
         };
-        let shelves: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
-        let substituted = |shelves: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
-            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.substitute_spectra(clean, |_| true)).collect()
+        let spectra: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
+        let substituted = |spectra: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
+            spectra.iter().zip(clean).map(|(spectra, clean)| spectra.substitute_spectra(clean, |_| true)).collect()
         };
-        let substitutes = shelves.iter().map(substituted).collect();
-        Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra: shelves, substitutes })
+        let substitutes = spectra.iter().map(substituted).collect();
+        Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra, substitutes })
     }
 
     /// Return the two-stage least-squares estimate of every equation: one step with noise-free signals as instruments.
@@ -225,7 +225,7 @@ impl<'a> CoupledProblem<'a> {
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
             let pairs = self.spectra[i].iter().zip(&self.substitutes[i]);
             let sources: Vec<InstrumentSource<'_>> =
-                pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
+                pairs.map(|(spectra, clean)| spectra.source(|k| clean[k].as_ref())).collect();
             let filter = |r: &Record| {
                 state_variable_filter(ratio * power_frequency(r.signal(structure.output), r.step()), structure.order, r)
             };
@@ -267,13 +267,13 @@ impl<'a> CoupledProblem<'a> {
                 return Ok(RefinementResult { error, solutions, covariances, iterations, converged, damped });
             }
             iterations += 1;
-            converged = self.agree(&solutions, &next, settings.tolerance);
+            converged = self.has_converged_to(&solutions, &next, settings.tolerance);
             solutions = next;
         }
     }
 
     /// Return true if the term coefficients of two solutions agree within a relative tolerance.
-    fn agree(&self, before: &[Solution], after: &[Solution], tolerance: f64) -> bool {
+    fn has_converged_to(&self, before: &[Solution], after: &[Solution], tolerance: f64) -> bool {
         let mut pairs = before.iter().zip(after).zip(self.structures);
         pairs.all(|((a, b), s)| has_converged(a, b, s.terms.len(), tolerance))
     }
@@ -328,7 +328,7 @@ impl<'a> CoupledProblem<'a> {
             let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
             let pairs = self.spectra[i].iter().zip(&simulated);
             let kernels: Vec<Vec<Option<Kernel>>> =
-                pairs.map(|(shelf, record)| shelf.substitute_spectra(record, driven)).collect();
+                pairs.map(|(spectra, record)| spectra.substitute_spectra(record, driven)).collect();
             let terms = &self.structures[i].terms;
             let sources: Vec<InstrumentSource<'_>> = (0..kernels.len())
                 .map(|r| {

@@ -226,7 +226,7 @@ fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: 
                 once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
             let mut resonator: Vec<f64> = resonator.collect();
             resonator[0] += 1.0;
-            let answer = Kernel::made_with(&reciprocal(&resonator), &mut buffers);
+            let answer = Kernel::with_buffers(&reciprocal(&resonator), &mut buffers);
             columns.extend(spectra.each_ref().map(|integral| {
                 let mut column = vec![0.0; m];
                 answer.times(integral, &mut column, &mut buffers);

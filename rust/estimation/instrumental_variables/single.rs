@@ -220,9 +220,14 @@ pub fn step(
     }
     let mut covariance = Vec::new();
     if with_covariance {
-        let mut meat = vec![0.0; k * k];
+        let mut score_covariance = vec![0.0; k * k];
         for (part, instruments) in filtered.iter().zip(&instruments) {
-            add_long_run_covariance(&part.scores(instruments, &x), &instruments.unknown_indices, &mut meat, k);
+            add_long_run_covariance(
+                &part.scores(instruments, &x),
+                &instruments.unknown_indices,
+                &mut score_covariance,
+                k,
+            );
         }
         let (n, inverse) = (free.len(), solved.inverse());
         covariance = vec![0.0; n * n];
@@ -231,7 +236,7 @@ pub fn step(
                 let mut total = 0.0;
                 for i in 0..k {
                     for j in 0..k {
-                        total += inverse[a * k + i] * meat[i * k + j] * inverse[b * k + j];
+                        total += inverse[a * k + i] * score_covariance[i * k + j] * inverse[b * k + j];
                     }
                 }
                 covariance[a * n + b] = total;
@@ -308,9 +313,9 @@ pub fn refine(
             responses.push(response);
         }
         let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
-        let still = has_converged(&solution, &next, fixed.len(), settings.tolerance);
+        let converged = has_converged(&solution, &next, fixed.len(), settings.tolerance);
         solution = next;
-        if still {
+        if converged {
             return Ok((solution, iteration, true));
         }
     }

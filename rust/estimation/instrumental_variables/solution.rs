@@ -215,22 +215,22 @@ fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {
     pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
-/// Add the long-run covariance of the summed scores to the k × k row-major matrix `meat`.
+/// Add the long-run covariance of the summed scores to the k × k row-major matrix `score_covariance`.
 ///
 /// `scores` has one row of samples per instrument, and `places` contains the index of each instrument in the matrix.
 /// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610), because filtered residuals are not white if other
 /// measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
+pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], score_covariance: &mut [f64], k: usize) {
     let m = scores.first().map_or(0, Vec::len);
     let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m.saturating_sub(1));
     for (left, &a) in scores.iter().zip(places) {
         for (right, &b) in scores.iter().zip(places) {
-            meat[a * k + b] += dot(left, right);
+            score_covariance[a * k + b] += dot(left, right);
             for lag in 1..=lags {
                 let weight = 1.0 - lag as f64 / (lags + 1) as f64;
                 let both = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
-                meat[a * k + b] += weight * both;
+                score_covariance[a * k + b] += weight * both;
             }
         }
     }

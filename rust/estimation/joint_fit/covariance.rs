@@ -26,27 +26,36 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 /// rows. [`Error::Structure`] if its singular values are not found.
 pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<Vec<f64>> {
     let series: Vec<Vec<f64>> = grid.residuals(attempt).into_iter().flatten().collect();
-    let shares = grid.weights.robust_weights.is_some().then(|| grid.flat_sample_weights());
-    robust_covariance(&attempt.jacobian, series, shares.as_deref())
+    let robust_weights = grid.weights.robust_weights.is_some().then(|| grid.flat_sample_weights());
+    robust_covariance(&attempt.jacobian, series, robust_weights.as_deref())
 }
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian and residuals.
 ///
 /// `jacobian` has one row per parameter and includes the robust weights. `series` contains the residuals by run and
-/// output, without robust weights. `shares` contains the robust weight of each residual; it is None for a squared loss.
+/// output, without robust weights. `robust_weights` contains the robust weight of each residual; it is None for a
+/// squared loss.
 ///
 /// # Errors
-/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals or `shares` have another
-/// length than its rows. [`Error::Structure`] if its singular values are not found.
-pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: Option<&[f64]>) -> Result<Vec<f64>> {
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals or `robust_weights` have
+/// another length than its rows. [`Error::Structure`] if its singular values are not found.
+pub fn robust_covariance(
+    jacobian: &[Vec<f64>],
+    series: Vec<Vec<f64>>,
+    robust_weights: Option<&[f64]>,
+) -> Result<Vec<f64>> {
     let squares = |series: &[Vec<f64>]| {
         let of = |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
         series.iter().map(of).sum::<f64>()
     };
-    let Some(shares) = shares else { return covariance_of_residuals(jacobian, &series, squares(&series)) };
-    jacobian.iter().try_for_each(|row| check_length("robust weights of residuals", row.len(), shares.len()))?;
-    let whole = |(value, &share): (&f64, &f64)| value / if share > 0.0 { share } else { 1.0 };
-    let rows: Vec<Vec<f64>> = jacobian.iter().map(|row| row.iter().zip(shares).map(whole).collect()).collect();
+    let Some(robust_weights) = robust_weights else {
+        return covariance_of_residuals(jacobian, &series, squares(&series));
+    };
+    jacobian.iter().try_for_each(|row| check_length("robust weights of residuals", row.len(), robust_weights.len()))?;
+    let unweighted =
+        |(value, &robust_weight): (&f64, &f64)| value / if robust_weight > 0.0 { robust_weight } else { 1.0 };
+    let rows: Vec<Vec<f64>> =
+        jacobian.iter().map(|row| row.iter().zip(robust_weights).map(unweighted).collect()).collect();
     let series = huber_pseudo_residuals(series, jacobian.len());
     covariance_of_residuals(&rows, &series, squares(&series))
 }
@@ -116,13 +125,13 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
     let rounding = f64::EPSILON * (count.max(1) as f64).sqrt() * largest;
     let significant: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k] > rounding).collect();
     // Largest angle between an identifiable and a non-identifiable direction that rounding can cause.
-    let turned = significant.iter().map(|&k| sizes[k]).reduce(f64::min).map_or(0.0, |least| rounding / least);
+    let threshold = significant.iter().map(|&k| sizes[k]).reduce(f64::min).map_or(0.0, |least| rounding / least);
     let is_beyond = |i: usize| {
         let lost_share = (0..sizes.len()).filter(|k| sizes[*k] <= rounding).map(|k| right[k][i] * right[k][i]);
-        lost_share.sum::<f64>().sqrt() > turned
+        lost_share.sum::<f64>().sqrt() > threshold
     };
-    let mut unseen: Vec<bool> = (0..p).map(|i| significant.len() < sizes.len() && is_beyond(i)).collect();
-    // Rows of the pseudoinverse in the singular basis: the outer factor ("bread") of the sandwich covariance.
+    let mut is_unidentifiable: Vec<bool> = (0..p).map(|i| significant.len() < sizes.len() && is_beyond(i)).collect();
+    // Rows of the pseudoinverse in the singular basis: the outer factor of the sandwich covariance.
     let inverse: Vec<Vec<f64>> =
         (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
     let middle = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
@@ -131,15 +140,18 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
     } else {
         check_length("residuals", count, series.iter().map(Vec::len).sum())?;
         let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..count]).collect();
-        let answers = inverse.iter().map(|row| weighted_row_sum(row, &basis, count)).collect::<Vec<_>>();
-        widen_covariance(autoregressive_covariance(&answers, &basis, series), &long_run_covariance(&answers, series)?)
+        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, count)).collect::<Vec<_>>();
+        widen_covariance(
+            autoregressive_covariance(&pseudoinverse_rows, &basis, series),
+            &long_run_covariance(&pseudoinverse_rows, series)?,
+        )
     };
     // The variance of a parameter with almost no effect can overflow.
     let mut result: Vec<f64> = (0..p * p).map(|at| middle[at] / (lengths[at / p] * lengths[at % p])).collect();
-    (0..p).for_each(|i| unseen[i] |= !result[i * p + i].is_finite());
+    (0..p).for_each(|i| is_unidentifiable[i] |= !result[i * p + i].is_finite());
     for (at, value) in result.iter_mut().enumerate() {
         let (i, j) = (at / p, at % p);
-        if unseen[i] || unseen[j] {
+        if is_unidentifiable[i] || is_unidentifiable[j] {
             *value = if i == j { f64::INFINITY } else { f64::NAN };
         }
     }
@@ -170,16 +182,16 @@ fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
 
 /// Return the covariance of least-squares estimates for noise that is modeled by an autoregression of the residuals.
 ///
-/// `answers` contains the rows of the pseudoinverse of the Jacobian, one per parameter. `basis` is an orthonormal basis
-/// of the regressors, and `series` contains the residuals by run and output. The result is row-major.
+/// `pseudoinverse_rows` contains the rows of the pseudoinverse of the Jacobian, one per parameter. `basis` is an
+/// orthonormal basis of the regressors, and `series` contains the residuals by run and output. The result is row-major.
 ///
 /// The regressors do not depend on the noise, so the autocovariances of the noise determine the covariance. An
 /// autoregression describes them with few parameters. Sums over lags would miss slow correlations such as 0.9 per
 /// sample. The fit removes the noise along `basis` from the residuals. The result is corrected for this loss, which is
 /// larger if the noise has the spectrum of the regressors.
 #[allow(clippy::cast_precision_loss)]
-fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
-    let mut total = vec![0.0; answers.len() * answers.len()];
+fn autoregressive_covariance(pseudoinverse_rows: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
+    let mut total = vec![0.0; pseudoinverse_rows.len() * pseudoinverse_rows.len()];
     let mut at = 0;
     for residuals in series {
         let range = at..at + residuals.len();
@@ -197,7 +209,7 @@ fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[V
         let own = multiply_toeplitz(&directions, &covariances);
         let explained = own.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
         let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_SHARE);
-        let rows: Vec<&[f64]> = answers.iter().map(|row| &row[range.clone()]).collect();
+        let rows: Vec<&[f64]> = pseudoinverse_rows.iter().map(|row| &row[range.clone()]).collect();
         total.iter_mut().zip(quadratic_form(&rows, &covariances)).for_each(|(sum, more)| *sum += more / remainder);
     }
     total
@@ -206,9 +218,9 @@ fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[V
 /// Scale the covariance `one` so that no variance is below that of `other`; correlations are unchanged.
 fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
     let p = one.len().isqrt();
-    let stretch = |i: usize| (other[i * p + i] / one[i * p + i].max(f64::MIN_POSITIVE)).max(1.0).sqrt();
-    let stretches: Vec<f64> = (0..p).map(stretch).collect();
-    one.iter().enumerate().map(|(at, value)| value * stretches[at / p] * stretches[at % p]).collect()
+    let scale_of = |i: usize| (other[i * p + i] / one[i * p + i].max(f64::MIN_POSITIVE)).max(1.0).sqrt();
+    let scales: Vec<f64> = (0..p).map(scale_of).collect();
+    one.iter().enumerate().map(|(at, value)| value * scales[at / p] * scales[at % p]).collect()
 }
 
 /// Return the long-run covariance of the summed scores, the middle factor of the sandwich covariance, row-major.

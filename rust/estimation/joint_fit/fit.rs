@@ -182,21 +182,21 @@ impl<'a> FitProblem<'a> {
     /// # Errors
     /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress
     /// listener if it returns one. [`Error::Interrupted`] after a stop request.
-    pub fn run_multistart(&self, threads: usize, pace: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
+    pub fn run_multistart(&self, threads: usize, progress: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
         let floor = self.noise_floor();
         let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
-        let shared = std::cell::RefCell::new(pace);
+        let shared = std::cell::RefCell::new(progress);
         let listener =
             |count, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, of);
         let Self { source, starts, stop, .. } = *self;
-        let course =
+        let context =
             MultistartContext { source, starts, stop, weights: &weights, floor, threads, listener: Some(&listener) };
         let run = match &self.free.problem {
             problem if !problem.derived.is_empty() => run_nonlinear_multistart,
             problem if !problem.frictions.is_empty() => run_friction_multistart,
             _ => run_multistart,
         };
-        run(self.free, course)
+        run(self.free, context)
     }
 
     fn start(&self, values: &[f64], origin: &str) -> Result<Candidate> {
@@ -274,9 +274,9 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
 ///     ParametricTerm { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
 /// };
 /// let terms = vec![term(0, "a"), term(1, "b")];
-/// let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+/// let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
 /// let signals = vec!["y".into(), "u".into()];
-/// let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![sought], Initial::Rest))?;
+/// let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![equation], Initial::Rest))?;
 /// let stop = Stop::default();
 /// let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
 /// let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
@@ -291,37 +291,39 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
 /// # }
 /// ```
 pub fn fit(
-    sought: FitProblem<'_>,
-    outset: Initialization,
+    problem: FitProblem<'_>,
+    initialization: Initialization,
     settings: Settings,
     listener: &ProgressListener<'_>,
 ) -> Result<Option<JointFit>> {
-    let free = sought.free;
-    let mut pace = FitProgress::new(listener);
-    let (candidates, contenders) = match outset {
-        Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates: raced } => {
-            let start = sought.start(&values, GIVEN_START_ORIGIN)?;
+    let free = problem.free;
+    let mut progress = FitProgress::new(listener);
+    let (candidates, survivors) = match initialization {
+        Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates } => {
+            let start = problem.start(&values, GIVEN_START_ORIGIN)?;
             let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
             let weights = noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect();
-            let grid = sought.grid(weights, sampling, settings.refine)?;
+            let grid = problem.grid(weights, sampling, settings.refine)?;
             let (best, grid) = reweight_candidate(&start, grid, settings.loss)?;
-            return finish_fit(free, best, grid, raced, settings).map(Some);
+            return finish_fit(free, best, grid, candidates, settings).map(Some);
         }
-        Initialization::InitialGuess(values) => (Vec::new(), vec![sought.start(&values, GIVEN_START_ORIGIN)?]),
-        Initialization::Multistart { known: guesses, candidates: raced } => {
-            let candidates =
-                if let Some(raced) = raced { raced } else { sought.run_multistart(settings.threads, &mut pace)? };
-            let mut contenders = select_survivors(&candidates);
+        Initialization::InitialGuess(values) => (Vec::new(), vec![problem.start(&values, GIVEN_START_ORIGIN)?]),
+        Initialization::Multistart { known: guesses, candidates } => {
+            let candidates = match candidates {
+                Some(candidates) => candidates,
+                None => problem.run_multistart(settings.threads, &mut progress)?,
+            };
+            let mut survivors = select_survivors(&candidates);
             for values in &guesses {
-                contenders.push(sought.start(values, GIVEN_START_ORIGIN)?);
+                survivors.push(problem.start(values, GIVEN_START_ORIGIN)?);
             }
-            (candidates, contenders)
+            (candidates, survivors)
         }
     };
-    let Some(first) = contenders.first() else { return Ok(None) };
-    pace.advance_to(MULTISTART_PROGRESS_SHARE)?;
-    let weights = sought.sizes.iter().map(|size| 1.0 / size.noise).collect();
-    let mut grid = sought.grid(weights, Sampling::default(), settings.refine)?;
+    let Some(first) = survivors.first() else { return Ok(None) };
+    progress.advance_to(MULTISTART_PROGRESS_SHARE)?;
+    let weights = problem.sizes.iter().map(|size| 1.0 / size.noise).collect();
+    let mut grid = problem.grid(weights, Sampling::default(), settings.refine)?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
     while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !grid.is_exact(&first.result.iterate) {
         let finer = grid.finer()?;
@@ -330,8 +332,8 @@ pub fn fit(
         }
         grid = finer;
     }
-    let mut best = select_on_part(sought, &contenders, grid.sampling, settings.refine)?;
-    if sought.sizes.len() > 1 {
+    let mut best = select_on_part(problem, &survivors, grid.sampling, settings.refine)?;
+    if problem.sizes.len() > 1 {
         // With a single output, the optimum does not depend on the noise level.
         let place = &best.result.iterate;
         best = best.with_result(grid.minimize_in(
@@ -340,11 +342,11 @@ pub fn fit(
             EVALUATIONS_PER_REWEIGHTING,
         )?);
     }
-    pace.advance_to(0.65)?;
+    progress.advance_to(0.65)?;
     let (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
-    pace.advance_to(0.75)?;
+    progress.advance_to(0.75)?;
     let final_fit = finish_fit(free, best, grid, candidates, settings)?;
-    pace.advance_to(1.0)?;
+    progress.advance_to(1.0)?;
     Ok(Some(final_fit))
 }
 
@@ -371,7 +373,7 @@ fn finish_fit(
         corrected
     } else {
         let others: Vec<Iterate> =
-            select_survivors(&candidates).into_iter().map(|runner| runner.result.iterate).collect();
+            select_survivors(&candidates).into_iter().map(|candidate| candidate.result.iterate).collect();
         refine_step(best.result, grid, settings.loss, &others)?
     };
     Ok(JointFit { optimum: optimum.into_statistics(), candidates, stability })
@@ -380,9 +382,13 @@ fn finish_fit(
 /// Fit a candidate by iteratively reweighted least squares until the weights converge.
 ///
 /// Return the fitted candidate and the objective with the final weights.
-fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -> Result<(Candidate, Objective<'a>)> {
-    let (attempt, grid) = fit_reweighted(&runner.result.iterate, grid, loss)?;
-    Ok((runner.with_result(attempt), grid))
+fn reweight_candidate<'a>(
+    candidate: &Candidate,
+    grid: Objective<'a>,
+    loss: Loss,
+) -> Result<(Candidate, Objective<'a>)> {
+    let (attempt, grid) = fit_reweighted(&candidate.result.iterate, grid, loss)?;
+    Ok((candidate.with_result(attempt), grid))
 }
 
 /// Return the best survivor of the multistart, fitted to all samples.
@@ -391,17 +397,18 @@ fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -
 /// the selection is repeated on all samples. It is also repeated if the cost rises and another survivor has a lower
 /// cost.
 fn select_on_part(
-    sought: FitProblem<'_>,
-    contenders: &[Candidate],
+    problem: FitProblem<'_>,
+    survivors: &[Candidate],
     sampling: Sampling,
     refine: bool,
 ) -> Result<Candidate> {
-    let whole = sought.equally_weighted_grid(sampling, refine)?;
-    if let Some(intervals) = leading_part(sought.free, sought.source, SELECTION_INTERVALS)? {
-        let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
-        let winner = select_best_candidate(sought, contenders, &part).and_then(|best| {
+    let whole = problem.equally_weighted_grid(sampling, refine)?;
+    if let Some(intervals) = leading_part(problem.free, problem.source, SELECTION_INTERVALS)? {
+        let part =
+            problem.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
+        let winner = select_best_candidate(problem, survivors, &part).and_then(|best| {
             let place = &best.result.iterate;
-            let problem = sought.free.problem_at(place, true, &[]);
+            let problem = problem.free.problem_at(place, true, &[]);
             let end = whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?;
             Ok((best.cost_per_residual(), best.with_result(end)))
         });
@@ -410,18 +417,18 @@ fn select_on_part(
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Ok((partial, best)) => {
                 let rises = best.cost_per_residual() > MAX_COST_RATIO * partial;
-                if !rises || !is_beaten(&best, contenders, &whole)? {
+                if !rises || !has_better_candidate(&best, survivors, &whole)? {
                     return Ok(best);
                 }
             }
             Err(_) => {}
         }
     }
-    select_best_candidate(sought, contenders, &whole)
+    select_best_candidate(problem, survivors, &whole)
 }
 
 /// Return true if a candidate, without further optimization, has a lower cost on the objective `grid` than `best`.
-fn is_beaten(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -> Result<bool> {
+fn has_better_candidate(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -> Result<bool> {
     for candidate in candidates {
         if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {
             return Ok(true);
@@ -431,31 +438,31 @@ fn is_beaten(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -
 }
 
 /// Fit the survivors with the objective `near` and return the best one.
-fn select_best_candidate(sought: FitProblem<'_>, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
-    let free = sought.free;
-    let fit = |runner: &Candidate, evaluations| {
-        let place = &runner.result.iterate;
+fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
+    let free = problem.free;
+    let fit = |candidate: &Candidate, evaluations| {
+        let place = &candidate.result.iterate;
         near.minimize_in(&free.problem_at(place, false, &[]), place, evaluations)
     };
     let mut short = Vec::new();
     let mut last = None;
-    for runner in contenders {
-        match fit(runner, FIRST_BUDGET_EVALUATIONS) {
-            Ok(attempt) => short.push(runner.with_result(attempt)),
+    for candidate in survivors {
+        match fit(candidate, FIRST_BUDGET_EVALUATIONS) {
+            Ok(attempt) => short.push(candidate.with_result(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // This survivor has no finite simulation on this grid. Other survivors may have one.
             Err(error) => last = Some(error),
         }
     }
-    let (unfinished, mut ends) = split_unfinished(short, sought.noise_floor());
-    for runner in unfinished {
-        match fit(&runner, MAX_FINAL_EVALUATIONS) {
-            Ok(attempt) => ends.push(runner.with_result(attempt)),
+    let (unfinished, mut ends) = split_unfinished(short, problem.noise_floor());
+    for candidate in unfinished {
+        match fit(&candidate, MAX_FINAL_EVALUATIONS) {
+            Ok(attempt) => ends.push(candidate.with_result(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            Err(_) => ends.push(runner),
+            Err(_) => ends.push(candidate),
         }
     }
-    let attempts: Vec<&OptimizationResult> = ends.iter().map(|runner| &runner.result).collect();
+    let attempts: Vec<&OptimizationResult> = ends.iter().map(|candidate| &candidate.result).collect();
     let first = match (attempts.len(), last) {
         (0, Some(error)) => return Err(error),
         (0 | 1, _) => 0,

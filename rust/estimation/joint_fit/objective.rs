@@ -55,7 +55,8 @@ pub struct Objective<'a> {
 }
 
 impl<'a> Objective<'a> {
-    /// Return the objective of a problem on the given runs; `steady` sets [`Objective::requires_stability`].
+    /// Return the objective of a problem on the given runs; `requires_stability` sets
+    /// [`Objective::requires_stability`].
     ///
     /// # Errors
     /// An error if the runs cannot be sampled ([`Recordings::experiments`]). [`Error::Length`] for a wrong number of
@@ -64,7 +65,7 @@ impl<'a> Objective<'a> {
         (problem, source, stop): (&'a Problem, &'a Recordings, &'a Stop),
         weights: Weights,
         sampling: Sampling,
-        steady: bool,
+        requires_stability: bool,
     ) -> Result<Self> {
         check_length("weights", problem.outputs.len(), weights.outputs.len())?;
         sampling.check()?;
@@ -78,7 +79,7 @@ impl<'a> Objective<'a> {
             stop,
             weights: blank,
             sampling,
-            requires_stability: steady,
+            requires_stability,
             tolerance: RELATIVE_COST_TOLERANCE,
             sample_mask: read,
             experiments: Arc::new(experiments),
@@ -173,7 +174,7 @@ impl<'a> Objective<'a> {
     /// Time scaling of the problem on these runs.
     #[must_use]
     pub fn time_scaling(&self) -> super::parameter_set::TimeScaling {
-        super::parameter_set::TimeScaling::from_runs(self.problem, &self.source.spans())
+        super::parameter_set::TimeScaling::from_runs(self.problem, &self.source.intervals_and_durations())
     }
 
     /// Minimize the cost by the Levenberg–Marquardt method from an initial guess.
@@ -189,9 +190,9 @@ impl<'a> Objective<'a> {
     ///
     /// # Errors
     /// The error of the simulation of `start` if it fails. [`Error::Interrupted`] after a stop request.
-    pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
+    pub fn minimize_in(&self, problem: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
-        turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
+        problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
     /// Return true if the simulation at an iterate does not depend on the step.
@@ -202,7 +203,7 @@ impl<'a> Objective<'a> {
     #[must_use]
     pub fn is_exact(&self, place: &Iterate) -> bool {
         let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
-        let runs = self.source.runs().iter().zip(self.source.spans());
+        let runs = self.source.runs().iter().zip(self.source.intervals_and_durations());
         self.sampling.decimation == 1
             && self.problem.is_linear()
             && runs

@@ -279,10 +279,11 @@ impl TimeScaling {
     ///
     /// The unit is the inverse of the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
     #[must_use]
-    pub fn from_runs(problem: &Problem, spans: &[(f64, f64)]) -> Self {
-        let spans: Vec<f64> = spans.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
+    pub fn from_runs(problem: &Problem, intervals_and_durations: &[(f64, f64)]) -> Self {
+        let log_spans: Vec<f64> =
+            intervals_and_durations.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
         Self {
-            unit: Unit::from_log_spans(&problem.model, &spans),
+            unit: Unit::from_log_spans(&problem.model, &log_spans),
             orders: problem.model.order_bounds.len(),
             coefficients: problem.model.coordinates.len(),
             size: problem.size(),
@@ -388,10 +389,10 @@ mod tests {
         let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
         let structure = ParametricStructure::new(vec!["y".into(), "u".into()], vec![equation], Initial::Rest);
         let problem = ParameterSet::from_structure(structure)?.problem;
-        let (clock, minutes) =
+        let (time_scaling, minutes) =
             (TimeScaling::from_runs(&problem, &[(0.02, 4.8)]), TimeScaling::from_runs(&problem, &[(1.2, 288.0)]));
         let unit = libm::exp(minutes.unit());
-        assert!((unit / libm::exp(clock.unit()) / 60.0 - 1.0).abs() < 1e-12);
+        assert!((unit / libm::exp(time_scaling.unit()) / 60.0 - 1.0).abs() < 1e-12);
         let values = [1.9, 0.7, 0.4, -2.0, -30.0, 4.0, 0.0];
         let powers = [0.0, 0.0, 0.0, 1.2, 1.9, 1.5, 1.9];
         let scaled = minutes.to_scaled(&values);
@@ -420,9 +421,9 @@ mod tests {
             assert!((error - expected).abs() <= 1e-3 * expected);
         }
         // If an order is not identifiable, its coefficients have no finite error either.
-        let mut unseen = covariance;
-        unseen[2 * n + 2] = f64::INFINITY;
-        let errors = minutes.standard_errors(&values, &unseen);
+        let mut with_unidentifiable = covariance;
+        with_unidentifiable[2 * n + 2] = f64::INFINITY;
+        let errors = minutes.standard_errors(&values, &with_unidentifiable);
         assert_eq!(
             errors.iter().map(|e| e.is_infinite()).collect::<Vec<_>>(),
             [false, false, true, false, false, true, false]

@@ -126,7 +126,7 @@ impl Problem {
 
     /// Minimize the cost by the Levenberg–Marquardt method.
     ///
-    /// If `steady`, a linear model that is stable does not become unstable.
+    /// If `requires_stability`, a linear model that is stable does not become unstable.
     ///
     /// # Errors
     /// The error of the simulation of `start` if it fails. An error if the model does not match the experiments
@@ -137,11 +137,11 @@ impl Problem {
         experiments: &[Experiment],
         start: &Iterate,
         settings: MinimizationSettings,
-        steady: bool,
+        requires_stability: bool,
         stop: &Stop,
     ) -> Result<OptimizationResult> {
         if self.is_linear() {
-            let optimum = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
+            let optimum = fit_until(&self.model, experiments, &start.point, settings, requires_stability, stop)?;
             return Ok(OptimizationResult {
                 iterate: Iterate { point: optimum.point, states: Vec::new() },
                 cost: optimum.cost,

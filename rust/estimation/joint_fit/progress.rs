@@ -64,17 +64,17 @@ mod tests {
 
     #[test]
     fn progress_is_monotone_and_sweeps_share_the_rest() {
-        let heard = RefCell::new(Vec::new());
+        let reports = RefCell::new(Vec::new());
         let listener = |count: usize, of: usize| {
-            heard.borrow_mut().push((count, of));
+            reports.borrow_mut().push((count, of));
             Ok(())
         };
-        let mut pace = FitProgress::new(&listener);
+        let mut progress = FitProgress::new(&listener);
         for (count, of) in [(0, 4), (2, 4), (4, 4), (0, 2), (1, 2), (1, 2)] {
-            assert_eq!(pace.advance_within(0.5, 0.3, count, of), Ok(()));
+            assert_eq!(progress.advance_within(0.5, 0.3, count, of), Ok(()));
         }
-        assert_eq!((pace.advance_to(0.5), pace.advance_to(0.2)), (Ok(()), Ok(())));
-        let parts: Vec<usize> = heard.borrow().iter().map(|(count, _)| *count).collect();
+        assert_eq!((progress.advance_to(0.5), progress.advance_to(0.2)), (Ok(()), Ok(())));
+        let parts: Vec<usize> = reports.borrow().iter().map(|(count, _)| *count).collect();
         assert_eq!(parts, [0, 75, 150, 202, 500]);
     }
 }

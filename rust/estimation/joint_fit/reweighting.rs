@@ -64,7 +64,8 @@ pub(super) fn huber_weights(grid: &Objective<'_>, attempt: &OptimizationResult, 
 
 /// Return true if two sets of robust weights agree within the tolerance, or if there are none.
 pub(super) fn are_weights_equal(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<Vec<f64>>>>) -> bool {
-    let flat = |shares: &Vec<Vec<Vec<f64>>>| shares.iter().flatten().flatten().copied().collect::<Vec<_>>();
+    let flat =
+        |robust_weights: &Vec<Vec<Vec<f64>>>| robust_weights.iter().flatten().flatten().copied().collect::<Vec<_>>();
     match (before, after) {
         (None, None) => true,
         (Some(a), Some(b)) => flat(a).iter().zip(flat(b)).all(|(a, b)| (a - b).abs() <= ROBUST_WEIGHT_TOLERANCE),
@@ -93,13 +94,13 @@ pub fn fit_reweighted<'a>(
     grid: Objective<'a>,
     loss: Loss,
 ) -> Result<(OptimizationResult, Objective<'a>)> {
-    let rounds = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
+    let max_reweightings = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
     // The residuals of noise-free samples are rounding errors, so the weights have upper limits relative to the first
     // ones.
     let limits: Vec<f64> = grid.weights.outputs.iter().map(|weight| weight / f64::EPSILON).collect();
-    let (mut place, mut grid, mut turn) = (start.clone(), grid, 0);
+    let (mut place, mut grid, mut reweighting) = (start.clone(), grid, 0);
     loop {
-        turn += 1;
+        reweighting += 1;
         let attempt = grid.minimize(&place, EVALUATIONS_PER_REWEIGHTING)?;
         let levels = if loss == Loss::Huber {
             grid.residual_scales(&attempt)
@@ -109,14 +110,16 @@ pub fn fit_reweighted<'a>(
         if let Some(output) = levels.iter().position(|level| !level.is_finite()) {
             return Err(Error::Beyond { output: grid.problem.outputs[output].clone() });
         }
-        let still = levels.iter().all(|level| (level - 1.0).abs() < NOISE_LEVEL_TOLERANCE);
-        let shares = (loss == Loss::Huber).then(|| huber_weights(&grid, &attempt, &levels));
-        if turn == rounds || (still && are_weights_equal(grid.weights.robust_weights.as_ref(), shares.as_ref())) {
+        let has_converged = levels.iter().all(|level| (level - 1.0).abs() < NOISE_LEVEL_TOLERANCE);
+        let robust_weights = (loss == Loss::Huber).then(|| huber_weights(&grid, &attempt, &levels));
+        if reweighting == max_reweightings
+            || (has_converged && are_weights_equal(grid.weights.robust_weights.as_ref(), robust_weights.as_ref()))
+        {
             return Ok((attempt, grid));
         }
         let inverse = grid.weights.outputs.iter().zip(&levels).map(|(weight, level)| weight / level);
         let outputs = inverse.zip(&limits).map(|(weight, &limit)| weight.min(limit)).collect();
-        grid = grid.with_weights(Weights { outputs, robust_weights: shares })?;
+        grid = grid.with_weights(Weights { outputs, robust_weights })?;
         place = attempt.iterate;
     }
 }

@@ -120,8 +120,8 @@ fn ignore_failure<T>(outcome: Result<T>) -> Result<Option<T>> {
 }
 
 /// Return true if an equation is unstable at a candidate.
-fn is_unstable(free: &ParameterSet, runner: &Candidate) -> bool {
-    free.problem.is_unstable(&runner.result.iterate.point)
+fn is_unstable(free: &ParameterSet, candidate: &Candidate) -> bool {
+    free.problem.is_unstable(&candidate.result.iterate.point)
 }
 
 /// Known factor of each free autoregressive coefficient in its term, by name of the coefficient.
@@ -140,17 +140,17 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
 /// coefficients should first be fixed while the others adapt. The input coefficients still belong to the unstable
 /// optimum.
 #[must_use]
-pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candidate, Vec<usize>) {
+pub fn dissipative_candidate(free: &ParameterSet, candidate: &Candidate) -> (Candidate, Vec<usize>) {
     let own = autoregressive_factors(free);
-    let mut place = runner.result.iterate.clone();
-    let mut turned = Vec::new();
+    let mut place = candidate.result.iterate.clone();
+    let mut changed = Vec::new();
     for (k, (name, value)) in free.coefficients.iter().zip(&mut place.point.coefficients).enumerate() {
         if own.get(name).is_some_and(|factor| *value * factor > 0.0) {
             *value = -*value;
-            turned.push(free.orders.len() + k);
+            changed.push(free.orders.len() + k);
         }
     }
-    (candidate_at(runner, place, "stable signs of the coefficients"), turned)
+    (candidate_at(candidate, place, "stable signs of the coefficients"), changed)
 }
 
 /// Return one candidate per autoregressive coefficient, with that coefficient at 0, and its parameter index.
@@ -158,13 +158,13 @@ pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candid
 /// In a fit, the coefficient should first be fixed while the others adapt. The result is empty if there is only one
 /// autoregressive coefficient.
 #[must_use]
-pub fn candidates_without_term(free: &ParameterSet, runner: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
+pub fn candidates_without_term(free: &ParameterSet, candidate: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
     let places = autoregressive_indices(free);
     let without = |&k: &usize| {
-        let mut place = runner.result.iterate.clone();
+        let mut place = candidate.result.iterate.clone();
         place.point.coefficients[k] = 0.0;
         let words = format!("from {} = 0", free.coefficients[k]);
-        (candidate_at(runner, place, &words), vec![free.orders.len() + k])
+        (candidate_at(candidate, place, &words), vec![free.orders.len() + k])
     };
     if places.len() > 1 {
         places.iter().map(without).collect()
@@ -179,9 +179,9 @@ fn autoregressive_indices(free: &ParameterSet) -> Vec<usize> {
     (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
 }
 
-fn candidate_at(runner: &Candidate, place: super::problem::Iterate, words: &str) -> Candidate {
-    let origin = format!("{}, {words}", runner.origin);
-    Candidate { origin, result: OptimizationResult { iterate: place, ..runner.result.clone() }, ..runner.clone() }
+fn candidate_at(candidate: &Candidate, place: super::problem::Iterate, words: &str) -> Candidate {
+    let origin = format!("{}, {words}", candidate.origin);
+    Candidate { origin, result: OptimizationResult { iterate: place, ..candidate.result.clone() }, ..candidate.clone() }
 }
 
 /// Search for stable optima of a problem.
@@ -199,16 +199,19 @@ impl StableSearch<'_, '_> {
 
     /// Fit briefly from stable candidates of the multistart and from modifications of the unstable optimum.
     fn short_fits(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
-        let stable = reached.iter().filter(|runner| !is_unstable(self.free, runner)).take(MAX_STABLE_CANDIDATES);
-        let mut starts: Vec<(Candidate, Vec<usize>)> = stable.map(|runner| (runner.clone(), Vec::new())).collect();
+        let stable = reached.iter().filter(|candidate| !is_unstable(self.free, candidate)).take(MAX_STABLE_CANDIDATES);
+        let mut starts: Vec<(Candidate, Vec<usize>)> =
+            stable.map(|candidate| (candidate.clone(), Vec::new())).collect();
         starts.push(dissipative_candidate(self.free, best));
         starts.extend(candidates_without_term(self.free, best));
         let mut fits = Vec::new();
-        for (start, turned) in starts.into_iter().filter(|(start, _)| !is_unstable(self.free, start)) {
+        for (start, changed) in starts.into_iter().filter(|(start, _)| !is_unstable(self.free, start)) {
             let adapt = |fixed: &[usize]| self.minimize(&start, fixed, FIRST_BUDGET_EVALUATIONS);
-            let near = if turned.is_empty() { Ok(start.clone()) } else { adapt(&turned) };
+            let adapted = if changed.is_empty() { Ok(start.clone()) } else { adapt(&changed) };
             // Candidates without a finite simulation on this grid are skipped.
-            fits.extend(ignore_failure(near.and_then(|near| self.minimize(&near, &[], FIRST_BUDGET_EVALUATIONS)))?);
+            fits.extend(ignore_failure(
+                adapted.and_then(|adapted| self.minimize(&adapted, &[], FIRST_BUDGET_EVALUATIONS)),
+            )?);
         }
         Ok(fits)
     }
@@ -237,13 +240,13 @@ impl StableSearch<'_, '_> {
     /// A converged optimum is preferred over a candidate on the stability limit. The exception is a candidate that fits
     /// significantly better than all converged optima.
     fn select_optimum(&self, ends: &[Candidate]) -> Result<Candidate> {
-        let attempts: Vec<&OptimizationResult> = ends.iter().map(|runner| &runner.result).collect();
+        let attempts: Vec<&OptimizationResult> = ends.iter().map(|candidate| &candidate.result).collect();
         let order = self.grid.finer()?.rank_results(&attempts)?;
         let first = order.first().copied().unwrap_or(0);
-        let settled = |&&i: &&usize| {
+        let is_preferred = |&&i: &&usize| {
             attempts[i].has_converged() && !is_significantly_better(&self.grid, attempts[first], attempts[i])
         };
-        Ok(ends[order.iter().find(settled).copied().unwrap_or(first)].clone())
+        Ok(ends[order.iter().find(is_preferred).copied().unwrap_or(first)].clone())
     }
 }
 
@@ -260,10 +263,10 @@ pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, 
     let squares = |attempt: &OptimizationResult| {
         grid.residuals(attempt).iter().map(|run| squares_by_sample(run)).collect::<Vec<_>>()
     };
-    let (ours, theirs) = (squares(best), squares(other));
-    let samples: usize = theirs.iter().map(Vec::len).sum();
+    let (best_squares, other_squares) = (squares(best), squares(other));
+    let samples: usize = other_squares.iter().map(Vec::len).sum();
     let mut less = Vec::new();
-    for (one, two) in theirs.iter().zip(&ours) {
+    for (one, two) in other_squares.iter().zip(&best_squares) {
         let fall: Vec<f64> = one.iter().zip(two).map(|(a, b)| a - b).collect();
         let count = (COMPARISON_SEGMENTS * fall.len() as f64 / samples as f64).round_ties_even().max(1.0) as usize;
         let (short, longer) = (fall.len() / count, fall.len() % count);
@@ -280,8 +283,8 @@ pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, 
         return true;
     }
     let (middle, count) = (mean(&less), less.len() as f64);
-    let spread = less.iter().map(|v| (v - middle).powi(2)).sum::<f64>() / (count - 1.0);
-    middle > STUDENT_T_QUANTILE_99 * (spread / count).sqrt()
+    let variance = less.iter().map(|v| (v - middle).powi(2)).sum::<f64>() / (count - 1.0);
+    middle > STUDENT_T_QUANTILE_99 * (variance / count).sqrt()
 }
 
 /// Sum of squared weighted residuals over all outputs, by sample. A missing sample contributes 0.

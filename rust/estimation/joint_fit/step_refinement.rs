@@ -75,51 +75,51 @@ pub fn refine_step<'a>(
     loss: Loss,
     others: &[Iterate],
 ) -> Result<Optimum<'a>> {
-    let clock = grid.time_scaling();
+    let time_scaling = grid.time_scaling();
     let (mut best, mut grid, mut others) = (best, grid, others);
-    let (mut estimate, mut still, mut before) = (best.values(), false, None::<OptimizationResult>);
+    let (mut estimate, mut has_converged, mut before) = (best.values(), false, None::<OptimizationResult>);
     let mut spread = None;
-    while !still && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+    while !has_converged && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         // Residuals can shrink to the noise on a finer grid, so the weights are iterated again.
         let half = grid.finer()?;
-        let start = extrapolated_start(&half, &clock, &best, before.as_ref())?;
+        let start = extrapolated_start(&half, &time_scaling, &best, before.as_ref())?;
         let (finer, fine) = match fit_reweighted(&start, half.clone(), loss) {
             // The extrapolated start may have no finite simulation.
             Err(error) if error != Error::Interrupted => fit_reweighted(&best.iterate, half, loss)?,
             fit => fit?,
         };
-        let rose =
+        let has_increased =
             negative_log_likelihood(&finer, &fine) > negative_log_likelihood(&best, &grid) + MAX_LOG_RESIDUAL_INCREASE;
         let mut fine = fine;
-        if (finer.status == Status::DomainLimit && before.is_none()) || (rose && !others.is_empty()) {
-            let freed = best_alternative(&finer, &fine, others, loss)?;
+        if (finer.status == Status::DomainLimit && before.is_none()) || (has_increased && !others.is_empty()) {
+            let alternative = best_alternative(&finer, &fine, others, loss)?;
             // The other survivors are tried only once.
             others = &[];
-            if let Some((other, freed_grid)) = freed {
+            if let Some((other, finer_values)) = alternative {
                 // The two grids have different optima, so they cannot be extrapolated.
                 (before, spread) = (None, None);
                 estimate = other.values();
-                (best, grid) = (other, freed_grid);
+                (best, grid) = (other, finer_values);
                 continue;
             }
         }
         std::mem::swap(&mut grid, &mut fine);
-        let (freed_grid, own_values) = (finer.values(), best.values());
+        let (finer_values, own_values) = (finer.values(), best.values());
         let fit = covariance(&finer, &grid)?;
         // The scheme is of second order. Richardson extrapolation of two grids yields the limit, and a third grid
         // confirms it. Optimizations that did not converge cannot be extrapolated.
-        let mut limit = freed_grid.clone();
+        let mut limit = finer_values.clone();
         if finer.has_converged() && best.has_converged() {
-            limit = extrapolate(&grid, &clock, &freed_grid, &own_values, 3.0)?;
+            limit = extrapolate(&grid, &time_scaling, &finer_values, &own_values, 3.0)?;
         }
-        still = is_within_errors(&clock, &limit, &estimate, (&freed_grid, &fit))
-            || is_within_errors(&clock, &freed_grid, &own_values, (&freed_grid, &fit));
+        has_converged = is_within_errors(&time_scaling, &limit, &estimate, (&finer_values, &fit))
+            || is_within_errors(&time_scaling, &finer_values, &own_values, (&finer_values, &fit));
         estimate = limit;
         (before, best, spread) = (Some(best), finer, Some(fit));
     }
     let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
-    let estimate = select_limit_or_optimum(&best, &grid, estimate, &clock, still)?;
-    Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
+    let estimate = select_limit_or_optimum(&best, &grid, estimate, &time_scaling, has_converged)?;
+    Ok(Optimum { attempt: best, grid, estimate, step_converged: has_converged, covariance: spread })
 }
 
 /// Return the optimum of a long record for zero step, by deferred correction; None if this fails.
@@ -136,7 +136,7 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     if pulses < MIN_CORRECTED_PULSES || !best.has_converged() {
         return Ok(None);
     }
-    let clock = grid.time_scaling();
+    let time_scaling = grid.time_scaling();
     let (mut place, mut own_grid, mut coarse) = (best.clone(), grid.clone(), grid.clone());
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let fine = coarse.finer()?;
@@ -149,8 +149,9 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
                 _ => return Ok(None),
             };
             let spread = covariance(&next, &next_grid)?;
-            let is_still = is_within_errors(&clock, &next.values(), &place.values(), (&next.values(), &spread));
-            if is_still && correction == 0 {
+            let has_converged =
+                is_within_errors(&time_scaling, &next.values(), &place.values(), (&next.values(), &spread));
+            if has_converged && correction == 0 {
                 // The optimum is the same as with the previous pair of coarser grids.
                 let estimate = next.values();
                 let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
@@ -158,7 +159,7 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
                 return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
             }
             (place, own_grid) = (next, next_grid);
-            if is_still {
+            if has_converged {
                 break;
             }
         }
@@ -217,7 +218,7 @@ impl<'a> Optimum<'a> {
     /// Convert to the statistics of the optimum, with noise levels and residuals.
     #[must_use]
     pub fn into_statistics(self) -> OptimumStatistics {
-        let Self { attempt, grid, estimate, step_converged: settled, covariance } = self;
+        let Self { attempt, grid, estimate, step_converged: has_converged, covariance } = self;
         let robust = grid.weights.robust_weights.is_some();
         let levels = if robust { grid.residual_scales(&attempt) } else { grid.residual_root_mean_squares(&attempt) };
         let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
@@ -236,7 +237,7 @@ impl<'a> Optimum<'a> {
             weights: grid.weights,
             pulses_per_sample: grid.sampling.pulses_per_sample,
             attempt,
-            step_converged: settled,
+            step_converged: has_converged,
             covariance,
         }
     }
@@ -245,10 +246,10 @@ impl<'a> Optimum<'a> {
 /// Return true if two estimates differ by at most a tenth of the standard errors in scaled time.
 ///
 /// The standard errors are those of the covariance matrix `spread` at the parameter values `at`.
-fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread): (&[f64], &[f64])) -> bool {
-    let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
-    let errors = clock.standard_errors(at, spread);
-    ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
+fn is_within_errors(time_scaling: &TimeScaling, one: &[f64], other: &[f64], (at, spread): (&[f64], &[f64])) -> bool {
+    let pairs = time_scaling.to_scaled(one).into_iter().zip(time_scaling.to_scaled(other));
+    let errors = time_scaling.standard_errors(at, spread);
+    pairs.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
 }
 
 /// Extrapolate the estimates of two grids: add their difference, divided by `share`, to the estimate of the finer grid.
@@ -256,14 +257,14 @@ fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread
 /// The result is limited to feasible values.
 fn extrapolate(
     grid: &Objective<'_>,
-    clock: &TimeScaling,
+    time_scaling: &TimeScaling,
     fine: &[f64],
     coarse: &[f64],
     share: f64,
 ) -> Result<Vec<f64>> {
-    let (fine, coarse) = (clock.to_scaled(fine), clock.to_scaled(coarse));
+    let (fine, coarse) = (time_scaling.to_scaled(fine), time_scaling.to_scaled(coarse));
     let target: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
+    Ok(time_scaling.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
 }
 
 /// Return the initial guess for half the step.
@@ -271,31 +272,31 @@ fn extrapolate(
 /// The optimum is expected to move a quarter as far as at the last halving.
 fn extrapolated_start(
     grid: &Objective<'_>,
-    clock: &TimeScaling,
+    time_scaling: &TimeScaling,
     best: &OptimizationResult,
     before: Option<&OptimizationResult>,
 ) -> Result<Iterate> {
     match before {
         Some(before) if best.has_converged() && before.has_converged() => {
-            Ok(best.iterate_at(&extrapolate(grid, clock, &best.values(), &before.values(), 4.0)?))
+            Ok(best.iterate_at(&extrapolate(grid, time_scaling, &best.values(), &before.values(), 4.0)?))
         }
         _ => Ok(best.iterate.clone()),
     }
 }
 
-/// Return the best other candidate, with converged weights; None if none fits better than the result `stuck`.
+/// Return the best other candidate, with converged weights; None if none fits better than the result `stalled`.
 ///
-/// `stuck` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires stability.
+/// `stalled` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires stability.
 ///
 /// # Errors
 /// [`Error::Interrupted`] after a stop request.
 pub fn best_alternative<'a>(
-    stuck: &OptimizationResult,
+    stalled: &OptimizationResult,
     grid: &Objective<'a>,
     others: &[Iterate],
     loss: Loss,
 ) -> Result<Option<(OptimizationResult, Objective<'a>)>> {
-    let (mut best, mut least) = (None, negative_log_likelihood(stuck, grid));
+    let (mut best, mut least) = (None, negative_log_likelihood(stalled, grid));
     for other in others {
         let outcome = match fit_reweighted(other, grid.clone(), loss) {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
@@ -327,26 +328,27 @@ fn select_limit_or_optimum(
     best: &OptimizationResult,
     grid: &Objective<'_>,
     limit: Vec<f64>,
-    clock: &TimeScaling,
-    settled: bool,
+    time_scaling: &TimeScaling,
+    has_converged: bool,
 ) -> Result<Vec<f64>> {
     let own_values = best.values();
     let shift: Vec<f64> =
-        clock.to_scaled(&limit).iter().zip(clock.to_scaled(&own_values)).map(|(a, b)| a - b).collect();
-    let mut way = vec![0.0; best.residuals.len()];
-    for (by, column) in clock.step(&own_values, &shift).iter().zip(&best.jacobian) {
-        way.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
+        time_scaling.to_scaled(&limit).iter().zip(time_scaling.to_scaled(&own_values)).map(|(a, b)| a - b).collect();
+    let mut change = vec![0.0; best.residuals.len()];
+    for (by, column) in time_scaling.step(&own_values, &shift).iter().zip(&best.jacobian) {
+        change.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
-    if inner(&way, &way) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
+    if inner(&change, &change) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
         // Both points have nearly the same residuals.
         return Ok(limit);
     }
     let limit_iterate = best.iterate_at(&limit);
-    if settled && let Some(evaluation) = grid.evaluate(&limit_iterate)? {
-        let predicted = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
-        let bent: Vec<f64> = evaluation.residuals.iter().zip(predicted).map(|(e, predicted)| e - predicted).collect();
-        if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
+    if has_converged && let Some(evaluation) = grid.evaluate(&limit_iterate)? {
+        let predicted = best.residuals.iter().zip(&change).map(|(e, w)| e + w);
+        let deviation: Vec<f64> =
+            evaluation.residuals.iter().zip(predicted).map(|(e, predicted)| e - predicted).collect();
+        if length(&deviation) <= MAX_CHANGE_STANDARD_ERRORS * length(&change) {
             return Ok(limit);
         }
     }

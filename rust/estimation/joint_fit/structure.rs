@@ -110,8 +110,9 @@ impl ParametricEquation {
 
     /// Names of the free coefficients in order of appearance, friction last.
     pub fn coefficient_names(&self) -> impl Iterator<Item = &String> {
-        let rubs = self.friction.iter().flat_map(|rubs| rubs.parameters()).filter_map(|(_, number)| number.name());
-        self.terms.iter().filter_map(|term| term.coefficient.name()).chain(rubs)
+        let friction_names =
+            self.friction.iter().flat_map(|friction| friction.parameters()).filter_map(|(_, number)| number.name());
+        self.terms.iter().filter_map(|term| term.coefficient.name()).chain(friction_names)
     }
 
     /// Order α of the equation, then the order of each term.
@@ -252,8 +253,8 @@ impl ParametricStructure {
     #[must_use]
     pub fn order_names(&self) -> Vec<String> {
         let orders = || self.equations.iter().flat_map(ParametricEquation::orders);
-        let alone = orders().filter(|order| order.is_single()).flat_map(Order::names);
-        unique(alone.chain(orders().flat_map(Order::names)))
+        let single_orders = orders().filter(|order| order.is_single()).flat_map(Order::names);
+        unique(single_orders.chain(orders().flat_map(Order::names)))
     }
 
     /// Names of the free coefficients.
@@ -323,8 +324,8 @@ impl ParametricStructure {
         let mut out = self.clone();
         for equation in &mut out.equations {
             equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.substitute(values));
-            if let Some(rubs) = &mut equation.friction {
-                for (_, number) in [&mut rubs.coulomb, &mut rubs.stribeck, &mut rubs.speed] {
+            if let Some(friction) = &mut equation.friction {
+                for (_, number) in [&mut friction.coulomb, &mut friction.stribeck, &mut friction.speed] {
                     *number = number.substitute(values);
                 }
             }

@@ -53,7 +53,7 @@ impl LinearizedProblem {
         point: &P::Point,
         jacobian: &[Vec<f64>],
         residuals: &[f64],
-        corners: bool,
+        fixes_kinks: bool,
     ) -> Self {
         let (mut order, rest): (Vec<usize>, Vec<usize>) = (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
         let eliminated_count = order.len();
@@ -80,16 +80,16 @@ impl LinearizedProblem {
         let constraints = (problem.constraints(point).into_iter())
             .map(|(normal, room)| {
                 let unscaled = |(&i, &scale): (&usize, &f64)| if scale > 0.0 { normal[i] / scale } else { 0.0 };
-                let turned: Vec<f64> = order.iter().zip(&scales).map(unscaled).collect();
-                let size = norm(&turned);
+                let direction: Vec<f64> = order.iter().zip(&scales).map(unscaled).collect();
+                let size = norm(&direction);
                 let (size, room) = if size > 0.0 { (size, room / size) } else { (1.0, f64::INFINITY) };
-                (turned.iter().map(|v| v / size).collect(), room)
+                (direction.iter().map(|v| v / size).collect(), room)
             })
             .collect();
         let is_fixed = (distance_to_bounds.iter().zip(&gradient).enumerate())
             .map(|(place, (&(down, up), &g))| {
                 let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
-                out || scales[place] <= 0.0 || (corners && problem.has_kinks(point, order[place]))
+                out || scales[place] <= 0.0 || (fixes_kinks && problem.has_kinks(point, order[place]))
             })
             .collect();
         Self {
@@ -121,8 +121,8 @@ impl LinearizedProblem {
 
     /// Return the active constraints that block the descent direction, as pairs of index and Lagrange multiplier.
     pub(crate) fn active_constraints(&self) -> Vec<(usize, f64)> {
-        let near = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
-        let active: Vec<usize> = (0..self.constraints.len()).filter(near).collect();
+        let is_active = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
+        let active: Vec<usize> = (0..self.constraints.len()).filter(is_active).collect();
         let free = |values: &[f64]| values.iter().zip(&self.is_fixed).map(|(v, f)| if *f { 0.0 } else { *v }).collect();
         let normals: Vec<Vec<f64>> = active.iter().map(|&k| free(&self.constraints[k].0)).collect();
         let downhill: Vec<f64> = self.gradient.iter().map(|g| -g).collect();
@@ -139,8 +139,8 @@ impl LinearizedProblem {
                 Some(triangular_damped_step(&self.r, is_fixed, self.eliminated_count, damping, &self.constraints))
             })
             .unwrap_or_default();
-        let falls = self.predicted_decrease(&step, 0);
-        (step, falls)
+        let decrease = self.predicted_decrease(&step, 0);
+        (step, decrease)
     }
 
     /// Return the step with secant curvature over the parameters that are not eliminated.
@@ -148,8 +148,8 @@ impl LinearizedProblem {
     /// Return also the predicted relative decrease of the cost, or None if the quadratic model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
         let step = self.step_within_bounds(|is_fixed| self.minimize_with_curvature(is_fixed, damping, curvature))?;
-        let falls = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
-        Some((step, falls))
+        let decrease = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
+        Some((step, decrease))
     }
 
     /// Relative increase of the cost along a scaled step that is due to the secant curvature.
@@ -236,8 +236,8 @@ impl LinearizedProblem {
         let mut target = vec![0.0; count];
         for (a, &i) in free.iter().enumerate() {
             for (b, &j) in free.iter().enumerate() {
-                let learnt = curvature.at(self.order[i], self.order[j]) / (self.scales[i] * self.scales[j]);
-                matrix[a * count + b] = product(i, j) + learnt + if a == b { damping } else { 0.0 };
+                let secant_curvature = curvature.at(self.order[i], self.order[j]) / (self.scales[i] * self.scales[j]);
+                matrix[a * count + b] = product(i, j) + secant_curvature + if a == b { damping } else { 0.0 };
             }
             target[a] =
                 -(self.eliminated_count..=i).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + k]).sum::<f64>();

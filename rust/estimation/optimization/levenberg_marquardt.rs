@@ -128,7 +128,8 @@ pub fn minimize<P: LeastSquaresProblem>(
     start: P::Point,
     settings: MinimizationSettings,
 ) -> Result<Minimum<P::Point, P::Evaluation>> {
-    let mut search = Search { problem, settings, evaluations: 1, gain: f64::INFINITY, hit: false, corners: false };
+    let mut search =
+        Search { problem, settings, evaluations: 1, gain: f64::INFINITY, left_domain: false, fixes_kinks: false };
     let mut at = search.start(start)?;
     if settings.evaluations == 0 {
         return Ok(at.into_minimum(1, Status::Exhausted));
@@ -170,7 +171,7 @@ struct SearchState<P: LeastSquaresProblem> {
     evaluation: P::Evaluation,
     cost: f64,
     jacobian: Vec<Vec<f64>>,
-    trusted: bool,
+    is_admissible: bool,
     damping: f64,
     curvature: Curvature,
     /// Last step in coordinates, and the gradient before it.
@@ -198,9 +199,9 @@ struct Search<'a, P> {
     /// Relative decrease of the cost by the last step.
     gain: f64,
     /// True if the last trial step left the domain of the problem.
-    hit: bool,
+    left_domain: bool,
     /// True if parameters with kinks are fixed.
-    corners: bool,
+    fixes_kinks: bool,
 }
 
 impl<P: LeastSquaresProblem> Search<'_, P> {
@@ -215,16 +216,25 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
     fn start(&self, start: P::Point) -> Result<SearchState<P>> {
         let evaluation = self.problem.evaluate(&start)?;
         let point = self.problem.point_of_evaluation(&evaluation, start);
-        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
+        let (cost, is_admissible) = (cost(self.problem.residuals(&evaluation)), self.problem.is_admissible(&point));
         let is_near = self.problem.starts_near_optimum();
         let damping = if is_near { INITIAL_DAMPING_NEAR_OPTIMUM } else { INITIAL_DAMPING };
         let curvature = Curvature::new(0);
-        Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
+        Ok(SearchState {
+            point,
+            evaluation,
+            cost,
+            jacobian: Vec::new(),
+            is_admissible,
+            damping,
+            curvature,
+            before: None,
+        })
     }
 
     /// Discard the gain of the last step and the flag of the domain limit.
     fn reset_progress(&mut self) {
-        (self.gain, self.hit) = (f64::INFINITY, false);
+        (self.gain, self.left_domain) = (f64::INFINITY, false);
     }
 
     /// Evaluate an extrapolation step. Return None if it leaves the domain of the problem.
@@ -236,7 +246,9 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             Ok(iterate)
         });
         match outcome {
-            Ok(iterate) if iterate.cost.is_finite() && (iterate.trusted || !from.trusted) => Ok(Some(iterate)),
+            Ok(iterate) if iterate.cost.is_finite() && (iterate.is_admissible || !from.is_admissible) => {
+                Ok(Some(iterate))
+            }
             Ok(_) => Ok(None),
             Err(error) if error.ends_simulation() => Ok(None),
             Err(error) => Err(error),
@@ -257,7 +269,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 &at.point,
                 &at.jacobian,
                 problem.residuals(&at.evaluation),
-                self.corners,
+                self.fixes_kinks,
             );
             if at.curvature.is_for(at.jacobian.len()) {
                 if let Some((step, gradient)) = at.before.take() {
@@ -270,21 +282,21 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             }
             let slope = linear.max_gradient();
             let level = slope <= flat * linear.norm;
-            let (newton, falls) = linear.damped_step_and_decrease(MIN_DAMPING);
-            let nowhere = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
+            let (newton, decrease) = linear.damped_step_and_decrease(MIN_DAMPING);
+            let is_small_step = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
             // In a valley, the minimum can be far away although the gradient is small. The predicted decrease is
             // therefore checked as well.
-            if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
+            if is_small_step || (level && (decrease <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
-            if self.gain <= settings.tolerance && self.hit {
+            if self.gain <= settings.tolerance && self.left_domain {
                 return Ok(Advance::Ended(Status::DomainLimit));
             }
-            self.hit = false;
+            self.left_domain = false;
             match self.find_descent_step(at, &linear, (slope, level))? {
                 Some(advance) => return Ok(advance),
                 // Fix the parameters with kinks and continue with the others.
-                None => (self.corners, at.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
+                None => (self.fixes_kinks, at.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
             }
         }
     }
@@ -306,7 +318,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 continue;
             }
             let first = if curved.is_some() { linear.eliminated_count } else { 0 };
-            let (step, falls) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
+            let (step, decrease) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
             let steps = linear.to_coordinates(&step);
             let (next, change) = problem.apply_step(&at.point, &steps);
             if change <= settings.tolerance || at.damping > MAX_DAMPING {
@@ -314,9 +326,9 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 // at a kink.
                 return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
-                } else if self.hit {
+                } else if self.left_domain {
                     Some(Advance::Ended(Status::DomainLimit))
-                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.has_kinks(&at.point, i)) {
+                } else if !self.fixes_kinks && (0..linear.scales.len()).any(|i| problem.has_kinks(&at.point, i)) {
                     None
                 } else {
                     Some(Advance::Ended(Status::Stalled))
@@ -326,11 +338,11 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 return Ok(Some(Advance::Ended(Status::Exhausted)));
             }
             self.evaluations += 1;
-            let trusts = problem.is_admissible(&next);
+            let is_admissible = problem.is_admissible(&next);
             // A step that does not decrease the cost or overflows is shortened.
             let trial = problem.evaluate(&next).and_then(|trial_evaluation| {
                 let reached = cost(problem.residuals(&trial_evaluation));
-                if !reached.is_finite() || (at.trusted && !trusts) {
+                if !reached.is_finite() || (at.is_admissible && !is_admissible) {
                     return Err(Error::Diverged { what: "step".into(), index: 0 });
                 }
                 if reached >= at.cost {
@@ -342,21 +354,21 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             match trial {
                 Ok(Some((slopes, trial_evaluation, reached, next))) => {
                     self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
-                    (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
-                        (next, trial_evaluation, reached, slopes, trusts);
+                    (at.point, at.evaluation, at.cost, at.jacobian, at.is_admissible) =
+                        (next, trial_evaluation, reached, slopes, is_admissible);
                     let predicted = linear.predicted_decrease(&step, first);
                     if !linear.is_constrained() {
                         let with = predicted - linear.curvature_change(&step, &at.curvature);
                         at.curvature.select_model(predicted, with, self.gain);
                     }
                     at.before = Some((steps.clone(), linear.gradient_by_parameter()));
-                    if self.gain >= ACCEPTABLE_GAIN_RATIO * falls {
+                    if self.gain >= ACCEPTABLE_GAIN_RATIO * decrease {
                         at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);
                     }
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
-                Ok(None) => self.hit = false,
-                Err(error) if error.ends_simulation() => self.hit = true,
+                Ok(None) => self.left_domain = false,
+                Err(error) if error.ends_simulation() => self.left_domain = true,
                 Err(error) => return Err(error),
             }
             at.damping *= DAMPING_FACTOR;

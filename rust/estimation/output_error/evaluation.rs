@@ -51,10 +51,10 @@ impl<P> Evaluation<P> {
                 let (basis, effects) = of(part);
                 sides.push((residual, basis, effects.iter().map(Vec::as_slice).collect()));
             }
-            let moves = solve_linear_steps(&sides)?;
-            linear.iter().zip(&moves).for_each(|(&j, by)| self.point.coefficients[j] += by);
+            let steps = solve_linear_steps(&sides)?;
+            linear.iter().zip(&steps).for_each(|(&j, by)| self.point.coefficients[j] += by);
             for (residual, part) in residuals.iter_mut().zip(&self.parts) {
-                for (effect, by) in of(part).1.iter().zip(&moves) {
+                for (effect, by) in of(part).1.iter().zip(&steps) {
                     residual.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
                 }
             }

@@ -108,11 +108,11 @@ impl EvaluationCache {
             places.push((k, grid));
         }
         places.sort_by_key(|(k, _)| *k);
-        let shelf = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
+        let cache = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
             let total = SPECTRUM_FACTORS * grid.borrow().bare.m();
             Self { stop: stop.clone(), grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
         };
-        Ok(places.into_iter().map(shelf).collect())
+        Ok(places.into_iter().map(cache).collect())
     }
 
     /// Return the responses of `n` outputs to initial terms t^e over at least `m` pulses.
@@ -154,8 +154,8 @@ impl EvaluationCache {
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
         // Terms of the same order share an operator.
-        let alike = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
-        let new_operator = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
+        let same_order = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
+        let new_operator = same_order.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
         grid.operators.insert(place, new_operator.clone());
         new_operator
     }

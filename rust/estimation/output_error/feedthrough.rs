@@ -184,12 +184,12 @@ impl JumpCorrection {
                     instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
                     return Some((experiment.point_deviation(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }
-                let still = (experiment.record.signal(signal).to_vec(), Vec::new());
+                let unchanged = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.law_of(signal) {
                     Some(d) => experiment.input_point_deviation(signal, &acted[d]),
                     None => (
-                        experiment.input_point_deviation(signal, &(still.0, vec![0.0; experiment.record.m()])).0,
-                        still.1,
+                        experiment.input_point_deviation(signal, &(unchanged.0, vec![0.0; experiment.record.m()])).0,
+                        unchanged.1,
                     ),
                 })
             })
@@ -225,17 +225,17 @@ impl JumpCorrection {
             let entry = |i: usize, s: usize| (0..n).map(|j| inverse[i * n + j] * driving[j * signals + s]).sum::<f64>();
             Ok((0..n * signals).map(|at| entry(at / signals, at % signals)).collect())
         };
-        let answered = solved(&|i, k| first_coefficient(structures[i].order - structures[i].terms[k].order, step))?;
+        let first_gains = solved(&|i, k| first_coefficient(structures[i].order - structures[i].terms[k].order, step))?;
         let direct = solved(&|i, k| f64::from(u8::from(at_once[i][k])))?;
-        Ok(answered.iter().zip(direct).map(|(first, direct)| first - direct).collect())
+        Ok(first_gains.iter().zip(direct).map(|(first, direct)| first - direct).collect())
     }
 
     fn feedthrough_terms(model: &FreeModel, point: &ParameterPoint) -> Vec<Vec<bool>> {
         let structures = model.structures(&point.orders);
-        let near = |s: &Structure| {
+        let feedthrough = |s: &Structure| {
             s.terms.iter().map(|term| (s.order - term.order).abs() < FEEDTHROUGH_ORDER_TOLERANCE).collect()
         };
-        structures.iter().map(near).collect()
+        structures.iter().map(feedthrough).collect()
     }
 
     /// Subtract the early part of the response, with the given gains, from weighted samples.

@@ -233,7 +233,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
 /// parameters are relative to the interval between their bounds.
 fn step_within_bounds(
     model: &FreeModel,
-    clock: &TimeUnit,
+    time_unit: &TimeUnit,
     point: &ParameterPoint,
     deltas: &[f64],
 ) -> (ParameterPoint, f64) {
@@ -247,9 +247,9 @@ fn step_within_bounds(
         change = change.max((*order - before).abs());
     }
     for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
-        let before = clock.factor(j, &point.orders) * point.coefficients[j];
+        let before = time_unit.factor(j, &point.orders) * point.coefficients[j];
         let value = coordinate.shift(before, delta);
-        next.coefficients[j] = value / clock.factor(j, &next.orders);
+        next.coefficients[j] = value / time_unit.factor(j, &next.orders);
         change = change.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
     for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
@@ -330,7 +330,7 @@ pub fn fit_stable(
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
-/// Fit a model as [`fit`] does, or as [`fit_stable`] if `steady` is true, with a cancellation flag.
+/// Fit a model as [`fit`] does, or as [`fit_stable`] if `requires_stability` is true, with a cancellation flag.
 ///
 /// # Errors
 /// [`Error::Diverged`] if the simulation of the initial guess is not finite. [`Error::OutOfRange`] if the initial guess
@@ -341,7 +341,7 @@ pub fn fit_until(
     experiments: &[Experiment],
     start: &ParameterPoint,
     settings: MinimizationSettings,
-    steady: bool,
+    requires_stability: bool,
     stop: &Stop,
 ) -> Result<OutputErrorFit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
@@ -368,20 +368,20 @@ pub fn fit_until(
     let exact = IntegerOrders::of(&model, experiments, &point);
     let sampled = if exact.is_some() { None } else { FractionalOrders::of(&model, experiments, &point) };
     let needs_pulses = exact.is_none() && sampled.is_none();
-    let shelves = RefCell::new(if needs_pulses { EvaluationCache::of(experiments, stop)? } else { Vec::new() });
-    let clock = TimeUnit::from_experiments(&model, experiments);
-    let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
+    let caches = RefCell::new(if needs_pulses { EvaluationCache::of(experiments, stop)? } else { Vec::new() });
+    let time_unit = TimeUnit::from_experiments(&model, experiments);
+    let start = (point.coefficients.iter().enumerate()).map(|(j, c)| time_unit.factor(j, &point.orders) * c).collect();
     let problem = OutputErrorProblem {
         model: &model,
         experiments,
         start,
-        time_unit: clock,
-        requires_stability: steady,
+        time_unit,
+        requires_stability,
         allows_extrapolation: plain,
         linear,
         exact,
         sampled,
-        caches: shelves,
+        caches,
         stop,
     };
     let optimum = minimize(&problem, point, settings)?;

@@ -212,7 +212,7 @@ impl FractionalOrders {
     ) -> Result<Evaluation<SampledSimulation>> {
         if model.is_unstable(point) {
             // The damping e^{−σt} of the transform does not bound the response of an unstable model.
-            return Err(Error::Diverged { what: "free run".into(), index: 0 });
+            return Err(Error::Diverged { what: "simulation".into(), index: 0 });
         }
         let structures = model.structures(&point.orders);
         let mut out = Evaluation::empty(point.clone());
@@ -253,7 +253,7 @@ impl FractionalOrders {
                 }
             }
             if let Some(index) = remainders.iter().position(|e| !e.is_finite()) {
-                return Err(Error::Diverged { what: "free run".into(), index });
+                return Err(Error::Diverged { what: "simulation".into(), index });
             }
             for i in 0..if model.initial.has_level() { structures.len() } else { 0 } {
                 let mut column = vec![0.0; size];

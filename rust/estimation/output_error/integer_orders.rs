@@ -240,8 +240,8 @@ impl Discretization {
         let n = state.len();
         let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
         let lag = input.map_or(0, |input| {
-            let late = input.between == Intersample::Hold && input.delay > input.delay.floor();
-            input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(late)
+            let is_fractional_delay = input.between == Intersample::Hold && input.delay > input.delay.floor();
+            input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(is_fractional_delay)
         });
         let at = |k: usize| match (input, delayed_row(k, lag)) {
             (None, _) => 0.0,
@@ -391,7 +391,7 @@ impl IntegerOrders {
             let weights = (0..self.equations.len()).flat_map(|i| experiment.weights_of(i));
             remainders.iter_mut().zip(response.zip(weights)).for_each(|(e, (v, w))| *e -= w * v);
             if let Some(index) = remainders.iter().position(|e| !e.is_finite()) {
-                return Err(Error::Diverged { what: "free run".into(), index });
+                return Err(Error::Diverged { what: "simulation".into(), index });
             }
             residuals.push(remainders);
             columns.push(initial);
@@ -416,7 +416,7 @@ impl IntegerOrders {
         let (record, count) = (&experiment.record, experiment.compared_count());
         let (every, step) = (experiment.pulses_per_sample, record.step());
         let outputs = self.equations.len();
-        let overflow = || Error::Diverged { what: "free run".into(), index: 0 };
+        let overflow = || Error::Diverged { what: "simulation".into(), index: 0 };
         let mut equations = Vec::with_capacity(outputs);
         let (mut basis, mut columns) = (Vec::new(), Vec::new());
         let place = |i: usize, samples: &mut dyn Iterator<Item = f64>| {

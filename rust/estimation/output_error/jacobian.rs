@@ -24,15 +24,15 @@ impl FreeModel {
     pub(crate) fn jacobian(
         &self,
         experiments: &[Experiment],
-        shelves: &mut [EvaluationCache],
+        caches: &mut [EvaluationCache],
         linear: &[usize],
         at: &Evaluation<Linearization>,
     ) -> Result<Vec<Vec<f64>>> {
         let point = &at.point;
         let count = point.orders.len() + point.coefficients.len() + point.inputs.len();
         let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
-        for (index, ((experiment, part), shelf)) in experiments.iter().zip(&at.parts).zip(shelves).enumerate() {
-            self.sensitivities(experiment, shelf, part, point, &at.initial[index], linear, &mut jacobian)?;
+        for (index, ((experiment, part), cache)) in experiments.iter().zip(&at.parts).zip(caches).enumerate() {
+            self.sensitivities(experiment, cache, part, point, &at.initial[index], linear, &mut jacobian)?;
         }
         if jacobian.iter().flatten().any(|v| !v.is_finite()) {
             return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
@@ -45,7 +45,7 @@ impl FreeModel {
     fn sensitivities(
         &self,
         experiment: &Experiment,
-        shelf: &mut EvaluationCache,
+        cache: &mut EvaluationCache,
         part: &Linearization,
         point: &ParameterPoint,
         initial: &[Vec<f64>],
@@ -65,7 +65,7 @@ impl FreeModel {
             (n, m),
             open.len(),
             |place, rights| {
-                shelf.stop.check()?;
+                cache.stop.check()?;
                 let parameter = open[place];
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
@@ -77,26 +77,26 @@ impl FreeModel {
                         let operator = &part.operators[i][k];
                         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
                             let slope = &part.input_means[input].1;
-                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
+                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || cache.spectrum(slope));
                         } else if let Some(j) = self.output_index(i, *signal) {
                             let (response, spectrum) = (&part.response[j], &mut responses[j]);
-                            let make_spectrum = || spectrum.get_or_insert_with(|| shelf.spectrum(response)).clone();
+                            let make_spectrum = || spectrum.get_or_insert_with(|| cache.spectrum(response)).clone();
                             rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), make_spectrum);
                         } else {
                             let series = || {
                                 Cow::Borrowed(self.input_means(record, (*signal, operator.eta()), &part.input_means))
                             };
                             let make_spectrum =
-                                || shelf.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
+                                || cache.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
                             rights.add(i, weight, (operator, turns), series, make_spectrum);
                         }
                     }
                     if parameter < orders.len()
                         && let Some(initial_slope) =
-                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))
+                            initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, cache))
                     {
-                        let series = || Cow::Owned(shelf.filter_series(&initial_slope));
-                        rights.add_series(i, series, || shelf.filtered_spectrum(&initial_slope));
+                        let series = || Cow::Owned(cache.filter_series(&initial_slope));
+                        rights.add_series(i, series, || cache.filtered_spectrum(&initial_slope));
                     }
                 }
                 Ok(())
@@ -181,7 +181,7 @@ fn initial_term_derivative(
     (i, parameter): (usize, usize),
     orders: &[f64],
     values: &[f64],
-    (experiment, shelf): (&Experiment, &EvaluationCache),
+    (experiment, cache): (&Experiment, &EvaluationCache),
 ) -> Option<Vec<f64>> {
     let slopes = initial_exponent_slopes(model, (i, parameter), orders, values.len(), experiment)?;
     let exponents = model.exponents(experiment, i, &model.structures(orders)[i]);
@@ -191,7 +191,7 @@ fn initial_term_derivative(
             continue;
         }
         out.resize(experiment.record.m(), 0.0);
-        let power = shelf.initial_term(exponent);
+        let power = cache.initial_term(exponent);
         out.iter_mut().zip(power.slope()).for_each(|(v, by)| *v += x * slope * by);
     }
     Some(out).filter(|out| !out.is_empty())

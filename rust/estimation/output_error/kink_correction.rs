@@ -131,9 +131,9 @@ impl KinkCorrection {
             match parameter.checked_sub(point.orders.len()) {
                 None => {
                     let of = |weights: &[f64]| weights.get(parameter).copied().unwrap_or(0.0);
-                    let turned = |k: &usize| of(&equation.order.weights) - of(&equation.terms[*k].1.weights);
+                    let exponent_slope = |k: &usize| of(&equation.order.weights) - of(&equation.terms[*k].1.weights);
                     let product: f64 = c.terms.iter().map(|&k| value(k)).product();
-                    (0.0, product * c.terms.iter().map(turned).sum::<f64>())
+                    (0.0, product * c.terms.iter().map(exponent_slope).sum::<f64>())
                 }
                 Some(j) => {
                     let one = |k: usize| equation.terms[k].2.slope(&point.coefficients, j);

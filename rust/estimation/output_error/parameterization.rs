@@ -291,8 +291,8 @@ impl FreeModel {
 
     /// Return true if an equation is unstable. Coupled equations are not checked, and the result is false.
     pub(crate) fn is_unstable(&self, point: &ParameterPoint) -> bool {
-        let alone = !self.coupled || self.equations.len() == 1;
-        alone && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
+        let uncoupled = !self.coupled || self.equations.len() == 1;
+        uncoupled && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
 
     /// Return true if every grid resolves the autoregressive terms of each equation, or if equations are coupled.
@@ -367,7 +367,7 @@ impl InputLaw {
     pub fn apply(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
         if !(value.is_finite() && (value >= 0.0 || self == Self::Delay)) {
             return Err(Error::OutOfRange {
-                name: "number of an input".into(),
+                name: "input parameter".into(),
                 value,
                 range: "[0, ∞)".into(),
                 remedy: "give a delay of at least 0, and symmetric limits of at least 0".into(),
@@ -501,8 +501,8 @@ fn time_powers(model: &FreeModel) -> Vec<Option<TimePower>> {
     consistent_powers(model).unwrap_or_else(|| {
         // Exponents conflict if one coefficient occurs with several orders. Under a coefficient law, no coefficient is
         // then scaled.
-        let lawful = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
-        (0..model.coordinates.len()).map(|j| if lawful { None } else { time_power(model, j) }).collect()
+        let has_coefficient_law = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
+        (0..model.coordinates.len()).map(|j| if has_coefficient_law { None } else { time_power(model, j) }).collect()
     })
 }
 

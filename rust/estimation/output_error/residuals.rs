@@ -49,29 +49,29 @@ impl FreeModel {
     pub(crate) fn evaluate(
         &self,
         experiments: &[Experiment],
-        shelves: &mut [EvaluationCache],
+        caches: &mut [EvaluationCache],
         point: &ParameterPoint,
         linear: &[usize],
     ) -> Result<Evaluation<Linearization>> {
         let structures = self.structures(&point.orders);
         let mut out = Evaluation::empty(point.clone());
-        let mut answers = Vec::with_capacity(experiments.len());
-        for (experiment, shelf) in experiments.iter().zip(shelves) {
-            answers.push(self.simulate_at_rest(experiment, shelf, &structures, point, linear, &mut out)?);
+        let mut responses = Vec::with_capacity(experiments.len());
+        for (experiment, cache) in experiments.iter().zip(caches) {
+            responses.push(self.simulate_at_rest(experiment, cache, &structures, point, linear, &mut out)?);
         }
         if !linear.is_empty() {
-            let sides: Vec<LinearSide<'_>> = (answers.iter())
+            let sides: Vec<LinearSide<'_>> = (responses.iter())
                 .map(|RestSimulation { part, residuals, .. }| {
                     let effects = part.linear_effects.iter().map(|d| &d.samples[..]).collect();
                     (&residuals[..], &part.basis[..], effects)
                 })
                 .collect();
-            let moves = solve_linear_steps(&sides)?;
-            linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
-            for (answer, experiment) in answers.iter_mut().zip(experiments) {
+            let steps = solve_linear_steps(&sides)?;
+            linear.iter().zip(&steps).for_each(|(&j, by)| out.point.coefficients[j] += by);
+            for (answer, experiment) in responses.iter_mut().zip(experiments) {
                 let Linearization { linear_effects: driven, response, feedthrough: direct, input_means: acted, .. } =
                     &mut answer.part;
-                for (column, by) in driven.iter_mut().zip(&moves) {
+                for (column, by) in driven.iter_mut().zip(&steps) {
                     column.apply(*by, &mut answer.residuals, response);
                 }
                 if direct.is_some() {
@@ -79,7 +79,7 @@ impl FreeModel {
                 }
             }
         }
-        for answer in answers {
+        for answer in responses {
             Self::add_initial_terms(answer, structures.len(), &mut out)?;
         }
         Ok(out)
@@ -88,54 +88,54 @@ impl FreeModel {
     fn simulate_at_rest(
         &self,
         experiment: &Experiment,
-        shelf: &mut EvaluationCache,
+        cache: &mut EvaluationCache,
         structures: &[Structure],
         point: &ParameterPoint,
         linear: &[usize],
         out: &mut Evaluation<Linearization>,
     ) -> Result<RestSimulation> {
-        shelf.stop.check()?;
+        cache.stop.check()?;
         let record = &experiment.record;
         let acted = (self.inputs.iter().zip(&point.inputs))
             .map(|(&input, &value)| self.apply_input_law(record, input, value))
             .collect::<Result<Vec<_>>>()?;
-        let operators = self.term_operators(experiment, shelf, structures)?;
+        let operators = self.term_operators(experiment, cache, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let has_level = self.initial.has_level();
         let needs_terms = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
-        let (response, solved) = self.rest_response(experiment, shelf, &operators, point, &acted)?;
-        shelf.stop.check()?;
+        let (response, solved) = self.rest_response(experiment, cache, &operators, point, &acted)?;
+        cache.stop.check()?;
         let mut residuals = experiment.measured_samples();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.weighted_samples(&response);
-        let early = JumpCorrection::of(self, experiment, &acted);
-        early.correct(self, experiment, point, &mut sampled)?;
+        let jump_correction = JumpCorrection::of(self, experiment, &acted);
+        jump_correction.correct(self, experiment, point, &mut sampled)?;
         residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
         let direct = Feedthrough::of(self, experiment, structures, point, &acted)?;
         if let Some(direct) = &direct {
             residuals.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
         }
-        let corners = KinkCorrection::of(self, experiment, structures);
-        if let Some(corners) = &corners {
-            let correction = corners.weighted_correction(self, experiment, point, direct.as_ref());
+        let kink_correction = KinkCorrection::of(self, experiment, structures);
+        if let Some(kink_correction) = &kink_correction {
+            let correction = kink_correction.weighted_correction(self, experiment, point, direct.as_ref());
             residuals.iter_mut().zip(correction).for_each(|(e, v)| *e -= v);
         }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
-            return Err(Error::Diverged { what: "free run".into(), index });
+            return Err(Error::Diverged { what: "simulation".into(), index });
         }
         let mut free = Vec::new();
         let mut basis = Vec::new();
         if needs_terms {
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
-            let beside = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
-            let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !beside(i, e)).copied().collect();
-            let mut answers =
-                shelf.initial_term_responses(&solved, (structures.len(), record.m()), &moving)?.into_iter();
+            let is_filter_only = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
+            let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !is_filter_only(i, e)).copied().collect();
+            let mut responses =
+                cache.initial_term_responses(&solved, (structures.len(), record.m()), &moving)?.into_iter();
             for (i, exponent) in terms {
-                let moves = if beside(i, exponent) { None } else { answers.next() };
-                let (samples, means) = match moves {
-                    None => (shelf.impulse_samples(experiment, i, exponent), Rc::default()),
+                let response = if is_filter_only(i, exponent) { None } else { responses.next() };
+                let (samples, means) = match response {
+                    None => (cache.impulse_samples(experiment, i, exponent), Rc::default()),
                     Some(means) => {
                         let mut samples = experiment.weighted_samples(&truncate_means(&means, record.m()));
                         if experiment.nonuniform.is_some() {
@@ -164,10 +164,10 @@ impl FreeModel {
             linear_effects: Vec::new(),
             input_means: acted,
             feedthrough: direct,
-            jump_correction: early,
-            kink_correction: corners,
+            jump_correction,
+            kink_correction,
         };
-        part.linear_effects = self.linear_effects(experiment, shelf, &part, point, linear)?;
+        part.linear_effects = self.linear_effects(experiment, cache, &part, point, linear)?;
         Ok(RestSimulation { part, residuals, free })
     }
 
@@ -177,7 +177,7 @@ impl FreeModel {
     fn term_operators(
         &self,
         experiment: &Experiment,
-        shelf: &EvaluationCache,
+        cache: &EvaluationCache,
         structures: &[Structure],
     ) -> Result<Vec<Vec<Rc<Operator>>>> {
         let mut operators = Vec::with_capacity(structures.len());
@@ -199,7 +199,7 @@ impl FreeModel {
                     // This is reported as divergence, so that the optimization shortens its step.
                     return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
                 }
-                row.push(shelf.operator((i, k), eta, self.depends_on_free_order(i, k)));
+                row.push(cache.operator((i, k), eta, self.depends_on_free_order(i, k)));
             }
             operators.push(row);
         }
@@ -210,7 +210,7 @@ impl FreeModel {
     fn rest_response(
         &self,
         experiment: &Experiment,
-        shelf: &mut EvaluationCache,
+        cache: &mut EvaluationCache,
         operators: &[Vec<Rc<Operator>>],
         point: &ParameterPoint,
         acted: &[(Vec<f64>, Vec<f64>)],
@@ -243,7 +243,7 @@ impl FreeModel {
                             let eta = operators[i][k].eta();
                             let series = || Cow::Borrowed(self.input_means(record, (signal, eta), acted));
                             rights.add(i, c, (&operators[i][k], false), series, || {
-                                shelf.input_spectrum(self, experiment, (signal, eta), acted)
+                                cache.input_spectrum(self, experiment, (signal, eta), acted)
                             });
                         }
                     }
@@ -257,7 +257,7 @@ impl FreeModel {
             return Ok((response, Rc::new(solved)));
         }
         let mut rhs = vec![vec![0.0; m]; n];
-        let mut sum = SumOfProducts::with_length(shelf.total);
+        let mut sum = SumOfProducts::with_length(cache.total);
         let mut buffers = Buffers::default();
         let mut bits = Vec::new();
         for (i, row) in operators.iter().enumerate() {
@@ -271,7 +271,7 @@ impl FreeModel {
                     sum.add(
                         c,
                         &operator.spectrum(false),
-                        &shelf.input_spectrum(self, experiment, (signal, operator.eta()), acted),
+                        &cache.input_spectrum(self, experiment, (signal, operator.eta()), acted),
                     );
                 }
             }
@@ -279,8 +279,8 @@ impl FreeModel {
                 sum.take(&mut rhs[i], &mut buffers);
             }
         }
-        let solved = shelf.system_inverse(bits, || {
-            let mut matrix = vec![vec![vec![0.0; shelf.pulses()]; n]; n];
+        let solved = cache.system_inverse(bits, || {
+            let mut matrix = vec![vec![vec![0.0; cache.pulses()]; n]; n];
             for (i, row) in operators.iter().enumerate() {
                 matrix[i][i][0] += 1.0;
                 for (k, operator) in row.iter().enumerate() {
@@ -355,7 +355,7 @@ fn truncate_means(means: &PulseMeans, m: usize) -> Cow<'_, [Vec<f64>]> {
 impl FreeModel {
     /// Indices of the coefficients that occur alone and only in terms of external inputs.
     pub(crate) fn linear_coefficients(&self) -> Vec<usize> {
-        let stands = |j: usize| {
+        let stays = |j: usize| {
             let mut is_free = false;
             for (i, equation) in self.equations.iter().enumerate() {
                 for (signal, _, monomial) in &equation.terms {
@@ -370,14 +370,14 @@ impl FreeModel {
             is_free
         };
         let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
-        (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
+        (0..self.coordinates.len()).filter(|&j| moves(j) && stays(j)).collect()
     }
 
     /// Return the effect of each of the given input coefficients on an experiment.
     pub(crate) fn linear_effects(
         &self,
         experiment: &Experiment,
-        shelf: &mut EvaluationCache,
+        cache: &mut EvaluationCache,
         part: &Linearization,
         point: &ParameterPoint,
         coefficients: &[usize],
@@ -391,7 +391,7 @@ impl FreeModel {
             (n, record.m()),
             coefficients.len(),
             |place, rights| {
-                shelf.stop.check()?;
+                cache.stop.check()?;
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
                         let weight = monomial.slope(&point.coefficients, coefficients[place]);
@@ -399,7 +399,7 @@ impl FreeModel {
                             let eta = part.operators[i][k].eta();
                             let series = || Cow::Borrowed(self.input_means(record, (*signal, eta), &part.input_means));
                             rights.add(i, weight, (&part.operators[i][k], false), series, || {
-                                shelf.input_spectrum(self, experiment, (*signal, eta), &part.input_means)
+                                cache.input_spectrum(self, experiment, (*signal, eta), &part.input_means)
                             });
                         }
                     }
@@ -411,7 +411,7 @@ impl FreeModel {
                 let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
                 let effect = part.parameter_effect(parameter, means, (self, experiment, point))?;
                 if let Some(index) = effect.samples.iter().position(|v| !v.is_finite()) {
-                    return Err(Error::Diverged { what: "free run".into(), index });
+                    return Err(Error::Diverged { what: "simulation".into(), index });
                 }
                 driven.push(effect);
                 Ok(())
@@ -458,8 +458,8 @@ impl Linearization {
         if let Some(direct) = &self.feedthrough {
             add_feedthrough_derivative(model, experiment, direct, point, parameter, &mut samples);
         }
-        if let Some(corners) = &self.kink_correction {
-            corners.add_slope(model, experiment, self.feedthrough.as_ref(), point, parameter, &mut samples);
+        if let Some(kink_correction) = &self.kink_correction {
+            kink_correction.add_slope(model, experiment, self.feedthrough.as_ref(), point, parameter, &mut samples);
         }
         Ok(ParameterEffect { samples, means })
     }

@@ -46,15 +46,15 @@ pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
     let ends = |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| apart(end, power));
     let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
     let steps = ((last - first) / MAX_LOG_FREQUENCY_STEP).ceil().clamp(1.0, 1e6);
-    let mut turned = 0.0;
+    let mut angle = 0.0;
     let mut start = (first, curve_point(&powers, first));
     for k in 1..=steps as usize {
         let next = first + (last - first) * k as f64 / steps;
         let next_point = (next, curve_point(&powers, next));
-        turned += angle_change(&powers, start, next_point);
+        angle += angle_change(&powers, start, next_point);
         start = next_point;
     }
-    0.5 * (high.1 - low.1) - turned / PI > MIN_UNSTABLE_ZERO_COUNT
+    0.5 * (high.1 - low.1) - angle / PI > MIN_UNSTABLE_ZERO_COUNT
 }
 
 /// Merge powers (coefficient, exponent) whose exponents are closer than [`EXPONENT_TOLERANCE`].

@@ -182,7 +182,7 @@ impl SystemInverse {
             let rows = solver.inverse_spectra(total)?;
             return Ok(self.inverse.get_or_init(|| Inverse::Spectra { rows, total }));
         }
-        self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
+        self.inverse.get().ok_or_else(|| Error::Internal { what: "system without a solver".into() })
     }
 
     /// Return the responses of `n` outputs over `m` pulses to the initial terms t^e of equations.
@@ -317,8 +317,8 @@ impl Operator {
         }
         // With the kernel F(η), the kernel of a negative order is 1/F(−η). Its derivative with respect to η is
         // F′(−η)/F(−η)².
-        let (_, turned) = kernel_with_derivative(-self.eta, self.m, self.step);
-        let (mut product, spectrum) = (Kernel::with_length(&turned, total), self.spectrum(false));
+        let (_, derivative) = kernel_with_derivative(-self.eta, self.m, self.step);
+        let (mut product, spectrum) = (Kernel::with_length(&derivative, total), self.spectrum(false));
         product.multiply(&spectrum);
         let mut slope = vec![0.0; self.m];
         product.times(&spectrum, &mut slope, &mut Buffers::default());
@@ -343,9 +343,9 @@ impl Operator {
     /// Integration order if it is a fixed integer from 0 to [`MAX_SUMS`], else None.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn integer_order(&self) -> Option<usize> {
-        let near = self.eta.round();
-        let stays = !self.free && (self.eta - near).abs() <= INTEGER_TOLERANCE && near >= 0.0;
-        (stays && near <= MAX_SUMS as f64).then_some(near as usize)
+        let nearest = self.eta.round();
+        let is_integer = !self.free && (self.eta - nearest).abs() <= INTEGER_TOLERANCE && nearest >= 0.0;
+        (is_integer && nearest <= MAX_SUMS as f64).then_some(nearest as usize)
     }
 
     /// Spectrum of the kernel, or of its derivative, for products of [`SPECTRUM_FACTORS`] series.

@@ -36,7 +36,7 @@ const REFINEMENT_CHUNK_RANGE: (u64, u64) = (32, 1024);
 
 /// Evaluation of a range of batches.
 pub(super) struct BatchEvaluation<'a> {
-    pub(super) catalogue: &'a CandidateIndex<'a>,
+    pub(super) candidate_index: &'a CandidateIndex<'a>,
     /// Branch and bound over boxes, if it is used.
     boxes: Option<&'a BranchAndBound>,
     pub(super) pool: &'a rayon::ThreadPool,
@@ -52,13 +52,13 @@ pub(super) struct BatchEvaluation<'a> {
 
 impl<'a> BatchEvaluation<'a> {
     pub(super) fn new(
-        catalogue: &'a CandidateIndex<'a>,
+        candidate_index: &'a CandidateIndex<'a>,
         boxes: Option<&'a BranchAndBound>,
         pool: &'a rayon::ThreadPool,
         control: &'a Control,
     ) -> Self {
         Self {
-            catalogue,
+            candidate_index,
             boxes,
             pool,
             control,
@@ -89,21 +89,21 @@ impl<'a> BatchEvaluation<'a> {
     ) -> Result<bool> {
         let (start, end) = bounds;
         let (limit, resumed) = (top_rows.limit, place.end > 0);
-        let (catalogue, control) = (self.catalogue, self.control);
+        let (candidate_index, control) = (self.candidate_index, self.control);
         let parts: Vec<(Vec<OpenCandidate>, Vec<u64>, u64)> = self.pool.install(|| {
             self.chunks(start, end, limit)
                 .par_iter()
                 .with_max_len(1)
-                .map(|(lo, hi, slab)| {
+                .map(|(lo, hi, slice)| {
                     let (lo, hi) = (*lo, *hi);
                     if control.is_stopped() {
                         return Default::default();
                     }
-                    let boxes = slab.as_ref().zip(self.boxes);
+                    let boxes = slice.as_ref().zip(self.boxes);
                     let boxes_outcome = boxes
-                        .and_then(|(slab, boxes)| screen_slice(catalogue, boxes, slab, (lo, hi), limit))
+                        .and_then(|(slice, boxes)| screen_slice(candidate_index, boxes, slice, (lo, hi), limit))
                         .unwrap_or_else(|| {
-                            let (open, singular) = screen(catalogue, lo, hi, limit);
+                            let (open, singular) = screen(candidate_index, lo, hi, limit);
                             (open, singular, 0)
                         });
                     let closed = hi - lo - (boxes_outcome.0.len() + boxes_outcome.1.len()) as u64;
@@ -145,18 +145,18 @@ impl<'a> BatchEvaluation<'a> {
     /// limit of the raw score (Σ|e| or Σe²).
     pub(super) fn boxes_are_worthwhile(&self, limit: f64) -> Result<bool> {
         let Some(boxes) = self.boxes else { return Ok(false) };
-        let (catalogue, control) = (self.catalogue, self.control);
-        let order = low_discrepancy_order(catalogue.lattice.count());
-        let places: Vec<u64> = (0..TRIAL_SLICES.min(catalogue.lattice.count())).map(order).collect();
+        let (candidate_index, control) = (self.candidate_index, self.control);
+        let order = low_discrepancy_order(candidate_index.grid.count());
+        let places: Vec<u64> = (0..TRIAL_SLICES.min(candidate_index.grid.count())).map(order).collect();
         let counts: Vec<(u64, u64)> = self.pool.install(|| {
             places
                 .into_par_iter()
                 .with_max_len(1)
                 .filter_map(|at| {
-                    let slab = catalogue.lattice.slice_at(at).filter(|_| !control.is_stopped())?;
-                    let end = slab.hi.min(slab.lo + MIN_SLICE_CANDIDATES);
-                    let (.., boxed) = screen_slice(catalogue, boxes, &slab, (slab.lo, end), limit)?;
-                    Some((end - slab.lo, boxed))
+                    let slice = candidate_index.grid.slice_at(at).filter(|_| !control.is_stopped())?;
+                    let end = slice.hi.min(slice.lo + MIN_SLICE_CANDIDATES);
+                    let (.., boxed) = screen_slice(candidate_index, boxes, &slice, (slice.lo, end), limit)?;
+                    Some((end - slice.lo, boxed))
                 })
                 .collect()
         });
@@ -171,15 +171,16 @@ impl<'a> BatchEvaluation<'a> {
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<GridSlice>)> {
         let mut chunks = Vec::new();
         // With boxes, a chunk must not extend far into the next slice.
-        let plain = self.catalogue.problem.residual_sums.is_some() && self.boxes.is_none();
+        let plain = self.candidate_index.problem.residual_sums.is_some() && self.boxes.is_none();
         let chunk = if plain { GRAM_CHUNK_CANDIDATES } else { BOUND_CHUNK_CANDIDATES };
         let mut at = start;
         while at < end {
-            let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slice_at(at));
-            if let Some(slab) = boxed {
-                let to = end.min(slab.hi);
+            let boxed =
+                self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.candidate_index.grid.slice_at(at));
+            if let Some(slice) = boxed {
+                let to = end.min(slice.hi);
                 if to - at >= MIN_SLICE_CANDIDATES {
-                    chunks.push((at, to, Some(slab)));
+                    chunks.push((at, to, Some(slice)));
                     at = to;
                     continue;
                 }
@@ -203,7 +204,7 @@ impl<'a> BatchEvaluation<'a> {
         if open.is_empty() {
             return Ok(());
         }
-        let CandidateIndex { problem, options, .. } = self.catalogue;
+        let CandidateIndex { problem, options, .. } = self.candidate_index;
         let saving = counted && self.control.saving.load(Ordering::Relaxed);
         // A refinement costs about ten times a simulation.
         let pulses = if problem.refines() { CHECKPOINT_PULSES / 8 } else { CHECKPOINT_PULSES };
@@ -229,8 +230,8 @@ impl<'a> BatchEvaluation<'a> {
                     self.result.failures.truncate(MAX_LISTED_FAILURES);
                     let rows = rows.into_iter().filter(|row| top_rows.contains(row)).collect();
                     let part = Part { rows, counts: self.result.counts, failures: self.result.failures.clone() };
-                    let anew = std::mem::take(&mut self.replaces_previous);
-                    self.control.save(Checkpoint { place, replaces_previous: anew, part });
+                    let replaces_previous = std::mem::take(&mut self.replaces_previous);
+                    self.control.save(Checkpoint { place, replaces_previous, part });
                 } else {
                     top_rows.insert_rows(rows.into_iter());
                 }
@@ -248,8 +249,8 @@ impl<'a> BatchEvaluation<'a> {
     /// Simulate these candidates up to a limit of the raw score (Σ|e| or Σe²). Return the rows of candidates whose
     /// score is at most the limit. If `counted` is true, counts are updated.
     fn simulate_chunk(&mut self, open: &[OpenCandidate], limit: f64, counted: bool) -> Result<Vec<Row>> {
-        let (catalogue, control, scratches) = (self.catalogue, self.control, &self.scratches);
-        let problem = &catalogue.problem;
+        let (candidate_index, control, scratches) = (self.candidate_index, self.control, &self.scratches);
+        let problem = &candidate_index.problem;
         let visit = |candidate: &OpenCandidate| {
             if control.is_stopped() {
                 return None;
@@ -260,11 +261,11 @@ impl<'a> BatchEvaluation<'a> {
             scratches.with(|scratch| {
                 let mut positions = std::mem::take(&mut scratch.positions);
                 let mut initial = std::mem::take(&mut scratch.initial);
-                let cursor = Cursor::at(&catalogue.lattice, candidate.index);
+                let cursor = Cursor::at(&candidate_index.grid, candidate.index);
                 positions.clear();
-                positions.resize(catalogue.lattice.width(), 0);
-                catalogue.positions(&cursor, &mut positions);
-                catalogue.initial(&cursor, &mut initial);
+                positions.resize(candidate_index.grid.width(), 0);
+                candidate_index.positions(&cursor, &mut positions);
+                candidate_index.initial(&cursor, &mut initial);
                 let verdict = problem.evaluate(&positions, &initial, limit, false, scratch, control);
                 let row = match verdict {
                     Verdict::Score(raw) if raw <= limit => {
@@ -344,18 +345,18 @@ mod tests {
             let values = (0..40).map(|i| from + 0.01 * f64::from(i)).collect();
             TermAxis { signal, values, interchangeable: false }
         };
-        let lattice = OrderGrid::new(0, &[1.4, 1.6], &[axis(0, 0.1), axis(1, 0.6)], |signal| signal == 1)?;
+        let grid = OrderGrid::new(0, &[1.4, 1.6], &[axis(0, 0.1), axis(1, 0.6)], |signal| signal == 1)?;
         let (pool, control, options) = (pool(1)?, Control::default(), Options::default());
-        let (lattice, fixed) = (Cow::Borrowed(&lattice), [None, None]);
-        let catalogue = CandidateIndex::new(&[record], lattice, &fixed, &options, &pool, &Stop::default())?;
-        let boxes = pool.install(|| BranchAndBound::new(&catalogue));
-        let hunt = BatchEvaluation::new(&catalogue, boxes.as_ref(), &pool, &control);
-        assert!(hunt.boxes_are_worthwhile(1e-3 * size)?);
+        let (grid, fixed) = (Cow::Borrowed(&grid), [None, None]);
+        let candidate_index = CandidateIndex::new(&[record], grid, &fixed, &options, &pool, &Stop::default())?;
+        let boxes = pool.install(|| BranchAndBound::new(&candidate_index));
+        let evaluation = BatchEvaluation::new(&candidate_index, boxes.as_ref(), &pool, &control);
+        assert!(evaluation.boxes_are_worthwhile(1e-3 * size)?);
         // Nothing exceeds a limit as large.
-        assert!(!hunt.boxes_are_worthwhile(1e3 * size)?);
-        assert!(!BatchEvaluation::new(&catalogue, None, &pool, &control).boxes_are_worthwhile(1e-3 * size)?);
+        assert!(!evaluation.boxes_are_worthwhile(1e3 * size)?);
+        assert!(!BatchEvaluation::new(&candidate_index, None, &pool, &control).boxes_are_worthwhile(1e-3 * size)?);
         control.stop.set();
-        assert!(hunt.boxes_are_worthwhile(1e-3 * size).is_err());
+        assert!(evaluation.boxes_are_worthwhile(1e-3 * size).is_err());
         Ok(())
     }
 }

@@ -52,34 +52,34 @@ use crate::regressors::Record;
 /// // y is the integral of order 0.8 of u: D^0.8 y = u.
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-/// let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
-/// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
-/// assert_eq!(lattice.structure(found.rows[0].index).order, 0.8);
+/// let grid = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+/// let found = search(&[record], &grid, &[None], &Options::default(), &Control::default())?;
+/// assert_eq!(grid.structure(found.rows[0].index).order, 0.8);
 /// assert!((found.rows[0].coefficients[0] - 1.0).abs() < 1e-9);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn search(
     records: &[Record],
-    lattice: &OrderGrid,
+    grid: &OrderGrid,
     fixed: &[Option<f64>],
     options: &Options,
     control: &Control,
 ) -> Result<Outcome> {
     let pool = pool(options.threads)?;
-    let ready = BatchEvaluator::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
+    let evaluator = BatchEvaluator::new(records, Cow::Borrowed(grid), fixed, options, &pool, control)?;
     let mut all = Part::default();
     let mut first = 0;
-    for last in generation_ends(batch_count(lattice.count(), options)) {
+    for last in generation_ends(batch_count(grid.count(), options)) {
         let seed = all.seed();
-        all.join(ready.evaluate_batches(first, last, &seed, None, &pool, control)?, options.top);
+        all.merge(evaluator.evaluate_batches(first, last, &seed, None, &pool, control)?, options.top);
         first = last;
     }
-    Ok(all.outcome(options.norm, ready.catalogue.problem.samples()))
+    Ok(all.outcome(options.norm, evaluator.candidate_index.problem.samples()))
 }
 
 /// Evaluator of an order search, with the data that all batches share.
 pub struct BatchEvaluator<'a> {
-    catalogue: CandidateIndex<'a>,
+    candidate_index: CandidateIndex<'a>,
     /// Branch and bound over boxes of candidates, if it saves time.
     boxes: Option<BranchAndBound>,
     /// Raw score (Σ|e| or Σe²) above which no candidate can enter the table, from an initial sample of candidates.
@@ -95,47 +95,49 @@ impl<'a> BatchEvaluator<'a> {
     /// request.
     pub fn new(
         records: &[Record],
-        lattice: Cow<'a, OrderGrid>,
+        grid: Cow<'a, OrderGrid>,
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Self> {
-        let count = lattice.count();
-        let mut catalogue = CandidateIndex::new(records, lattice, fixed, options, pool, &control.stop)?;
+        let count = grid.count();
+        let mut candidate_index = CandidateIndex::new(records, grid, fixed, options, pool, &control.stop)?;
         control.total.store(count, Ordering::Relaxed);
         control.check_stop()?;
-        let problem = &catalogue.problem;
+        let problem = &candidate_index.problem;
         // An initial sample of few refined candidates would cost as much as the search.
         let few = problem.refines() && count <= MAX_UNSAMPLED_CANDIDATES;
         if few || (problem.bound.is_none() && problem.residual_sums.is_none()) {
-            return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
+            return Ok(Self { candidate_index, boxes: None, limit: f64::INFINITY });
         }
-        let pay = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&catalogue);
+        let uses_boxes = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&candidate_index);
         let closely = uses_close_bounds(count, options);
-        let InitialIncumbent { mut top_rows, mut evaluated, needs_close_bounds: hard, selected_vectors: which } =
-            BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
-        if let Some(which) = which {
-            let problem = &mut catalogue.problem;
-            problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&which));
+        let InitialIncumbent { mut top_rows, mut evaluated, needs_close_bounds, selected_vectors: selected } =
+            BatchEvaluation::new(&candidate_index, None, pool, control).find_incumbent(uses_boxes, closely)?;
+        if let Some(selected) = selected {
+            let problem = &mut candidate_index.problem;
+            problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&selected));
         }
         // The Gram matrix determines squared equation errors completely.
-        if pay && catalogue.problem.residual_sums.is_none() && top_rows.limit < f64::INFINITY {
-            let (adapted, bytes) = catalogue.problem.empty_tailored_vectors();
-            catalogue.problem.tailored_vectors = Some(adapted);
-            for time in 0.. {
+        if uses_boxes && candidate_index.problem.residual_sums.is_none() && top_rows.limit < f64::INFINITY {
+            let (tailored, bytes) = candidate_index.problem.empty_tailored_vectors();
+            candidate_index.problem.tailored_vectors = Some(tailored);
+            for pass in 0.. {
                 let best = top_rows.rows.first().map(|row| row.index);
-                let GeneratedVectors { vectors, open: candidates, is_worth_repeating: again } = BatchEvaluation::new(
-                    &catalogue, None, pool, control,
-                )
-                .generate_tailored_vectors(top_rows.limit, time, best)?;
-                catalogue.spare_bytes =
-                    catalogue.spare_bytes.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
-                if let Some(adapted) = &mut catalogue.problem.tailored_vectors {
-                    adapted.vectors.extend(vectors);
+                let GeneratedVectors { vectors, open: candidates, is_worth_repeating: again } =
+                    BatchEvaluation::new(&candidate_index, None, pool, control).generate_tailored_vectors(
+                        top_rows.limit,
+                        pass,
+                        best,
+                    )?;
+                candidate_index.spare_bytes =
+                    candidate_index.spare_bytes.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
+                if let Some(tailored) = &mut candidate_index.problem.tailored_vectors {
+                    tailored.vectors.extend(vectors);
                 }
                 // Candidates that no test vector excludes are likely to have a low score.
-                BatchEvaluation::new(&catalogue, None, pool, control).refine_from(
+                BatchEvaluation::new(&candidate_index, None, pool, control).refine_from(
                     &candidates,
                     &mut top_rows,
                     &mut evaluated,
@@ -146,27 +148,28 @@ impl<'a> BatchEvaluator<'a> {
             }
         }
         let limit = top_rows.limit;
-        if hard {
-            let spare = catalogue.spare_bytes;
-            catalogue.spare_bytes -= pool.install(|| catalogue.problem.add_unstable_zeros(spare));
-            let along = BatchEvaluation::new(&catalogue, None, pool, control).generate_linearized_vectors(limit)?;
+        if needs_close_bounds {
+            let spare = candidate_index.spare_bytes;
+            candidate_index.spare_bytes -= pool.install(|| candidate_index.problem.add_unstable_zeros(spare));
+            let along =
+                BatchEvaluation::new(&candidate_index, None, pool, control).generate_linearized_vectors(limit)?;
             if let Some(along) = along {
-                catalogue.spare_bytes = catalogue.spare_bytes.saturating_sub(along.memory_bytes());
-                catalogue.problem.linearized_vectors = Some(along);
+                candidate_index.spare_bytes = candidate_index.spare_bytes.saturating_sub(along.memory_bytes());
+                candidate_index.problem.linearized_vectors = Some(along);
             }
         }
-        let mut boxes = pool.install(|| if pay { BranchAndBound::new(&catalogue) } else { None });
+        let mut boxes = pool.install(|| if uses_boxes { BranchAndBound::new(&candidate_index) } else { None });
         control.check_stop()?;
         // Boxes and tailored test vectors may fail to exclude the candidates of the initial sample that are still to be
         // simulated.
-        if hard
+        if needs_close_bounds
             && boxes.is_some()
-            && !BatchEvaluation::new(&catalogue, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
+            && !BatchEvaluation::new(&candidate_index, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
         {
             boxes = None;
-            catalogue.problem.tailored_vectors = None;
+            candidate_index.problem.tailored_vectors = None;
         }
-        Ok(Self { catalogue, boxes, limit })
+        Ok(Self { candidate_index, boxes, limit })
     }
 
     /// Evaluate batches `first … last − 1`, and return their counts and best rows. The batches must belong to one
@@ -194,13 +197,13 @@ impl<'a> BatchEvaluator<'a> {
     /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
     /// # let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
     /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// # let lattice = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+    /// # let grid = OrderGrid::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
     /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);
-    /// let evaluator = BatchEvaluator::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
+    /// let evaluator = BatchEvaluator::new(&[record], Cow::Borrowed(&grid), &[None], &options, &pool, &control)?;
     /// let (mut all, mut first) = (Part::default(), 0);
-    /// for last in generation_ends(batch_count(lattice.count(), &options)) {
+    /// for last in generation_ends(batch_count(grid.count(), &options)) {
     ///     let seed = all.seed();
-    ///     all.join(evaluator.evaluate_batches(first, last, &seed, None, &pool, &control)?, options.top);
+    ///     all.merge(evaluator.evaluate_batches(first, last, &seed, None, &pool, &control)?, options.top);
     ///     first = last;
     /// }
     /// assert_eq!(all.counts.candidates, 4);
@@ -215,8 +218,8 @@ impl<'a> BatchEvaluator<'a> {
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Part> {
-        let CandidateIndex { lattice, options, .. } = &self.catalogue;
-        let count = lattice.count();
+        let CandidateIndex { grid, options, .. } = &self.candidate_index;
+        let count = grid.count();
         let (all, length) = (batch_count(count, options), batch_size(count, options));
         let is_first = from.is_none();
         let from = from.unwrap_or_else(|| Checkpoint {
@@ -241,13 +244,13 @@ impl<'a> BatchEvaluator<'a> {
         // Batches are distributed over the grid. Early generations therefore sample all of it, and later ones start
         // with a low limit.
         let order = low_discrepancy_order(all);
-        let mut hunt = BatchEvaluation::new(&self.catalogue, self.boxes.as_ref(), pool, control);
+        let mut evaluation = BatchEvaluation::new(&self.candidate_index, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
         let processed = part.counts.processed_count();
         control.count(processed, 0);
-        hunt.result = part;
-        hunt.replaces_previous = is_first;
+        evaluation.result = part;
+        evaluation.replaces_previous = is_first;
         while place.batch < last {
             let start = order(place.batch) * length;
             let bounds = (start, count.min(start + length));
@@ -256,12 +259,13 @@ impl<'a> BatchEvaluator<'a> {
             let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
             top_rows.insert_rows(seeds);
             top_rows.lower_limit(options.pruning);
-            top_rows.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
-            hunt.result.rows.retain(|row| !own(row));
-            if !hunt.evaluate_batch(bounds, &mut top_rows, place)? {
+            top_rows.insert_rows(evaluation.result.rows.iter().filter(|row| own(row)).cloned());
+            evaluation.result.rows.retain(|row| !own(row));
+            if !evaluation.evaluate_batch(bounds, &mut top_rows, place)? {
                 // Some candidates would be evaluated twice or never, so the result of the checkpoint is discarded.
                 control.finished_count.fetch_sub(processed, Ordering::Relaxed);
-                (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
+                (evaluation.result, evaluation.replaces_previous, place) =
+                    (Part::default(), true, BatchPosition::start(first));
                 continue;
             }
             let part = Part {
@@ -269,15 +273,15 @@ impl<'a> BatchEvaluator<'a> {
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
                 failures: Vec::new(),
             };
-            hunt.result.join(part, options.top);
+            evaluation.result.merge(part, options.top);
             place = BatchPosition::start(place.batch + 1);
         }
-        Ok(hunt.result)
+        Ok(evaluation.result)
     }
 
     /// Return [`crate::error::Error::Structure`] for a partial result that belongs to another search.
     fn check(&self, part: &Part) -> Result<()> {
-        let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
+        let (count, width) = (self.candidate_index.grid.count(), self.candidate_index.grid.width());
         let other = |row: &Row| row.coefficients.len() != width || row.index >= count || is_invalid_score(row.score);
         if part.rows.iter().any(other) || part.failures.iter().any(|failure| failure.0 >= count) {
             return Err(mismatch_error("a checkpoint holds rows of another search".into()));

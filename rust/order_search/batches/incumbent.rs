@@ -48,9 +48,9 @@ impl BatchEvaluation<'_> {
     /// also evaluated. If `closely` is true, also decide whether the expensive bounds (unstable zeros and linearized
     /// test vectors) save time.
     pub(super) fn find_incumbent(&mut self, thorough: bool, closely: bool) -> Result<InitialIncumbent> {
-        let catalogue = self.catalogue;
-        let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
-        let count = lattice.count();
+        let candidate_index = self.candidate_index;
+        let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
+        let count = grid.count();
         let order = low_discrepancy_order(count);
         let refined = problem.refines();
         let indices: Vec<u64> =
@@ -59,11 +59,11 @@ impl BatchEvaluation<'_> {
             indices
                 .par_iter()
                 .map(|&index| {
-                    let cursor = Cursor::at(lattice, index);
-                    let mut positions = vec![0; lattice.width()];
+                    let cursor = Cursor::at(grid, index);
+                    let mut positions = vec![0; grid.width()];
                     let mut initial = Vec::new();
-                    catalogue.positions(&cursor, &mut positions);
-                    catalogue.initial(&cursor, &mut initial);
+                    candidate_index.positions(&cursor, &mut positions);
+                    candidate_index.initial(&cursor, &mut initial);
                     let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
                     let mut solve = Solve::<1>::new();
                     let [failed] = problem.equations.solve(&sources, &initial, &mut solve);
@@ -94,32 +94,32 @@ impl BatchEvaluation<'_> {
         let candidates: Vec<(OpenCandidate, Vec<f64>)> = candidates.into_iter().flatten().collect();
         let mut likely: Vec<OpenCandidate> = candidates.iter().map(|(open, _)| *open).collect();
         sort_by_guess(&mut likely);
-        let keep = catalogue.options.top;
-        likely.truncate(keep.max(16).saturating_mul(4));
-        let mut top_rows = TopRows::new(keep, f64::INFINITY);
+        let top = candidate_index.options.top;
+        likely.truncate(top.max(16).saturating_mul(4));
+        let mut top_rows = TopRows::new(top, f64::INFINITY);
         self.simulate_open(&likely, &mut top_rows, BatchPosition::start(0), false)?;
         let mut evaluated: HashSet<u64> = likely.iter().map(|open| open.index).collect();
         let many = |limit: f64| {
             let waiting = candidates.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
             waiting * HARD_SEARCH_OPEN_RATIO >= candidates.len()
         };
-        let mut hard = false;
+        let mut needs_close_bounds = false;
         if thorough {
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            hard = closely && many(top_rows.limit);
+            needs_close_bounds = closely && many(top_rows.limit);
         } else if closely && top_rows.rows.first().is_some_and(|best| many(best.score)) {
             // In a small sample the best score is near the final limit. The score of the worst row of the table is far
             // above it.
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            hard = many(top_rows.limit);
+            needs_close_bounds = many(top_rows.limit);
         }
         let limit = top_rows.limit;
         // Without initial coefficients, all test vectors are used.
-        let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
+        let selected_vectors = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = candidates.into_iter().map(|(_, each)| each).collect();
             select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
-        Ok(InitialIncumbent { top_rows, evaluated, needs_close_bounds: hard, selected_vectors: which })
+        Ok(InitialIncumbent { top_rows, evaluated, needs_close_bounds, selected_vectors })
     }
 }
 
@@ -163,8 +163,8 @@ impl BatchEvaluation<'_> {
     /// no bound excludes, then neighbors again.
     pub(super) fn refine_incumbent(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
         self.search_neighbors(top_rows, evaluated)?;
-        let hard = self.sample_unexcluded(top_rows)?;
-        self.refine_from(&hard, top_rows, evaluated)
+        let unexcluded = self.sample_unexcluded(top_rows)?;
+        self.refine_from(&unexcluded, top_rows, evaluated)
     }
 
     /// Evaluate the candidates `open` that are not in `evaluated`, then search around the best rows.
@@ -174,17 +174,18 @@ impl BatchEvaluation<'_> {
         top_rows: &mut TopRows,
         evaluated: &mut HashSet<u64>,
     ) -> Result<()> {
-        let anew: Vec<OpenCandidate> = open.iter().filter(|open| evaluated.insert(open.index)).copied().collect();
-        self.simulate_open(&anew, top_rows, BatchPosition::start(0), false)?;
+        let unevaluated: Vec<OpenCandidate> =
+            open.iter().filter(|open| evaluated.insert(open.index)).copied().collect();
+        self.simulate_open(&unevaluated, top_rows, BatchPosition::start(0), false)?;
         self.search_neighbors(top_rows, evaluated)
     }
 
     /// Evaluate neighbors of the best rows that are not in `evaluated`. The distance is halved whenever no neighbor
     /// improves the best rows. The search ends at distance 1 or after [`MAX_NEIGHBOR_EVALUATIONS`] evaluations.
     pub(super) fn search_neighbors(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
-        let lattice = &*self.catalogue.lattice;
-        let longest = lattice.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
-        let longest = longest.chain([lattice.blocks().len()]).max().unwrap_or(1);
+        let grid = &*self.candidate_index.grid;
+        let longest = grid.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
+        let longest = longest.chain([grid.blocks().len()]).max().unwrap_or(1);
         let mut stride = (longest / 8).max(1).next_power_of_two();
         let first = evaluated.len();
         while stride > 0 {
@@ -209,17 +210,17 @@ impl BatchEvaluation<'_> {
 
     /// Return the indices of the candidates at a distance of `stride` grid values in one or more of the varying orders.
     fn grid_neighbors(&self, index: u64, stride: usize) -> Vec<u64> {
-        let lattice = &*self.catalogue.lattice;
-        let cursor = Cursor::at(lattice, index);
-        let mut digits = vec![0; lattice.width()];
+        let grid = &*self.candidate_index.grid;
+        let cursor = Cursor::at(grid, index);
+        let mut digits = vec![0; grid.width()];
         cursor.each(0, |term, digit| digits[term] = digit);
-        let mut lengths = vec![0; lattice.width()];
-        for group in lattice.groups() {
+        let mut lengths = vec![0; grid.width()];
+        for group in grid.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
         }
         // The order α of the equation comes last.
         digits.push(cursor.block());
-        lengths.push(lattice.blocks().len());
+        lengths.push(grid.blocks().len());
         let vary: Vec<usize> = (0..digits.len()).filter(|&i| lengths[i] > 1).collect();
         let whole = u32::try_from(vary.len())
             .ok()
@@ -249,25 +250,28 @@ impl BatchEvaluation<'_> {
                 };
             }
             let block = place.pop()?;
-            Cursor::find(lattice, block, &place)
+            Cursor::find(grid, block, &place)
         };
         moves.into_iter().filter_map(neighbor).collect()
     }
 
     /// Return a sample of candidates that no bound excludes, in ascending order of their estimated score.
     fn sample_unexcluded(&mut self, top_rows: &TopRows) -> Result<Vec<OpenCandidate>> {
-        let catalogue = self.catalogue;
-        if catalogue.problem.residual_sums.is_none() {
+        let candidate_index = self.candidate_index;
+        if candidate_index.problem.residual_sums.is_none() {
             return Ok(self.sample_open(top_rows.limit, 0)?.0);
         }
-        let (count, (stretches, length)) = (catalogue.lattice.count(), SAMPLE_BLOCKS_AND_LENGTH);
+        let (count, (block_count, length)) = (candidate_index.grid.count(), SAMPLE_BLOCKS_AND_LENGTH);
         let order = low_discrepancy_order(count.div_ceil(length));
-        let starts: Vec<u64> = (0..stretches.min(count.div_ceil(length))).map(|i| order(i) * length).collect();
-        let mut hard: Vec<OpenCandidate> = self.pool.install(|| {
-            starts.par_iter().flat_map(|&at| screen(catalogue, at, count.min(at + length), top_rows.limit).0).collect()
+        let starts: Vec<u64> = (0..block_count.min(count.div_ceil(length))).map(|i| order(i) * length).collect();
+        let mut unexcluded: Vec<OpenCandidate> = self.pool.install(|| {
+            starts
+                .par_iter()
+                .flat_map(|&at| screen(candidate_index, at, count.min(at + length), top_rows.limit).0)
+                .collect()
         });
         self.check_stop()?;
-        sort_by_guess(&mut hard);
-        Ok(subsample(&hard, MAX_OPEN_EVALUATIONS))
+        sort_by_guess(&mut unexcluded);
+        Ok(subsample(&unexcluded, MAX_OPEN_EVALUATIONS))
     }
 }

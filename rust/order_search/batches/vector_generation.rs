@@ -57,21 +57,21 @@ pub(super) struct GeneratedVectors {
 impl BatchEvaluation<'_> {
     /// Return a sample of candidates that no bound excludes at this limit of the raw score (Σ|e| or Σe²), in ascending
     /// order of their estimated score. Also return the number of candidates of the grid per sampled candidate. Each
-    /// pass `time` draws another sample.
-    pub(super) fn sample_open(&self, limit: f64, time: u64) -> Result<(Vec<OpenCandidate>, f64)> {
-        let catalogue = self.catalogue;
-        let count = catalogue.lattice.count();
-        let stretches = count.div_ceil(TAILORED_SAMPLE_BLOCK);
-        let share = if time == 0 { 0 } else { count / TAILORED_SAMPLE_RATIO };
-        let most = MIN_TAILORED_SAMPLE.max(share).div_ceil(TAILORED_SAMPLE_BLOCK).min(stretches);
-        let order = low_discrepancy_order(stretches);
+    /// pass draws another sample.
+    pub(super) fn sample_open(&self, limit: f64, pass: u64) -> Result<(Vec<OpenCandidate>, f64)> {
+        let candidate_index = self.candidate_index;
+        let count = candidate_index.grid.count();
+        let block_count = count.div_ceil(TAILORED_SAMPLE_BLOCK);
+        let share = if pass == 0 { 0 } else { count / TAILORED_SAMPLE_RATIO };
+        let most = MIN_TAILORED_SAMPLE.max(share).div_ceil(TAILORED_SAMPLE_BLOCK).min(block_count);
+        let order = low_discrepancy_order(block_count);
         let (mut open, mut position, mut candidates) = (Vec::new(), 0, 0);
         while position < most && open.len() < OPEN_SAMPLE_CANDIDATES {
             let next = most.min(position + BLOCKS_PER_SCREENING);
             let starts: Vec<u64> =
-                (position..next).map(|i| order((time * most + i) % stretches) * TAILORED_SAMPLE_BLOCK).collect();
+                (position..next).map(|i| order((pass * most + i) % block_count) * TAILORED_SAMPLE_BLOCK).collect();
             candidates += starts.iter().map(|&at| count.min(at + TAILORED_SAMPLE_BLOCK) - at).sum::<u64>();
-            let screened = |&at: &u64| screen(catalogue, at, count.min(at + TAILORED_SAMPLE_BLOCK), limit).0;
+            let screened = |&at: &u64| screen(candidate_index, at, count.min(at + TAILORED_SAMPLE_BLOCK), limit).0;
             open.extend(self.pool.install(|| starts.par_iter().flat_map(screened).collect::<Vec<OpenCandidate>>()));
             self.check_stop()?;
             position = next;
@@ -86,33 +86,34 @@ impl BatchEvaluation<'_> {
     }
 
     /// Generate tailored test vectors that together exclude most candidates not yet excluded at this limit of the raw
-    /// score (Σ|e| or Σe²). The first pass (`time` 0) includes a vector for the best row. The result has no vectors if
+    /// score (Σ|e| or Σe²). The first pass (`pass` 0) includes a vector for the best row. The result has no vectors if
     /// they save no time or memory is lacking.
     pub(super) fn generate_tailored_vectors(
         &self,
         limit: f64,
-        time: u64,
+        pass: u64,
         best: Option<u64>,
     ) -> Result<GeneratedVectors> {
-        let catalogue = self.catalogue;
-        let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
+        let candidate_index = self.candidate_index;
+        let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
         let (mut one, bytes) = problem.empty_tailored_vectors();
-        let vector_count = problem.tailored_vectors.as_ref().map_or(0, |adapted| adapted.vectors.len() as u64);
-        let room = catalogue.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(vector_count * bytes)) / bytes.max(1);
+        let vector_count = problem.tailored_vectors.as_ref().map_or(0, |tailored| tailored.vectors.len() as u64);
+        let room =
+            candidate_index.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(vector_count * bytes)) / bytes.max(1);
         let room = usize::try_from(room).unwrap_or(MAX_TRIAL_VECTORS).min(MAX_TRIAL_VECTORS);
         if room == 0 {
             return Ok(GeneratedVectors::default());
         }
-        let (open, each) = self.sample_open(limit, time)?;
+        let (open, each) = self.sample_open(limit, pass)?;
         #[allow(clippy::cast_precision_loss)]
         let all = |count: usize| count as f64 * each;
-        let best = best.filter(|_| time == 0);
+        let best = best.filter(|_| pass == 0);
         if best.is_none() && all(open.len()) < MIN_OPEN_CANDIDATES {
             return Ok(GeneratedVectors { open, ..GeneratedVectors::default() });
         }
         let columns = |index: u64| {
-            let mut positions = vec![0; lattice.width()];
-            catalogue.positions(&Cursor::at(lattice, index), &mut positions);
+            let mut positions = vec![0; grid.width()];
+            candidate_index.positions(&Cursor::at(grid, index), &mut positions);
             positions
         };
         let some = subsample(&open, room);
@@ -148,7 +149,7 @@ impl BatchEvaluation<'_> {
         let is_open: Vec<OpenCandidate> =
             open.into_iter().zip(is_open).filter_map(|(open, is_open)| is_open.then_some(open)).collect();
         // The vectors were selected on this sample, so they exclude a smaller fraction of other candidates.
-        let again = time + 1 < MAX_GENERATION_PASSES
+        let again = pass + 1 < MAX_GENERATION_PASSES
             && !new_vectors.is_empty()
             && all(SELECTION_BIAS_FACTOR * is_open.len()) >= MIN_OPEN_CANDIDATES;
         Ok(GeneratedVectors { vectors: new_vectors, open: is_open, is_worth_repeating: again })
@@ -183,22 +184,22 @@ impl BatchEvaluation<'_> {
     /// a sample that no bound excludes at this limit of the raw score (Σ|e| or Σe²). `None` if no vector saves time or
     /// memory is lacking.
     pub(super) fn generate_linearized_vectors(&self, limit: f64) -> Result<Option<LinearizedVectors>> {
-        let problem = &self.catalogue.problem;
-        let mut tangents = problem.empty_linearized_vectors();
+        let problem = &self.candidate_index.problem;
+        let mut linearized_vectors = problem.empty_linearized_vectors();
         if limit == f64::INFINITY {
             return Ok(None);
         }
         let (open, weight) = self.sample_grid(limit)?;
         let mut groups: BTreeMap<Vec<usize>, Vec<SolvedCandidate>> = BTreeMap::new();
         for (columns, coefficients) in open {
-            groups.entry(tangents.own_columns(&columns)).or_default().push((columns, coefficients));
+            groups.entry(linearized_vectors.own_columns(&columns)).or_default().push((columns, coefficients));
         }
         #[allow(clippy::cast_precision_loss)]
         groups.retain(|own, open| {
             (1..=MAX_OWN_TERMS).contains(&own.len()) && open.len() as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS
         });
-        let bytes = groups.keys().map(|own| tangents.bytes(own.len())).max().unwrap_or(1);
-        let room = self.catalogue.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
+        let bytes = groups.keys().map(|own| linearized_vectors.bytes(own.len())).max().unwrap_or(1);
+        let room = self.candidate_index.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
         let room = usize::try_from(room).unwrap_or(MAX_LINEARIZED_VECTORS).min(MAX_LINEARIZED_VECTORS);
         let new_vectors: Vec<(Vec<usize>, Vec<LinearizedVector>)> = self.pool.install(|| {
             groups
@@ -210,7 +211,7 @@ impl BatchEvaluation<'_> {
                     let new_vectors = if self.is_stopped() {
                         Vec::new()
                     } else {
-                        self.generate_for_own_columns(&tangents, &own, open, weight, limit, room)
+                        self.generate_for_own_columns(&linearized_vectors, &own, open, weight, limit, room)
                     };
                     (own, new_vectors)
                 })
@@ -219,25 +220,25 @@ impl BatchEvaluation<'_> {
         self.check_stop()?;
         for (own, new_vectors) in new_vectors {
             if !new_vectors.is_empty() {
-                tangents.add(own, new_vectors);
+                linearized_vectors.add(own, new_vectors);
             }
         }
-        Ok((tangents.len() > 0).then_some(tangents))
+        Ok((linearized_vectors.len() > 0).then_some(linearized_vectors))
     }
 
     /// Return columns and coefficients of the candidates in a sample of the grid that no bound excludes at this limit
     /// of the raw score (Σ|e| or Σe²). Also return the number of candidates of the grid per sampled candidate.
     #[allow(clippy::cast_precision_loss)]
     fn sample_grid(&self, limit: f64) -> Result<(Vec<SolvedCandidate>, f64)> {
-        let catalogue = self.catalogue;
-        let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
-        let count = lattice.count();
-        let stretches = count.div_ceil(LINEARIZED_SAMPLE_BLOCK);
-        let order = low_discrepancy_order(stretches);
+        let candidate_index = self.candidate_index;
+        let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
+        let count = grid.count();
+        let block_count = count.div_ceil(LINEARIZED_SAMPLE_BLOCK);
+        let order = low_discrepancy_order(block_count);
         let sample_count = (count / LINEARIZED_SAMPLE_RATIO)
             .min(MAX_LINEARIZED_SAMPLE)
             .div_ceil(LINEARIZED_SAMPLE_BLOCK)
-            .clamp(1, stretches);
+            .clamp(1, block_count);
         let open: Vec<SolvedCandidate> = self.pool.install(|| {
             (0..sample_count)
                 .into_par_iter()
@@ -246,11 +247,11 @@ impl BatchEvaluation<'_> {
                     let open = if self.is_stopped() {
                         Vec::new()
                     } else {
-                        screen(catalogue, at, count.min(at + LINEARIZED_SAMPLE_BLOCK), limit).0
+                        screen(candidate_index, at, count.min(at + LINEARIZED_SAMPLE_BLOCK), limit).0
                     };
                     open.into_iter().filter_map(|open| {
-                        let mut columns = vec![0; lattice.width()];
-                        catalogue.positions(&Cursor::at(lattice, open.index), &mut columns);
+                        let mut columns = vec![0; grid.width()];
+                        candidate_index.positions(&Cursor::at(grid, open.index), &mut columns);
                         let coefficients = problem.coefficients(&columns)?;
                         Some((columns, coefficients))
                     })
@@ -267,14 +268,14 @@ impl BatchEvaluation<'_> {
     /// vectors.
     fn generate_for_own_columns(
         &self,
-        tangents: &LinearizedVectors,
+        linearized_vectors: &LinearizedVectors,
         own: &[usize],
         mut open: Vec<SolvedCandidate>,
         weight: f64,
         limit: f64,
         room: usize,
     ) -> Vec<LinearizedVector> {
-        let problem = &self.catalogue.problem;
+        let problem = &self.candidate_index.problem;
         let first = |solved: &SolvedCandidate| solved.0.iter().position(|p| *p == own[0]).map_or(0.0, |i| solved.1[i]);
         open.sort_by(|a, b| first(a).total_cmp(&first(b)).then_with(|| a.0.cmp(&b.0)));
         let (mut new_vectors, mut vain) = (Vec::new(), 0);
@@ -288,11 +289,12 @@ impl BatchEvaluation<'_> {
             let middle = part.remove(part.len() / 2);
             let at = first(&middle);
             let mut gained = false;
-            if let Some(tangent) = problem.linearize_vector(tangents, &middle.0, &middle.1, limit) {
-                let remaining: Vec<SolvedCandidate> = problem.not_excluded_by(tangents, &tangent, &part, limit);
+            if let Some(linearized_vector) = problem.linearize_vector(linearized_vectors, &middle.0, &middle.1, limit) {
+                let remaining: Vec<SolvedCandidate> =
+                    problem.not_excluded_by(linearized_vectors, &linearized_vector, &part, limit);
                 gained = many(part.len() + 1 - remaining.len());
                 if gained {
-                    new_vectors.push(tangent);
+                    new_vectors.push(linearized_vector);
                     part = remaining;
                 }
             }

@@ -42,7 +42,7 @@ pub(super) struct Level {
     pub(super) coefficient_sums: Vec<CoefficientSums>,
     /// Largest second differences of the coefficients of the normalized column (orthogonal to the fixed-order columns,
     /// of unit norm) on the fixed-order columns. The entries are ordered by interval, then by fixed-order column.
-    pub(super) mixed: Vec<f64>,
+    pub(super) fixed_coefficients: Vec<f64>,
     /// Maxima of quantities of the test vectors, by interval of grid values, then by group of test vectors.
     pub(super) nodes: Vec<Node>,
 }
@@ -61,7 +61,7 @@ pub(super) struct RemainingColumns<'a> {
     pub(super) rounding: f64,
     /// Index in `columns` of a column of the output, if there is one. A varying column may also belong to the output.
     /// The coefficients of the two columns may then cancel.
-    pub(super) partner: Option<usize>,
+    pub(super) own_fixed_column: Option<usize>,
 }
 
 impl RemainingColumns<'_> {
@@ -78,34 +78,34 @@ impl RemainingColumns<'_> {
     /// of the output column `column`, and g the projection of Fᵀt on t. Fₚ and gₚ are the same quantities of the
     /// fixed-order output column. The bound is 0 if `column` is not an output column or no fixed-order column is one.
     #[inline(always)]
-    fn distance_to_partner(&self, record: usize, group: usize, column: usize) -> Wide {
-        let probes = &self.test_vectors[record];
-        let (mut way, row) = (ZERO_LANES, probes.rows[column]);
-        if let Some(partner) = self.partner.filter(|_| row != NO_INDEX) {
-            let at = |row: usize| &probes.effects[row * probes.groups + group][3];
-            let (a, b) = (at(row), at(probes.rows[self.columns[partner]]));
+    fn distance_to_own_fixed_column(&self, record: usize, group: usize, column: usize) -> Wide {
+        let test_vectors = &self.test_vectors[record];
+        let (mut distance, row) = (ZERO_LANES, test_vectors.rows[column]);
+        if let Some(own_fixed_column) = self.own_fixed_column.filter(|_| row != NO_INDEX) {
+            let at = |row: usize| &test_vectors.effects[row * test_vectors.groups + group][3];
+            let (a, b) = (at(row), at(test_vectors.rows[self.columns[own_fixed_column]]));
             for n in 0..LANE_COUNT {
-                way[n] = (a[n] - b[n]).abs();
+                distance[n] = (a[n] - b[n]).abs();
             }
         }
-        way
+        distance
     }
 
     /// Return the products ⟨t, x⟩ and g‖t‖ of a column x, scaled to unit norm, with a group of test vectors t, and ‖Fᵀt
     /// − g t‖. F is the kernel matrix of x, and g is the projection of Fᵀt on t.
     #[inline(always)]
     pub(super) fn vector_products(&self, record: usize, group: usize, column: usize) -> (VectorProducts, Wide) {
-        let probes = &self.test_vectors[record];
+        let test_vectors = &self.test_vectors[record];
         let inverse = self.normal.inverse()[column];
-        let [re, im] = &probes.products[column * probes.groups + group];
-        let row = probes.rows[column];
+        let [re, im] = &test_vectors.products[column * test_vectors.groups + group];
+        let row = test_vectors.rows[column];
         let (mut products, mut rest) = ([ZERO_LANES; 4], ZERO_LANES);
         for n in 0..LANE_COUNT {
             products[0][n] = re[n] * inverse;
             products[1][n] = im[n] * inverse;
         }
         if row != NO_INDEX {
-            let [a, b, c, _] = &probes.effects[row * probes.groups + group];
+            let [a, b, c, _] = &test_vectors.effects[row * test_vectors.groups + group];
             for n in 0..LANE_COUNT {
                 products[2][n] = a[n] * inverse;
                 products[3][n] = b[n] * inverse;
@@ -132,12 +132,12 @@ pub(super) struct AxisTable {
     pub(super) shared: Vec<f64>,
     /// Coefficients, with the opposite sign, of the normalized column (orthogonal to the fixed-order columns, of unit
     /// norm) on the fixed-order columns. Ordered by grid value, then by fixed-order column.
-    pub(super) mixed: Vec<f64>,
+    pub(super) fixed_coefficients: Vec<f64>,
     /// Negative sum, by grid value, of two coefficients of the normalized column (orthogonal to the fixed-order
     /// columns, of unit norm). They belong to the fixed-order output column and to the regressor column itself if it is
     /// an output column. The second is converted to the scale of the first. Empty if no fixed-order column belongs to
     /// the output.
-    pub(super) paired: Vec<f64>,
+    pub(super) joint_coefficients: Vec<f64>,
     /// Products of the normalized column (orthogonal to the fixed-order columns, of unit norm) with the test vectors,
     /// by grid value, then by group of [`LANE_COUNT`] test vectors.
     pub(super) vector_products: Vec<VectorProducts>,
@@ -152,7 +152,7 @@ impl AxisTable {
     pub(super) fn new(others: &RemainingColumns<'_>, columns: Vec<usize>) -> Option<Self> {
         let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
         let (mut scale, mut target, mut shared) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
-        let (mut mixed, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
+        let (mut fixed_coefficients, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
         for (i, &column) in columns.iter().enumerate() {
             let (shared, raw) = (&mut shared[i * k..(i + 1) * k], &mut raw[i * k..(i + 1) * k]);
             for (g, &s) in shared.iter_mut().zip(others.columns) {
@@ -168,7 +168,7 @@ impl AxisTable {
             scale[i] = 1.0 / remainder.sqrt();
             let along: f64 = raw.iter().zip(others.columns).map(|(a, &s)| a * normal.rhs()[s]).sum();
             target[i] = (normal.rhs()[column] - along) * scale[i];
-            for (m, a) in mixed[i * k..(i + 1) * k].iter_mut().zip(raw.iter()) {
+            for (m, a) in fixed_coefficients[i * k..(i + 1) * k].iter_mut().zip(raw.iter()) {
                 *m = a * scale[i];
             }
         }
@@ -176,14 +176,17 @@ impl AxisTable {
         let mut responses = Vec::with_capacity(n * groups);
         let mut rests = Vec::with_capacity(n * groups);
         let mut sound = ZERO_LANES;
-        let mut paired = Vec::new();
-        if let Some(partner) = others.partner {
+        let mut joint_coefficients = Vec::new();
+        if let Some(own_fixed_column) = others.own_fixed_column {
             let inverse = normal.inverse();
-            let own =
-                others.test_vectors.first().is_some_and(|probes| columns.iter().all(|&p| probes.rows[p] != NO_INDEX));
-            paired.extend(columns.iter().enumerate().map(|(i, &p)| {
-                let alone = if own { scale[i] * inverse[p] / inverse[others.columns[partner]] } else { 0.0 };
-                mixed[i * k + partner] - alone
+            let own = others
+                .test_vectors
+                .first()
+                .is_some_and(|test_vectors| columns.iter().all(|&p| test_vectors.rows[p] != NO_INDEX));
+            joint_coefficients.extend(columns.iter().enumerate().map(|(i, &p)| {
+                let own_coefficient =
+                    if own { scale[i] * inverse[p] / inverse[others.columns[own_fixed_column]] } else { 0.0 };
+                fixed_coefficients[i * k + own_fixed_column] - own_coefficient
             }));
         }
         let along: Vec<Vec<VectorProducts>> = others
@@ -205,24 +208,32 @@ impl AxisTable {
                 for column_products in &mut column_products {
                     column_products.iter_mut().for_each(|v| *v *= scale[i]);
                 }
-                let mut way = others.distance_to_partner(r, g, column);
+                let mut distance = others.distance_to_own_fixed_column(r, g, column);
                 rest.iter_mut().for_each(|v| *v *= scale[i]);
-                way.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
-                for values in column_products.iter().chain([&rest, &way]) {
+                distance.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
+                for values in column_products.iter().chain([&rest, &distance]) {
                     for n in 0..LANE_COUNT {
                         sound[n] += 0.0 * values[n];
                     }
                 }
                 responses.push(column_products);
-                rests.push([rest, way]);
+                rests.push([rest, distance]);
             }
         }
         // Reject NaN and infinity: their product with 0 is NaN.
         if sound.iter().any(|v| v.is_nan()) {
             return None;
         }
-        let mut side =
-            Self { columns, scale, target, shared, mixed, paired, vector_products: responses, levels: Vec::new() };
+        let mut side = Self {
+            columns,
+            scale,
+            target,
+            shared,
+            fixed_coefficients,
+            joint_coefficients,
+            vector_products: responses,
+            levels: Vec::new(),
+        };
         side.build(k, groups, &rests);
         Some(side)
     }
@@ -255,14 +266,15 @@ impl AxisTable {
         let mut levels = vec![Level {
             coefficient_sums: (0..n)
                 .map(|i| {
-                    let mixed: f64 = self.mixed[i * k..(i + 1) * k].iter().map(|m| m.abs()).sum();
-                    CoefficientSums { sum: self.scale[i] + mixed }
+                    let fixed_coefficients: f64 =
+                        self.fixed_coefficients[i * k..(i + 1) * k].iter().map(|m| m.abs()).sum();
+                    CoefficientSums { sum: self.scale[i] + fixed_coefficients }
                 })
                 .collect(),
-            mixed: vec![0.0; n * k],
+            fixed_coefficients: vec![0.0; n * k],
             nodes: rests
                 .iter()
-                .map(|&[rest, way]| Node { second_differences: [ZERO_LANES, ZERO_LANES, rest, way] })
+                .map(|&[rest, distance]| Node { second_differences: [ZERO_LANES, ZERO_LANES, rest, distance] })
                 .collect(),
         }];
         let mut length = 1;
@@ -272,14 +284,14 @@ impl AxisTable {
             let count = n.div_ceil(2 * length);
             let mut level = Level {
                 coefficient_sums: Vec::with_capacity(count),
-                mixed: Vec::with_capacity(count * k),
+                fixed_coefficients: Vec::with_capacity(count * k),
                 nodes: Vec::with_capacity(count * groups),
             };
             for node in 0..count {
                 let (left, right) = (2 * node, 2 * node + 1);
                 let mut all = below.coefficient_sums[left];
-                let start = level.mixed.len();
-                level.mixed.extend_from_slice(&below.mixed[left * k..(left + 1) * k]);
+                let start = level.fixed_coefficients.len();
+                level.fixed_coefficients.extend_from_slice(&below.fixed_coefficients[left * k..(left + 1) * k]);
                 if right < halves {
                     // The last value of the left half and the first value of the right half become interior values,
                     // except at the end.
@@ -287,13 +299,14 @@ impl AxisTable {
                     let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
                     all.sum = all.sum.max(below.coefficient_sums[right].sum);
                     for s in 0..k {
-                        let mut value = level.mixed[start + s].max(below.mixed[right * k + s]);
+                        let mut value =
+                            level.fixed_coefficients[start + s].max(below.fixed_coefficients[right * k + s]);
                         for i in [joint - 1, joint] {
                             if inner(i) {
-                                value = value.max(apart(&self.mixed, k, s, i));
+                                value = value.max(apart(&self.fixed_coefficients, k, s, i));
                             }
                         }
-                        level.mixed[start + s] = value;
+                        level.fixed_coefficients[start + s] = value;
                     }
                     for g in 0..groups {
                         let mut node = below.nodes[left * groups + g];
@@ -326,6 +339,6 @@ impl AxisTable {
 }
 
 /// Iterate over all groups of test vectors as pairs (record, group).
-pub(super) fn vector_groups(probes: &[TestVectors]) -> impl Iterator<Item = (usize, usize)> + '_ {
-    probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
+pub(super) fn vector_groups(test_vectors: &[TestVectors]) -> impl Iterator<Item = (usize, usize)> + '_ {
+    test_vectors.iter().enumerate().flat_map(|(r, test_vectors)| (0..test_vectors.groups).map(move |g| (r, g)))
 }

@@ -40,38 +40,37 @@ impl BranchAndBound {
     /// Return true if branch and bound applies to a search and saves time. Candidates must be ranked by simulation from
     /// zero initial conditions, or by squared equation error. Their coefficients must follow from the normal equations,
     /// and some slice must have at least [`MIN_SLICE_CANDIDATES`] candidates.
-    pub(crate) fn is_worthwhile(catalogue: &CandidateIndex<'_>) -> bool {
-        let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
+    pub(crate) fn is_worthwhile(candidate_index: &CandidateIndex<'_>) -> bool {
+        let (options, grid) = (&candidate_index.options, &*candidate_index.grid);
         options.pruning
             && !options.refines()
             && (options.criterion == Criterion::OutputError || options.ranks_by_gram_matrix())
-            && catalogue.problem.box_equations().is_some()
-            && (2..=MAX_REMAINING_COLUMNS + 2).contains(&lattice.width())
-            && lattice.blocks().iter().any(|block| {
-                lattice
-                    .slice_at(block.start)
-                    .is_some_and(|slab| lattice.max_slice_candidates(&slab) >= MIN_SLICE_CANDIDATES)
+            && candidate_index.problem.box_equations().is_some()
+            && (2..=MAX_REMAINING_COLUMNS + 2).contains(&grid.width())
+            && grid.blocks().iter().any(|block| {
+                grid.slice_at(block.start)
+                    .is_some_and(|slice| grid.max_slice_candidates(&slice) >= MIN_SLICE_CANDIDATES)
             })
     }
 
     /// Compute the constants of a search. `None` if there is no dual bound. Runs on the current thread pool.
-    pub(crate) fn new(catalogue: &CandidateIndex<'_>) -> Option<Self> {
-        let problem = &catalogue.problem;
-        let (probes, normal) = (test_vectors_of(problem)?, problem.box_equations()?);
+    pub(crate) fn new(candidate_index: &CandidateIndex<'_>) -> Option<Self> {
+        let problem = &candidate_index.problem;
+        let (test_vectors, normal) = (test_vectors_of(problem)?, problem.box_equations()?);
         // A column may differ from 0 only in rows of weight 1, where it is the difference of large numbers.
         #[allow(clippy::cast_precision_loss)]
-        let (samples, weights) = (problem.samples() as f64, catalogue.options.weights() as f64);
+        let (samples, weights) = (problem.samples() as f64, candidate_index.options.weights() as f64);
         let rounding = f64::EPSILON * samples * weights;
         let others = RemainingColumns {
             normal,
-            test_vectors: probes,
+            test_vectors,
             columns: &[],
             inverse: &[],
             trace: 0.0,
             rounding,
-            partner: None,
+            own_fixed_column: None,
         };
-        let (norm, ranks_equation_error) = (catalogue.options.norm, problem.residual_sums.is_some());
+        let (norm, ranks_equation_error) = (candidate_index.options.norm, problem.residual_sums.is_some());
         let common = SearchConstants::new(&others, norm, ranks_equation_error, problem.size(), weights.sqrt());
         Some(Self { common, rounding })
     }
@@ -80,16 +79,18 @@ impl BranchAndBound {
     /// matrix. `None` if there is no dual bound.
     fn remaining_columns<'a>(
         &self,
-        catalogue: &'a CandidateIndex<'_>,
+        candidate_index: &'a CandidateIndex<'_>,
         columns: &'a [usize],
         inverse: &'a [f64],
     ) -> Option<RemainingColumns<'a>> {
-        let (k, probes) = (columns.len(), test_vectors_of(&catalogue.problem)?);
-        let partner = probes.first().and_then(|probes| columns.iter().position(|&p| probes.rows[p] != NO_INDEX));
+        let (k, test_vectors) = (columns.len(), test_vectors_of(&candidate_index.problem)?);
+        let own_fixed_column = test_vectors
+            .first()
+            .and_then(|test_vectors| columns.iter().position(|&p| test_vectors.rows[p] != NO_INDEX));
         Some(RemainingColumns {
-            normal: catalogue.problem.box_equations()?,
-            test_vectors: probes,
-            partner,
+            normal: candidate_index.problem.box_equations()?,
+            test_vectors,
+            own_fixed_column,
             columns,
             inverse,
             trace: (0..k).map(|i| inverse[i * k + i]).sum::<f64>().max(1.0),
@@ -111,20 +112,20 @@ fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
 /// the candidates that are not excluded, the indices of singular candidates outside excluded boxes, and the number of
 /// candidates in excluded boxes. `None` if no box of this slice has a bound.
 pub(crate) fn screen_slice(
-    catalogue: &CandidateIndex<'_>,
+    candidate_index: &CandidateIndex<'_>,
     boxes: &BranchAndBound,
-    slab: &traversal::GridSlice,
+    slice: &traversal::GridSlice,
     (lo, hi): (u64, u64),
     limit: f64,
 ) -> Option<(Vec<OpenCandidate>, Vec<u64>, u64)> {
-    simd::dispatch_simd(SliceScreening { catalogue, boxes, slab, lo, hi, limit })
+    simd::dispatch_simd(SliceScreening { candidate_index, boxes, slice, lo, hi, limit })
 }
 
 /// Arguments of [`screen_slice`] as a task that is compiled for the widest vector instructions available.
 struct SliceScreening<'a> {
-    catalogue: &'a CandidateIndex<'a>,
+    candidate_index: &'a CandidateIndex<'a>,
     boxes: &'a BranchAndBound,
-    slab: &'a traversal::GridSlice,
+    slice: &'a traversal::GridSlice,
     lo: u64,
     hi: u64,
     limit: f64,
@@ -135,28 +136,28 @@ impl simd::SimdKernel for SliceScreening<'_> {
 
     #[inline(always)]
     fn run(self) -> Self::Output {
-        let Self { catalogue, boxes, slab, lo, hi, limit } = self;
-        let len = slab.len as u64;
+        let Self { candidate_index, boxes, slice, lo, hi, limit } = self;
+        let len = slice.len as u64;
         #[allow(clippy::cast_possible_truncation)]
-        let rows = ((lo - slab.lo) / len) as usize..((hi - slab.lo).div_ceil(len)) as usize;
-        let columns = first_columns(catalogue, slab);
-        let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
-        let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
-        let ready = build_slice_tables(catalogue, boxes, slab, &others, rows.clone())?;
-        let start = slab.lo + rows.start as u64 * len;
+        let rows = ((lo - slice.lo) / len) as usize..((hi - slice.lo).div_ceil(len)) as usize;
+        let columns = first_columns(candidate_index, slice);
+        let (others, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
+        let others = boxes.remaining_columns(candidate_index, &others, &inverse)?;
+        let tables = build_slice_tables(candidate_index, boxes, slice, &others, rows.clone())?;
+        let start = slice.lo + rows.start as u64 * len;
         let mut screen = Screen::<LANE_COUNT>::new(columns.len());
         let (mut screened, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
         let (mut count, mut boxed) = (0, hi - lo);
-        let lengths = [rows.len(), slab.len];
+        let lengths = [rows.len(), slice.len];
         let coarse = lengths.map(|n| INITIAL_BOX_LEVEL.min(n.next_power_of_two().trailing_zeros() as usize));
-        let (mut stack, mut strip) = (Vec::new(), RowCoefficients::default());
+        let (mut stack, mut row_coefficients) = (Vec::new(), RowCoefficients::default());
         for at in 0..lengths[0].div_ceil(1 << coarse[0]) {
-            ready.compute_coefficients(&mut strip, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
+            tables.compute_coefficients(&mut row_coefficients, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
             for by in 0..lengths[1].div_ceil(1 << coarse[1]) {
                 stack.push([Interval { level: coarse[0], at }, Interval { level: coarse[1], at: by }]);
                 while let Some([u, v]) = stack.pop() {
-                    if let Some(cell) = ready.box_quantities(&strip, [u, v])
-                        && ready.bound([u, v], &cell, limit) > limit
+                    if let Some(cell) = tables.box_quantities(&row_coefficients, [u, v])
+                        && tables.bound([u, v], &cell, limit) > limit
                     {
                         continue;
                     }
@@ -180,12 +181,12 @@ impl simd::SimdKernel for SliceScreening<'_> {
                                 continue;
                             }
                             boxed -= 1;
-                            waiting[count] = (index, ready.sides[0].columns[row], ready.sides[1].columns[value]);
+                            waiting[count] = (index, tables.sides[0].columns[row], tables.sides[1].columns[value]);
                             count += 1;
                             if count == LANE_COUNT {
                                 screen.screen_slice_candidates(
-                                    catalogue,
-                                    slab,
+                                    candidate_index,
+                                    slice,
                                     &columns,
                                     &waiting[..count],
                                     limit,
@@ -199,7 +200,7 @@ impl simd::SimdKernel for SliceScreening<'_> {
             }
         }
         if count > 0 {
-            screen.screen_slice_candidates(catalogue, slab, &columns, &waiting[..count], limit, &mut screened);
+            screen.screen_slice_candidates(candidate_index, slice, &columns, &waiting[..count], limit, &mut screened);
         }
         let (open, singular) = screened;
         Some((open, singular, boxed))
@@ -208,21 +209,21 @@ impl simd::SimdKernel for SliceScreening<'_> {
 
 /// Return the column index of every term at the first candidate of a slice of the order grid.
 #[inline(always)]
-fn first_columns(catalogue: &CandidateIndex<'_>, slab: &traversal::GridSlice) -> Vec<usize> {
-    slab.digits.iter().enumerate().map(|(term, &digit)| catalogue.columns(slab.block, term)[digit]).collect()
+fn first_columns(candidate_index: &CandidateIndex<'_>, slice: &traversal::GridSlice) -> Vec<usize> {
+    slice.digits.iter().enumerate().map(|(term, &digit)| candidate_index.columns(slice.block, term)[digit]).collect()
 }
 
 /// Return the column indices of the terms whose orders do not vary in a slice of the order grid, and the inverse of
 /// their correlation matrix. `None` without a dual bound, or if the matrix is singular.
 #[inline(always)]
 fn factor_remaining_columns(
-    catalogue: &CandidateIndex<'_>,
-    slab: &traversal::GridSlice,
+    candidate_index: &CandidateIndex<'_>,
+    slice: &traversal::GridSlice,
     columns: &[usize],
 ) -> Option<(Vec<usize>, Vec<f64>)> {
     let others: Vec<usize> =
-        (0..columns.len()).filter(|&t| t != slab.outer && t != slab.inner).map(|t| columns[t]).collect();
-    let normal = catalogue.problem.box_equations()?;
+        (0..columns.len()).filter(|&t| t != slice.outer && t != slice.inner).map(|t| columns[t]).collect();
+    let normal = candidate_index.problem.box_equations()?;
     let inverse = inverse_correlation(&others, |a, b| normal.product(a, b)).ok()?;
     Some((others, inverse))
 }
@@ -231,15 +232,15 @@ fn factor_remaining_columns(
 /// the fixed-order columns.
 #[inline(always)]
 fn build_slice_tables<'a>(
-    catalogue: &CandidateIndex<'_>,
+    candidate_index: &CandidateIndex<'_>,
     boxes: &'a BranchAndBound,
-    slab: &traversal::GridSlice,
+    slice: &traversal::GridSlice,
     others: &'a RemainingColumns<'a>,
     rows: Range<usize>,
 ) -> Option<SliceTables<'a>> {
-    let columns_of = |term: usize| catalogue.columns(slab.block, term);
-    let outer = slab.rows[rows].iter().map(|&digit| columns_of(slab.outer)[digit]).collect();
-    let inner = columns_of(slab.inner)[slab.first..slab.first + slab.len].to_vec();
+    let columns_of = |term: usize| candidate_index.columns(slice.block, term);
+    let outer = slice.rows[rows].iter().map(|&digit| columns_of(slice.outer)[digit]).collect();
+    let inner = columns_of(slice.inner)[slice.first..slice.first + slice.len].to_vec();
     let sides = [AxisTable::new(others, outer)?, AxisTable::new(others, inner)?];
     Some(SliceTables::new(others, &boxes.common, sides))
 }
@@ -293,33 +294,33 @@ pub struct BoxBound {
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
-/// let lattice = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
-/// let boxes = box_bounds(&[record], &lattice, &Options::default(), 0)?;
+/// let grid = OrderGrid::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
+/// let boxes = box_bounds(&[record], &grid, &Options::default(), 0)?;
 /// assert!(boxes.iter().any(|b| b.rows * b.values == 6) && boxes.iter().any(|b| b.rows * b.values == 1));
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, index: u64) -> Result<Vec<BoxBound>> {
-    with_slice(records, lattice, options, index, |catalogue, boxes, slab| {
-        let columns = first_columns(catalogue, slab);
-        let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
-        let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
-        let ready = build_slice_tables(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
-        let mut strip = RowCoefficients::default();
-        ready.compute_coefficients(&mut strip, 0..slab.rows.len());
+pub fn box_bounds(records: &[Record], grid: &OrderGrid, options: &Options, index: u64) -> Result<Vec<BoxBound>> {
+    with_slice(records, grid, options, index, |candidate_index, boxes, slice| {
+        let columns = first_columns(candidate_index, slice);
+        let (others, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
+        let others = boxes.remaining_columns(candidate_index, &others, &inverse)?;
+        let tables = build_slice_tables(candidate_index, boxes, slice, &others, 0..slice.rows.len())?;
+        let mut row_coefficients = RowCoefficients::default();
+        tables.compute_coefficients(&mut row_coefficients, 0..slice.rows.len());
         let mut bounds = Vec::new();
-        let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
+        let levels = [0, 1].map(|side: usize| tables.sides[side].levels.len());
         for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
-            for at in 0..ready.sides[0].levels[a].coefficient_sums.len() {
-                for by in 0..ready.sides[1].levels[b].coefficient_sums.len() {
-                    let both = [Interval { level: a, at }, Interval { level: b, at: by }];
-                    let ((u0, u1), (v0, v1)) = (both[0].ends(slab.rows.len()), both[1].ends(slab.len));
-                    let cell = ready.box_quantities(&strip, both);
-                    let bound = cell.map_or(0.0, |cell| ready.bound(both, &cell, f64::INFINITY));
+            for at in 0..tables.sides[0].levels[a].coefficient_sums.len() {
+                for by in 0..tables.sides[1].levels[b].coefficient_sums.len() {
+                    let intervals = [Interval { level: a, at }, Interval { level: b, at: by }];
+                    let ((u0, u1), (v0, v1)) = (intervals[0].ends(slice.rows.len()), intervals[1].ends(slice.len));
+                    let cell = tables.box_quantities(&row_coefficients, intervals);
+                    let bound = cell.map_or(0.0, |cell| tables.bound(intervals, &cell, f64::INFINITY));
                     bounds.push(BoxBound {
-                        first: slab.lo + (u0 * slab.len + v0) as u64,
+                        first: slice.lo + (u0 * slice.len + v0) as u64,
                         rows: (u1 - u0 + 1) as u64,
                         values: (v1 - v0 + 1) as u64,
-                        stride: slab.len as u64,
+                        stride: slice.len as u64,
                         bound,
                     });
                 }
@@ -337,15 +338,15 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
 /// too little memory.
 pub fn open_candidates(
     records: &[Record],
-    lattice: &OrderGrid,
+    grid: &OrderGrid,
     options: &Options,
     index: u64,
     range: Range<u64>,
     limit: f64,
 ) -> Result<Vec<u64>> {
-    with_slice(records, lattice, options, index, |catalogue, boxes, slab| {
-        let range = (range.start.clamp(slab.lo, slab.hi), range.end.clamp(slab.lo, slab.hi));
-        let (open, ..) = screen_slice(catalogue, boxes, slab, range, limit)?;
+    with_slice(records, grid, options, index, |candidate_index, boxes, slice| {
+        let range = (range.start.clamp(slice.lo, slice.hi), range.end.clamp(slice.lo, slice.hi));
+        let (open, ..) = screen_slice(candidate_index, boxes, slice, range, limit)?;
         Some(open.iter().map(|open| open.index).collect())
     })
 }
@@ -354,7 +355,7 @@ pub fn open_candidates(
 /// Return an empty list if there is no such slice or `work` returns `None`.
 fn with_slice<T>(
     records: &[Record],
-    lattice: &OrderGrid,
+    grid: &OrderGrid,
     options: &Options,
     index: u64,
     work: impl FnOnce(&CandidateIndex<'_>, &BranchAndBound, &traversal::GridSlice) -> Option<Vec<T>> + Send,
@@ -363,21 +364,22 @@ where
     T: Send,
 {
     let pool = pool(1)?;
-    let fixed = vec![None; lattice.width()];
-    let mut catalogue = CandidateIndex::new(records, Cow::Borrowed(lattice), &fixed, options, &pool, &Stop::default())?;
-    catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Stop::default()));
+    let fixed = vec![None; grid.width()];
+    let mut candidate_index =
+        CandidateIndex::new(records, Cow::Borrowed(grid), &fixed, options, &pool, &Stop::default())?;
+    candidate_index.problem = pool.install(|| candidate_index.problem.with_bound(u64::MAX >> 8, &Stop::default()));
     if options.criterion == Criterion::OutputError {
-        let mut adapted = catalogue.problem.empty_tailored_vectors().0;
-        for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
-            let mut positions = vec![0; lattice.width()];
-            catalogue.positions(&Cursor::at(lattice, made_for), &mut positions);
-            adapted.vectors.extend(pool.install(|| catalogue.problem.tailor_vector(&adapted, &positions)));
+        let mut tailored = candidate_index.problem.empty_tailored_vectors().0;
+        for made_for in [index, 0, grid.count() / 2, grid.count() - 1] {
+            let mut positions = vec![0; grid.width()];
+            candidate_index.positions(&Cursor::at(grid, made_for), &mut positions);
+            tailored.vectors.extend(pool.install(|| candidate_index.problem.tailor_vector(&tailored, &positions)));
         }
-        catalogue.problem.tailored_vectors = Some(adapted);
+        candidate_index.problem.tailored_vectors = Some(tailored);
     }
-    let slab = lattice.slice_at(index).filter(|_| (2..=MAX_REMAINING_COLUMNS + 2).contains(&lattice.width()));
-    let Some(slab) = slab else { return Ok(Vec::new()) };
-    Ok(pool.install(|| work(&catalogue, &BranchAndBound::new(&catalogue)?, &slab)).unwrap_or_default())
+    let slice = grid.slice_at(index).filter(|_| (2..=MAX_REMAINING_COLUMNS + 2).contains(&grid.width()));
+    let Some(slice) = slice else { return Ok(Vec::new()) };
+    Ok(pool.install(|| work(&candidate_index, &BranchAndBound::new(&candidate_index)?, &slice)).unwrap_or_default())
 }
 
 #[cfg(test)]
@@ -433,56 +435,61 @@ mod tests {
     fn no_candidate_is_farther_from_bilinear_than_its_box_allows() -> Result<()> {
         let mut nearest: Vec<[f64; 2]> = Vec::new();
         for case in 0..40 {
-            let (record, lattice) = problem(case)?;
+            let (record, grid) = problem(case)?;
             let options = Options { norm: [Norm::L1, Norm::L2][case as usize / 4 % 2], ..Options::default() };
-            let bounds = with_slice(&[record], &lattice, &options, u64::from(case) * 7, |catalogue, boxes, slab| {
-                let columns = first_columns(catalogue, slab);
-                let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
-                let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
-                let ready = build_slice_tables(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
-                let mut strip = RowCoefficients::default();
-                ready.compute_coefficients(&mut strip, 0..slab.rows.len());
-                let groups = others.test_vectors.first().map_or(0, |p: &TestVectors| p.groups);
-                let deviation_bound =
-                    |both: [Interval; 2], cell: &BoxQuantities, group: usize, together: Option<Option<usize>>| {
-                        let moduli = ready.moduli(both, cell);
-                        let together = together.unwrap_or_else(|| ready.joint_partner(both, cell, &moduli, group));
-                        (ready.corner_values(both, cell, &moduli, (0, group), together), together)
-                    };
-                let mut most = Vec::new();
-                let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
-                for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
-                    for (at, by) in (0..ready.sides[0].levels[a].coefficient_sums.len())
-                        .flat_map(|at| (0..ready.sides[1].levels[b].coefficient_sums.len()).map(move |by| (at, by)))
-                    {
-                        let both = [Interval { level: a, at }, Interval { level: b, at: by }];
-                        let ends = [both[0].ends(slab.rows.len()), both[1].ends(slab.len)];
-                        let Some(cell) = ready.box_quantities(&strip, both) else { continue };
-                        for group in (0..groups).filter(|_| a + b > 0) {
-                            let (whole, together) = deviation_bound(both, &cell, group, None);
-                            let mut nearest = [0.0_f64; 2];
-                            for (i, j) in
-                                (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
-                            {
-                                let alone = [Interval { level: 0, at: i }, Interval { level: 0, at: j }];
-                                let Some(cell) = ready.box_quantities(&strip, alone) else { continue };
-                                let (one, _) = deviation_bound(alone, &cell, group, Some(together));
-                                let place = |x: usize, (from, to): (usize, usize)| {
-                                    2.0 * (x - from) as f64 / (to - from).max(1) as f64 - 1.0
-                                };
-                                let far = relative_deviations(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
-                                for (nearest, far) in nearest.iter_mut().zip(far) {
-                                    // NaN counts as a failed bound.
-                                    let far = far.map(|v| if v.is_nan() { f64::INFINITY } else { v });
-                                    *nearest = far.into_iter().fold(*nearest, f64::max);
+            let bounds =
+                with_slice(&[record], &grid, &options, u64::from(case) * 7, |candidate_index, boxes, slice| {
+                    let columns = first_columns(candidate_index, slice);
+                    let (others, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
+                    let others = boxes.remaining_columns(candidate_index, &others, &inverse)?;
+                    let tables = build_slice_tables(candidate_index, boxes, slice, &others, 0..slice.rows.len())?;
+                    let mut row_coefficients = RowCoefficients::default();
+                    tables.compute_coefficients(&mut row_coefficients, 0..slice.rows.len());
+                    let groups = others.test_vectors.first().map_or(0, |p: &TestVectors| p.groups);
+                    let deviation_bound =
+                        |intervals: [Interval; 2],
+                         cell: &BoxQuantities,
+                         group: usize,
+                         joint_column: Option<Option<usize>>| {
+                            let moduli = tables.moduli(intervals, cell);
+                            let joint_column =
+                                joint_column.unwrap_or_else(|| tables.joint_column(intervals, cell, &moduli, group));
+                            (tables.corner_values(intervals, cell, &moduli, (0, group), joint_column), joint_column)
+                        };
+                    let mut most = Vec::new();
+                    let levels = [0, 1].map(|side: usize| tables.sides[side].levels.len());
+                    for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
+                        for (at, by) in (0..tables.sides[0].levels[a].coefficient_sums.len()).flat_map(|at| {
+                            (0..tables.sides[1].levels[b].coefficient_sums.len()).map(move |by| (at, by))
+                        }) {
+                            let intervals = [Interval { level: a, at }, Interval { level: b, at: by }];
+                            let ends = [intervals[0].ends(slice.rows.len()), intervals[1].ends(slice.len)];
+                            let Some(cell) = tables.box_quantities(&row_coefficients, intervals) else { continue };
+                            for group in (0..groups).filter(|_| a + b > 0) {
+                                let (whole, joint_column) = deviation_bound(intervals, &cell, group, None);
+                                let mut nearest = [0.0_f64; 2];
+                                for (i, j) in
+                                    (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
+                                {
+                                    let alone = [Interval { level: 0, at: i }, Interval { level: 0, at: j }];
+                                    let Some(cell) = tables.box_quantities(&row_coefficients, alone) else { continue };
+                                    let (one, _) = deviation_bound(alone, &cell, group, Some(joint_column));
+                                    let place = |x: usize, (from, to): (usize, usize)| {
+                                        2.0 * (x - from) as f64 / (to - from).max(1) as f64 - 1.0
+                                    };
+                                    let far = relative_deviations(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
+                                    for (nearest, far) in nearest.iter_mut().zip(far) {
+                                        // NaN counts as a failed bound.
+                                        let far = far.map(|v| if v.is_nan() { f64::INFINITY } else { v });
+                                        *nearest = far.into_iter().fold(*nearest, f64::max);
+                                    }
                                 }
+                                most.push(nearest);
                             }
-                            most.push(nearest);
                         }
                     }
-                }
-                Some(most)
-            })?;
+                    Some(most)
+                })?;
             if bounds.is_empty() {
                 return Err(Error::Internal { what: format!("nothing was proved of case {case}") });
             }

@@ -162,7 +162,7 @@ pub(super) struct BoxQuantities {
     /// unless candidates are ranked by equation error.
     pub(super) explained: f64,
     /// Upper bound of the sum of the weighted output norm and the moduli of all coefficients.
-    pub(super) all: f64,
+    pub(super) modulus_sum: f64,
     /// Rounding-error bound of one coefficient of a candidate.
     pub(super) rounding: f64,
 }
@@ -173,10 +173,11 @@ impl BoxQuantities {
     /// and are given by linear approximations.
     #[inline(always)]
     pub(super) fn remainder(&self, [a, b]: [LinearApproximation; 2]) -> f64 {
-        let bent = self.mixed_slopes[0] * a.slope.abs() + self.mixed_slopes[1] * b.slope.abs();
+        let curvature = self.mixed_slopes[0] * a.slope.abs() + self.mixed_slopes[1] * b.slope.abs();
         let slopes = a.slope.abs() + b.slope.abs();
         let (sum, difference) = (a.middle + b.middle, a.middle - b.middle);
-        bent + self.most[0] * a.remainder
+        curvature
+            + self.most[0] * a.remainder
             + self.most[1] * b.remainder
             + self.bilinear_deviation[0] * (sum.abs() + slopes)
             + self.bilinear_deviation[1] * (difference.abs() + slopes)
@@ -246,8 +247,9 @@ impl<'a> SliceTables<'a> {
         others.solve(&rhs, &mut base_coefficients);
         let (mut base, mut rests) = (Vec::new(), Vec::new());
         for (r, g) in vector_groups(others.test_vectors) {
-            let probes = &others.test_vectors[r];
-            let mut slice_products = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO_LANES];
+            let test_vectors = &others.test_vectors[r];
+            let mut slice_products =
+                [test_vectors.target[g][0], test_vectors.target[g][1], test_vectors.size[g], ZERO_LANES];
             for (c, &s) in base_coefficients.iter().zip(others.columns) {
                 let (products, rest) = others.vector_products(r, g, s);
                 for (slice_products, products) in slice_products.iter_mut().zip(&products) {
@@ -277,15 +279,15 @@ impl<'a> SliceTables<'a> {
     }
 
     /// Compute the coefficients of the two varying columns for all candidates in these rows of the slice of the order
-    /// grid, and store them in `strip`.
+    /// grid, and store them in `row_coefficients`.
     #[inline(always)]
-    pub(super) fn compute_coefficients(&self, strip: &mut RowCoefficients, rows: Range<usize>) {
+    pub(super) fn compute_coefficients(&self, row_coefficients: &mut RowCoefficients, rows: Range<usize>) {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
-        (strip.start, strip.len) = (rows.start, len);
-        let RowCoefficients { plus, minus, independence, product, .. } = strip;
-        for all in [&mut *plus, minus, independence] {
-            all.resize(rows.len() * len, 0.0);
+        (row_coefficients.start, row_coefficients.len) = (rows.start, len);
+        let RowCoefficients { plus, minus, independence, product, .. } = row_coefficients;
+        for table in [&mut *plus, minus, independence] {
+            table.resize(rows.len() * len, 0.0);
         }
         product.resize((k + 1) * len, 0.0);
         let (product, shared) = product.split_at_mut(len);
@@ -299,9 +301,11 @@ impl<'a> SliceTables<'a> {
             for (product, &column) in product.iter_mut().zip(&v.columns) {
                 *product = with[column] * scale;
             }
-            for (shared, mixed) in shared.chunks_exact(len).zip(&u.mixed[row * k..(row + 1) * k]) {
+            for (shared, fixed_coefficients) in
+                shared.chunks_exact(len).zip(&u.fixed_coefficients[row * k..(row + 1) * k])
+            {
                 for (product, shared) in product.iter_mut().zip(shared) {
-                    *product -= mixed * shared;
+                    *product -= fixed_coefficients * shared;
                 }
             }
             let at = at * len..(at + 1) * len;
@@ -310,10 +314,10 @@ impl<'a> SliceTables<'a> {
             for j in 0..len {
                 let (b, z) = (product[j] * scales[j], targets[j]);
                 let (above, below) = (1.0 + b, 1.0 - b);
-                let both = above * below;
-                let sound = both > COLLINEARITY_TOLERANCE;
-                let half = if sound { 0.5 / both } else { 0.0 };
-                independence[j] = if sound { both } else { 0.0 };
+                let independence_at = above * below;
+                let sound = independence_at > COLLINEARITY_TOLERANCE;
+                let half = if sound { 0.5 / independence_at } else { 0.0 };
+                independence[j] = if sound { independence_at } else { 0.0 };
                 plus[j] = (y + z) * below * half;
                 minus[j] = (y - z) * above * half;
             }
@@ -323,26 +327,33 @@ impl<'a> SliceTables<'a> {
     /// Compute the quantities shared by all candidates of a box of orders. `None` if the two varying columns may be
     /// collinear in the box, because no bound exists then.
     #[inline(always)]
-    pub(super) fn box_quantities(&self, strip: &RowCoefficients, [su, sv]: [Interval; 2]) -> Option<BoxQuantities> {
+    pub(super) fn box_quantities(
+        &self,
+        row_coefficients: &RowCoefficients,
+        [su, sv]: [Interval; 2],
+    ) -> Option<BoxQuantities> {
         let [u, v] = &self.sides;
         let ((u0, u1), (v0, v1)) = (su.ends(u.columns.len()), sv.ends(v.columns.len()));
         let (wu, wv) = (eighth_of_square(u1 - u0), eighth_of_square(v1 - v0));
         let (pu, pv) = (u.levels[su.level].coefficient_sums[su.at], v.levels[sv.level].coefficient_sums[sv.at]);
         let sums = pu.sum + pv.sum;
         let at = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
-        let places = at.map(|(i, j)| strip.at(i, j));
-        let halves = [places.map(|place| strip.plus[place]), places.map(|place| strip.minus[place])];
+        let places = at.map(|(i, j)| row_coefficients.at(i, j));
+        let halves =
+            [places.map(|place| row_coefficients.plus[place]), places.map(|place| row_coefficients.minus[place])];
         let (mut ps, mut qs) = ([0.0; 4], [0.0; 4]);
         for c in 0..4 {
             ps[c] = halves[0][c] + halves[1][c];
             qs[c] = halves[0][c] - halves[1][c];
         }
-        let (off, independence, explained) = if self.common.ranks_equation_error {
-            let (independence, explained) = strip.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
+        let (bilinear_deviation, independence, explained) = if self.common.ranks_equation_error {
+            let (independence, explained) =
+                row_coefficients.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
             ([0.0; 2], independence, explained)
         } else {
-            let (off, independence) = strip.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
-            (off, independence, 0.0)
+            let (bilinear_deviation, independence) =
+                row_coefficients.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
+            (bilinear_deviation, independence, 0.0)
         };
         let independence = independence - 2.0 * self.others.rounding * self.others.trace * sums * sums;
         // NaN proves nothing.
@@ -350,27 +361,28 @@ impl<'a> SliceTables<'a> {
             return None;
         }
         let largest = |x: &[f64; 4]| x.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
-        let both = off[0] + off[1];
-        let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
+        let deviation_sum = bilinear_deviation[0] + bilinear_deviation[1];
+        let (p, q, p_most, q_most) =
+            (bilinear(ps), bilinear(qs), largest(&ps) + deviation_sum, largest(&qs) + deviation_sum);
 
         let trace = self.others.trace + sums * sums / independence;
-        let all = self.common.weighted_size
+        let modulus_sum = self.common.weighted_size
             + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()
             + p_most * pu.sum
             + q_most * pv.sum;
         let terms = to_f64(self.others.columns.len() + 2);
-        let rounding = ELIMINATION_ERROR * terms * terms * trace * all;
-        let bends = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
+        let rounding = ELIMINATION_ERROR * terms * terms * trace * modulus_sum;
+        let mixed_slopes = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
         Some(BoxQuantities {
             at,
             wide: [wu, wv],
             ps,
             qs,
             most: [p_most, q_most],
-            bilinear_deviation: off,
-            mixed_slopes: bends,
+            bilinear_deviation,
+            mixed_slopes,
             explained,
-            all,
+            modulus_sum,
             rounding,
         })
     }
@@ -378,11 +390,11 @@ impl<'a> SliceTables<'a> {
     /// Return a lower bound of the raw score (Σ|e| or Σe²) that holds for every candidate of a box of orders. The sum
     /// over records stops once it exceeds `limit`.
     #[inline(always)]
-    pub(super) fn bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
+    pub(super) fn bound(&self, intervals: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         if self.common.ranks_equation_error {
             self.equation_error_bound(cell)
         } else {
-            self.output_error_bound(both, cell, limit)
+            self.output_error_bound(intervals, cell, limit)
         }
     }
 
@@ -390,8 +402,8 @@ impl<'a> SliceTables<'a> {
     /// is proved.
     #[inline(always)]
     fn equation_error_bound(&self, cell: &BoxQuantities) -> f64 {
-        let rounding = self.others.rounding * cell.all + to_f64(self.others.columns.len() + 2) * cell.rounding;
-        let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.all;
+        let rounding = self.others.rounding * cell.modulus_sum + to_f64(self.others.columns.len() + 2) * cell.rounding;
+        let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.modulus_sum;
         // Neither NaN nor an overflow proves anything.
         if bound > 0.0 && bound < f64::MAX && cell.explained > f64::MIN {
             bound
@@ -403,15 +415,15 @@ impl<'a> SliceTables<'a> {
     /// Return a lower bound of the raw output error (Σ|e| or Σe²) of every candidate of the box of orders. The sum over
     /// records stops once it exceeds `limit`.
     #[inline(always)]
-    fn output_error_bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
-        let moduli = self.moduli(both, cell);
+    fn output_error_bound(&self, intervals: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
+        let moduli = self.moduli(intervals, cell);
         let (mut sum, mut first) = (0.0, 0);
-        for (r, probes) in self.others.test_vectors.iter().enumerate() {
+        for (r, test_vectors) in self.others.test_vectors.iter().enumerate() {
             let mut best = 0.0;
-            for group in first..first + probes.groups {
-                let together = self.joint_partner(both, cell, &moduli, group);
-                let CornerValues { values, slack, remainders: rough } =
-                    self.corner_values(both, cell, &moduli, (r, group), together);
+            for group in first..first + test_vectors.groups {
+                let joint_column = self.joint_column(intervals, cell, &moduli, group);
+                let CornerValues { values, slack, remainders } =
+                    self.corner_values(intervals, cell, &moduli, (r, group), joint_column);
                 // All corner values are projected on the direction of their sum.
                 let mut along = [ZERO_LANES; 2];
                 for n in 0..LANE_COUNT {
@@ -425,10 +437,10 @@ impl<'a> SliceTables<'a> {
                 let mut bounds = [f64::MAX; LANE_COUNT];
                 for (value, slack) in values.iter().zip(&slack) {
                     for n in 0..LANE_COUNT {
-                        let response = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
+                        let response = value[0][n] * along[0][n] + value[1][n] * along[1][n] - remainders[0][n];
                         let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
                         // Margin for the rounding errors of the divisor and of the score.
-                        let bound = response / ((size + slack[n] + rough[1][n]) * (1.0 + probes.unit));
+                        let bound = response / ((size + slack[n] + remainders[1][n]) * (1.0 + test_vectors.unit));
                         // Neither NaN nor an overflow proves anything.
                         let bound = if bound > 0.0 && bound < f64::MAX { bound } else { 0.0 };
                         bounds[n] = if bound < bounds[n] { bound } else { bounds[n] };
@@ -443,7 +455,7 @@ impl<'a> SliceTables<'a> {
                     break;
                 }
             }
-            first += probes.groups;
+            first += test_vectors.groups;
             sum += self.raw(best);
         }
         sum
@@ -461,25 +473,46 @@ impl<'a> SliceTables<'a> {
         let (mut others, mut rests) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
         for s in 0..k {
             for (c, (i, j)) in at.into_iter().enumerate() {
-                others[s][c] =
-                    (self.base_coefficients[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
+                others[s][c] = (self.base_coefficients[s]
+                    - ps[c] * u.fixed_coefficients[i * k + s]
+                    - qs[c] * v.fixed_coefficients[j * k + s])
+                    .abs();
             }
-            let a = LinearApproximation::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
-            let b = LinearApproximation::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
+            let a = LinearApproximation::new(
+                u.fixed_coefficients[u0 * k + s],
+                u.fixed_coefficients[u1 * k + s],
+                wu * lu.fixed_coefficients[su.at * k + s],
+            );
+            let b = LinearApproximation::new(
+                v.fixed_coefficients[v0 * k + s],
+                v.fixed_coefficients[v1 * k + s],
+                wv * lv.fixed_coefficients[sv.at * k + s],
+            );
             rests[s] = cell.remainder([a, b]) + rounding;
         }
         let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
-        if let Some(partner) = self.partner() {
+        if let Some(own_fixed_column) = self.own_fixed_column() {
             for (c, (i, j)) in at.into_iter().enumerate() {
-                sums[c] = (self.base_coefficients[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
+                sums[c] = (self.base_coefficients[own_fixed_column]
+                    - ps[c] * u.joint_coefficients[i]
+                    - qs[c] * v.joint_coefficients[j])
+                    .abs();
             }
-            let bent = |values: &[f64], first: usize, last: usize| {
+            let curvature = |values: &[f64], first: usize, last: usize| {
                 let inner =
                     (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
                 inner.fold(0.0, f64::max)
             };
-            let a = LinearApproximation::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
-            let b = LinearApproximation::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
+            let a = LinearApproximation::new(
+                u.joint_coefficients[u0],
+                u.joint_coefficients[u1],
+                wu * curvature(&u.joint_coefficients, u0, u1),
+            );
+            let b = LinearApproximation::new(
+                v.joint_coefficients[v0],
+                v.joint_coefficients[v1],
+                wv * curvature(&v.joint_coefficients, v0, v1),
+            );
             sums_rest = cell.remainder([a, b]) + rounding * self.common.ratio;
         }
         Moduli { others, rests, sums, sums_rest }
@@ -488,37 +521,37 @@ impl<'a> SliceTables<'a> {
     /// Return the index of a fixed-order column of the output if a varying column also belongs to the output. `None`
     /// otherwise. The coefficients of the two columns may cancel.
     #[inline(always)]
-    fn partner(&self) -> Option<usize> {
-        self.others.partner.filter(|_| self.own.is_some())
+    fn own_fixed_column(&self) -> Option<usize> {
+        self.others.own_fixed_column.filter(|_| self.own.is_some())
     }
 
     /// Return the index of the fixed-order output column if a joint bound with the varying output column is tighter for
     /// this group of test vectors. `None` otherwise.
     #[inline(always)]
-    pub(super) fn joint_partner(
+    pub(super) fn joint_column(
         &self,
         [su, sv]: [Interval; 2],
         cell: &BoxQuantities,
         moduli: &Moduli,
         group: usize,
     ) -> Option<usize> {
-        let partner = self.partner()?;
+        let own_fixed_column = self.own_fixed_column()?;
         let (k, groups) = (self.others.columns.len(), self.base.len());
         let [u, v] = &self.sides;
         let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
         let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
         let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
-        let rest = &self.rests[group * k + partner];
+        let rest = &self.rests[group * k + own_fixed_column];
         let (mut apart, mut joint) = (0.0, 0.0);
         for n in 0..LANE_COUNT {
-            apart += moduli.others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
+            apart += moduli.others[own_fixed_column][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
             joint += moduli.sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
         }
-        (joint < apart).then_some(partner)
+        (joint < apart).then_some(own_fixed_column)
     }
 
     /// Compute inner products and denominators of one group of test vectors on one record, at the corners of a box of
-    /// orders. `together` is the fixed-order output column that is bounded jointly with the varying output column.
+    /// orders. `joint_column` is the fixed-order output column that is bounded jointly with the varying output column.
     #[inline(always)]
     pub(super) fn corner_values(
         &self,
@@ -526,7 +559,7 @@ impl<'a> SliceTables<'a> {
         cell: &BoxQuantities,
         moduli: &Moduli,
         (record, group): (usize, usize),
-        together: Option<usize>,
+        joint_column: Option<usize>,
     ) -> CornerValues {
         let (k, groups) = (self.others.columns.len(), self.base.len());
         let [u, v] = &self.sides;
@@ -536,20 +569,20 @@ impl<'a> SliceTables<'a> {
             ps,
             qs,
             most: [p_most, q_most],
-            bilinear_deviation: off,
-            mixed_slopes: bends,
-            all,
+            bilinear_deviation,
+            mixed_slopes,
+            modulus_sum,
             rounding: rounding_error,
             ..
         } = *cell;
-        let both = off[0] + off[1];
+        let deviation_sum = bilinear_deviation[0] + bilinear_deviation[1];
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
         let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
         let (a, b) = (&u.vector_products[u0 * groups + group], &u.vector_products[u1 * groups + group]);
         let (c, d) = (&v.vector_products[v0 * groups + group], &v.vector_products[v1 * groups + group]);
         let (base, tops) = (&self.base[group], &self.common.max_moduli[group]);
-        let mut rough = [[0.0; LANE_COUNT]; 2];
+        let mut remainders = [[0.0; LANE_COUNT]; 2];
         for half in 0..2 {
             for n in 0..LANE_COUNT {
                 let mut sizes = [0.0; 4];
@@ -560,35 +593,38 @@ impl<'a> SliceTables<'a> {
                     sizes[2] += (b[part][n] - a[part][n]).abs() * 0.5;
                     sizes[3] += (d[part][n] - c[part][n]).abs() * 0.5;
                 }
-                rough[half][n] = bends[0] * sizes[2]
-                    + bends[1] * sizes[3]
-                    + off[0] * sizes[0]
-                    + off[1] * sizes[1]
-                    + both * (sizes[2] + sizes[3])
+                remainders[half][n] = mixed_slopes[0] * sizes[2]
+                    + mixed_slopes[1] * sizes[3]
+                    + bilinear_deviation[0] * sizes[0]
+                    + bilinear_deviation[1] * sizes[1]
+                    + deviation_sum * (sizes[2] + sizes[3])
                     + wu * bu[half][n] * p_most
                     + wv * bv[half][n] * q_most
                     + rounding_error * tops[half][n];
             }
         }
-        let rounding =
-            self.others.test_vectors[record].target_rounding + (all + rounding_error) * self.common.rounding[record];
-        rough[0].iter_mut().for_each(|rough| *rough += rounding);
+        let rounding = self.others.test_vectors[record].target_rounding
+            + (modulus_sum + rounding_error) * self.common.rounding[record];
+        remainders[0].iter_mut().for_each(|remainders| *remainders += rounding);
         // Slack of the varying columns, whose scale is at least 1. The slack of the fixed-order columns follows.
         let mut slack = [ZERO_LANES; 4];
-        let part = if together.is_some() { 3 } else { 2 };
+        let part = if joint_column.is_some() { 3 } else { 2 };
         for n in 0..LANE_COUNT {
-            rough[1][n] += (both + rounding_error) * (bu[part][n] + bv[part][n]);
+            remainders[1][n] += (deviation_sum + rounding_error) * (bu[part][n] + bv[part][n]);
             for corner in 0..4 {
                 slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
             }
         }
         let rest_of = &self.rests[group * k..(group + 1) * k];
         for (s, rest) in rest_of.iter().enumerate() {
-            let paired = together == Some(s);
-            let (sizes, norms) =
-                if paired { (&moduli.sums, moduli.sums_rest) } else { (&moduli.others[s], moduli.rests[s]) };
+            let joint_coefficients = joint_column == Some(s);
+            let (sizes, norms) = if joint_coefficients {
+                (&moduli.sums, moduli.sums_rest)
+            } else {
+                (&moduli.others[s], moduli.rests[s])
+            };
             for n in 0..LANE_COUNT {
-                rough[1][n] += norms * rest[n];
+                remainders[1][n] += norms * rest[n];
                 for corner in 0..4 {
                     slack[corner][n] += sizes[corner] * rest[n];
                 }
@@ -603,7 +639,7 @@ impl<'a> SliceTables<'a> {
                 }
             }
         }
-        CornerValues { values, slack, remainders: rough }
+        CornerValues { values, slack, remainders }
     }
 
     /// Convert a norm of the error to a raw score: Σ|e| for [`Norm::L1`], Σe² for [`Norm::L2`].
@@ -664,7 +700,7 @@ impl RowCoefficients {
         [(u0, u1), (v0, v1)]: [(usize, usize); 2],
         [plus, minus]: [[f64; 4]; 2],
     ) -> ([f64; 2], f64) {
-        let (mut far, mut independence) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
+        let (mut deviations, mut independence) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
         let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / to_f64(b - a) } else { 0.0 });
         for row in 0..=u1 - u0 {
@@ -681,8 +717,8 @@ impl RowCoefficients {
                 for n in 0..ROW_LANES {
                     let a = (plus[n] - (first + x * place[n])).abs();
                     let b = (minus[n] - (second + y * place[n])).abs();
-                    far[0][n] = if a > far[0][n] { a } else { far[0][n] };
-                    far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                    deviations[0][n] = if a > deviations[0][n] { a } else { deviations[0][n] };
+                    deviations[1][n] = if b > deviations[1][n] { b } else { deviations[1][n] };
                     independence[n] = if lefts[n] < independence[n] { lefts[n] } else { independence[n] };
                     place[n] += LANE_OFFSETS[ROW_LANES - 1] + 1.0;
                 }
@@ -690,13 +726,13 @@ impl RowCoefficients {
             for n in 0..rest[0].len() {
                 let a = (rest[0][n] - (first + x * place[n])).abs();
                 let b = (rest[1][n] - (second + y * place[n])).abs();
-                far[0][n] = if a > far[0][n] { a } else { far[0][n] };
-                far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                deviations[0][n] = if a > deviations[0][n] { a } else { deviations[0][n] };
+                deviations[1][n] = if b > deviations[1][n] { b } else { deviations[1][n] };
                 independence[n] = if rest[2][n] < independence[n] { rest[2][n] } else { independence[n] };
             }
         }
         let most = |x: [f64; ROW_LANES]| x.into_iter().fold(0.0_f64, f64::max);
-        ([most(far[0]), most(far[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
+        ([most(deviations[0]), most(deviations[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
     }
 
     /// Return the smallest 1 − B² over a box of orders, and the largest part of the squared output norm that the two

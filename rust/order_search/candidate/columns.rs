@@ -29,7 +29,7 @@ impl<'a> RequiredRegressors<'a> {
         for exponent in self.initial.offset_exponents(alpha).into_iter().chain(self.initial.impulses()) {
             self.index.insert(Key::initial(exponent));
         }
-        match self.initial.under() {
+        match self.initial.base() {
             Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => {}
             Initial::Powers(powers) => powers.iter().for_each(|&e| {
                 self.index.insert(Key::initial(e));
@@ -42,7 +42,7 @@ impl<'a> RequiredRegressors<'a> {
     pub(crate) fn add_term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
-            if *self.initial.under() == Initial::Caputo {
+            if *self.initial.base() == Initial::Caputo {
                 self.add_powers(alpha - order, order);
             }
         }

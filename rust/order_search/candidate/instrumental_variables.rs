@@ -76,12 +76,12 @@ impl Refiner {
             .iter()
             .zip(banks)
             .zip(targets)
-            .map(|((shelf, bank), target)| InstrumentSource {
-                own: positions.iter().map(|&p| shelf.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
-                measured: positions.iter().map(|&p| &shelf.columns[p]).collect(),
-                clean: positions.iter().map(|&p| &shelf.columns[p]).collect(),
-                initial: initial.iter().map(|&p| &shelf.columns[p]).collect(),
-                target: &shelf.target,
+            .map(|((spectra, bank), target)| InstrumentSource {
+                own: positions.iter().map(|&p| spectra.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
+                measured: positions.iter().map(|&p| &spectra.columns[p]).collect(),
+                clean: positions.iter().map(|&p| &spectra.columns[p]).collect(),
+                initial: initial.iter().map(|&p| &spectra.columns[p]).collect(),
+                target: &spectra.target,
                 output: target,
             })
             .collect();

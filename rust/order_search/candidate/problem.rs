@@ -89,7 +89,7 @@ struct InfeasibilityKernel<'a> {
     fixed: &'a [Option<f64>],
     initial: &'a [usize],
     start: &'a [f64],
-    reach: &'a mut InfeasibilityProof,
+    proof: &'a mut InfeasibilityProof,
 }
 
 impl simd::SimdKernel for InfeasibilityKernel<'_> {
@@ -97,14 +97,14 @@ impl simd::SimdKernel for InfeasibilityKernel<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.bound.proves_infeasible(self.limit, self.terms, self.fixed, self.initial, self.start, self.reach)
+        self.bound.proves_infeasible(self.limit, self.terms, self.fixed, self.initial, self.start, self.proof)
     }
 }
 
 /// Arguments of [`TailoredVectors::excludes_candidate`] as a task that is compiled for the widest vector instructions
 /// available.
 struct TailoredVectorKernel<'a> {
-    adapted: &'a TailoredVectors,
+    tailored: &'a TailoredVectors,
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
@@ -116,14 +116,14 @@ impl simd::SimdKernel for TailoredVectorKernel<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.adapted.excludes_candidate(self.terms, self.coefficients, self.limit, self.memory)
+        self.tailored.excludes_candidate(self.terms, self.coefficients, self.limit, self.memory)
     }
 }
 
 /// Arguments of [`LinearizedVectors::excludes_candidate`] as a task that is compiled for the widest vector instructions
 /// available.
 struct LinearizedVectorKernel<'a> {
-    tangents: &'a LinearizedVectors,
+    linearized_vectors: &'a LinearizedVectors,
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
@@ -135,7 +135,7 @@ impl simd::SimdKernel for LinearizedVectorKernel<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.tangents.excludes_candidate(self.terms, self.coefficients, self.limit, self.lookup)
+        self.linearized_vectors.excludes_candidate(self.terms, self.coefficients, self.limit, self.lookup)
     }
 }
 
@@ -317,18 +317,18 @@ impl Problem {
 
     /// Build the test vector tailored to the candidate with these columns, with zero initial conditions. `None` if the
     /// candidate is singular or a value overflows.
-    pub(crate) fn tailor_vector(&self, adapted: &TailoredVectors, positions: &[usize]) -> Option<TailoredVector> {
+    pub(crate) fn tailor_vector(&self, tailored: &TailoredVectors, positions: &[usize]) -> Option<TailoredVector> {
         let coefficients = self.coefficients(positions)?;
-        adapted.fit(&self.banks, &self.targets, positions, &coefficients)
+        tailored.fit(&self.banks, &self.targets, positions, &coefficients)
     }
 
     /// Return true if these test vectors prove that the raw score (Σ|e| or Σe²) of the candidate with these columns
     /// exceeds `limit`.
-    pub(crate) fn excluded_by_tailored(&self, adapted: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
+    pub(crate) fn excluded_by_tailored(&self, tailored: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
         let Some(coefficients) = self.coefficients(positions) else { return false };
         let mut memory = NormCache::default();
         simd::dispatch_simd(TailoredVectorKernel {
-            adapted,
+            tailored,
             limit,
             terms: positions,
             coefficients: &coefficients,
@@ -345,24 +345,27 @@ impl Problem {
     /// conditions. `None` if the vector covers no sample or a value overflows.
     pub(crate) fn linearize_vector(
         &self,
-        tangents: &LinearizedVectors,
+        linearized_vectors: &LinearizedVectors,
         terms: &[usize],
         c: &[f64],
         limit: f64,
     ) -> Option<LinearizedVector> {
-        tangents.fit((&self.banks, &self.targets), terms, c, limit)
+        linearized_vectors.fit((&self.banks, &self.targets), terms, c, limit)
     }
 
     /// Return those candidates, as columns and coefficients, that this vector does not exclude at this limit of the raw
     /// score (Σ|e| or Σe²).
     pub(crate) fn not_excluded_by(
         &self,
-        tangents: &LinearizedVectors,
+        linearized_vectors: &LinearizedVectors,
         linearized: &LinearizedVector,
         all: &[SolvedCandidate],
         limit: f64,
     ) -> Vec<SolvedCandidate> {
-        all.iter().filter(|(terms, c)| !tangents.vector_excludes(linearized, terms, c, limit)).cloned().collect()
+        all.iter()
+            .filter(|(terms, c)| !linearized_vectors.vector_excludes(linearized, terms, c, limit))
+            .cloned()
+            .collect()
     }
 
     /// Build the test for unstable zeros if its tables fit into `spare` bytes. Return the memory used \[bytes\], 0 if
@@ -438,10 +441,10 @@ impl Problem {
         let Scratch {
             norm_cache: memory,
             lookup,
-            infeasibility: reach,
+            infeasibility: proof,
             start,
             one,
-            simulation: march,
+            simulation,
             coefficients,
             weights,
             ..
@@ -460,7 +463,7 @@ impl Problem {
             start.clear();
             start.extend(coefficients.iter().chain(weights.iter()));
             let (terms, fixed) = (positions, self.equations.fixed_coefficients());
-            if simd::dispatch_simd(InfeasibilityKernel { bound, limit, terms, fixed, initial, start, reach }) {
+            if simd::dispatch_simd(InfeasibilityKernel { bound, limit, terms, fixed, initial, start, proof }) {
                 return Verdict::Bounded(limit);
             }
         }
@@ -481,13 +484,19 @@ impl Problem {
                 return Verdict::Bounded(lowest);
             }
         }
-        if let (Some(adapted), true) = (&self.tailored_vectors, limit < f64::INFINITY)
-            && simd::dispatch_simd(TailoredVectorKernel { adapted, limit, terms: positions, coefficients, memory })
+        if let (Some(tailored), true) = (&self.tailored_vectors, limit < f64::INFINITY)
+            && simd::dispatch_simd(TailoredVectorKernel { tailored, limit, terms: positions, coefficients, memory })
         {
             return Verdict::Bounded(limit);
         }
-        if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY)
-            && simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, lookup })
+        if let (Some(linearized_vectors), true) = (&self.linearized_vectors, limit < f64::INFINITY)
+            && simd::dispatch_simd(LinearizedVectorKernel {
+                linearized_vectors,
+                limit,
+                terms: positions,
+                coefficients,
+                lookup,
+            })
         {
             return Verdict::Bounded(limit);
         }
@@ -498,11 +507,13 @@ impl Problem {
             let starts = initial.iter().copied().zip(of_record(r).iter().copied());
             let column = |(p, c): (usize, f64)| (bank.column(p), c);
             let verdict = match self.options.criterion {
-                Criterion::EquationError => march.residuals(target, terms.chain(starts).map(column), norm, raw, limit),
+                Criterion::EquationError => {
+                    simulation.residuals(target, terms.chain(starts).map(column), norm, raw, limit)
+                }
                 Criterion::OutputError => {
                     let own = terms.clone().map(|(p, c)| (bank.kernel(p), c)).filter(|(kernel, _)| !kernel.is_empty());
                     let driven = terms.filter(|&(p, _)| bank.kernel(p).is_empty()).chain(starts).map(column);
-                    march.accumulate_error(target, own, driven, norm, raw, limit, control)
+                    simulation.accumulate_error(target, own, driven, norm, raw, limit, control)
                 }
             };
             match verdict {

@@ -109,15 +109,15 @@ impl BinomialSums {
 #[allow(clippy::cast_precision_loss)]
 fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     let b = highest;
-    let far = |t: f64| (libm::log(t) - mu).abs();
+    let deviation = |t: f64| (libm::log(t) - mu).abs();
     let mut sum = mu.powi(4);
     if m > 1 {
-        sum += libm::exp2(b + 1.0) * far(2.0).powi(4) + 2.0 * mu.powi(4);
+        sum += libm::exp2(b + 1.0) * deviation(2.0).powi(4) + 2.0 * mu.powi(4);
     }
-    let (mut before, mut current) = ((1.0, far(1.0)), (libm::pow(2.0, b - 1.0), far(2.0)));
+    let (mut before, mut current) = ((1.0, deviation(1.0)), (libm::pow(2.0, b - 1.0), deviation(2.0)));
     for n in 2..m {
         let t = (n + 1) as f64;
-        let after = (libm::pow(t, b - 1.0), far(t));
+        let after = (libm::pow(t, b - 1.0), deviation(t));
         let (power, l) = (f64::max(before.0, after.0), f64::max(before.1, after.1));
         sum += power * l * l * (((b + 1.0) * b * l + (2.0 * b + 1.0) * 4.0) * l + 12.0);
         (before, current) = (current, after);
@@ -197,9 +197,9 @@ impl RegressorExpansion {
         for j in 0..EXPANSION_COLUMNS {
             left_out += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL_TABLE[j];
         }
-        let hair = 1.0 + rounding_unit(columns[0].len());
-        let sizes = std::array::from_fn(|j| dot(&columns[j], &columns[j]).sqrt() * hair);
-        Ok(Self { columns, sizes, remainder: left_out * inverse * hair })
+        let rounding_factor = 1.0 + rounding_unit(columns[0].len());
+        let sizes = std::array::from_fn(|j| dot(&columns[j], &columns[j]).sqrt() * rounding_factor);
+        Ok(Self { columns, sizes, remainder: left_out * inverse * rounding_factor })
     }
 }
 
@@ -207,8 +207,8 @@ impl BinomialSums {
     /// Return the sum over n = 1 … m of the moduli of the summands of [`Self::derivative`].
     fn moduli(&self, j: usize, mu: f64) -> f64 {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
-        let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
-        let far = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
+        let first_terms = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
+        let other_terms = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
             let (mut value, mut turn) = (0.0, 1.0);
             for i in 0..=j {
                 value += turn / FACTORIAL_TABLE[i] * sums[j - i].abs();
@@ -216,7 +216,7 @@ impl BinomialSums {
             }
             2.0 * FACTORIAL_TABLE[j] * lead * value
         });
-        near + far.sum::<f64>()
+        first_terms + other_terms.sum::<f64>()
     }
 }
 

@@ -65,7 +65,7 @@ impl InfeasibilityProof {
     #[inline(always)]
     pub(super) fn set_conditions(
         &mut self,
-        probes: &[TestVectors],
+        test_vectors: &[TestVectors],
         limit: f64,
         terms: &[usize],
         fixed: &[Option<f64>],
@@ -73,27 +73,27 @@ impl InfeasibilityProof {
         start: &[f64],
     ) {
         let free = fixed.iter().filter(|f| f.is_none()).count();
-        let last = free + initial.len() * probes.len();
+        let last = free + initial.len() * test_vectors.len();
         self.unknowns = last + 1;
         self.effects.clear();
-        for (r, probes) in probes.iter().enumerate() {
+        for (r, test_vectors) in test_vectors.iter().enumerate() {
             // Margin for the rounding of the divisor and of the score.
-            let scale = 1.0 / (limit * (1.0 + probes.unit));
-            for group in 0..probes.groups {
+            let scale = 1.0 / (limit * (1.0 + test_vectors.unit));
+            for group in 0..test_vectors.groups {
                 let first = self.effects.len();
                 self.effects.resize(first + self.unknowns, NO_EFFECT);
                 let effects = &mut self.effects[first..];
                 let column = |p: usize, c: f64| -> Effect {
-                    let [re, im] = &probes.products[p * probes.groups + group];
+                    let [re, im] = &test_vectors.products[p * test_vectors.groups + group];
                     let mut effect = NO_EFFECT;
                     for n in 0..LANE_COUNT {
                         effect.error[0][n] = -c * re[n] * scale;
                         effect.error[1][n] = -c * im[n] * scale;
-                        effect.slack[n] = c.abs() * probes.rounding[p] * scale;
+                        effect.slack[n] = c.abs() * test_vectors.rounding[p] * scale;
                     }
-                    let row = probes.rows[p];
+                    let row = test_vectors.rows[p];
                     if row != NO_INDEX {
-                        let [re, im, rest, _] = &probes.effects[row * probes.groups + group];
+                        let [re, im, rest, _] = &test_vectors.effects[row * test_vectors.groups + group];
                         for n in 0..LANE_COUNT {
                             effect.divisor[0][n] = -c * re[n];
                             effect.divisor[1][n] = -c * im[n];
@@ -104,10 +104,10 @@ impl InfeasibilityProof {
                 };
                 let mut constant = NO_EFFECT;
                 for n in 0..LANE_COUNT {
-                    constant.error[0][n] = probes.target[group][0][n] * scale;
-                    constant.error[1][n] = probes.target[group][1][n] * scale;
-                    constant.divisor[0][n] = probes.size[group][n];
-                    constant.slack[n] = probes.target_rounding * scale;
+                    constant.error[0][n] = test_vectors.target[group][0][n] * scale;
+                    constant.error[1][n] = test_vectors.target[group][1][n] * scale;
+                    constant.divisor[0][n] = test_vectors.size[group][n];
+                    constant.slack[n] = test_vectors.target_rounding * scale;
                 }
                 let mut next = 0;
                 for (&p, value) in terms.iter().zip(fixed) {

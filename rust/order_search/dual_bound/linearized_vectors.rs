@@ -73,9 +73,9 @@ pub fn excluded_by_linearized_vector(
     }
     let bank = Bank::new(&index, record, equation.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
-    let mut tangents = LinearizedVectors::new(&banks, &targets, norm);
-    let own = tangents.own_columns(&positions[0]);
-    if own != tangents.own_columns(&positions[1]) || own.is_empty() || own.len() > MAX_OWN_TERMS {
+    let mut linearized_vectors = LinearizedVectors::new(&banks, &targets, norm);
+    let own = linearized_vectors.own_columns(&positions[0]);
+    if own != linearized_vectors.own_columns(&positions[1]) || own.is_empty() || own.len() > MAX_OWN_TERMS {
         return Err(Error::OutOfRange {
             name: "own terms".into(),
             value: 0.0,
@@ -83,9 +83,14 @@ pub fn excluded_by_linearized_vector(
             remedy: "give both equations these".into(),
         });
     }
-    let vector = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
-    tangents.add(own, vector.into_iter().collect());
-    Ok(tangents.excludes_candidate(&positions[1], &equation.coefficients, limit, &mut VectorLookup::default()))
+    let vector = linearized_vectors.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
+    linearized_vectors.add(own, vector.into_iter().collect());
+    Ok(linearized_vectors.excludes_candidate(
+        &positions[1],
+        &equation.coefficients,
+        limit,
+        &mut VectorLookup::default(),
+    ))
 }
 
 /// Test vector t₀ of one candidate and its first-order corrections v_m, one per output term, over all records. D₀ is

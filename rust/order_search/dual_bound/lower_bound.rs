@@ -143,12 +143,12 @@ pub fn excluded_in_turn(
     }
     let bank = Bank::new(&index, record, made_for.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
-    let mut adapted = TailoredVectors::new(&banks, &targets, norm);
-    adapted.vectors.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    let mut tailored = TailoredVectors::new(&banks, &targets, norm);
+    tailored.vectors.extend(tailored.fit(&banks, &targets, &positions[0], &made_for.coefficients));
     let mut memory = NormCache::for_adjacent_candidates();
     let candidates = positions[1..].iter().zip(equations);
     Ok(candidates
-        .map(|(terms, candidates)| adapted.excludes_candidate(terms, &candidates.coefficients, limit, &mut memory))
+        .map(|(terms, candidates)| tailored.excludes_candidate(terms, &candidates.coefficients, limit, &mut memory))
         .collect())
 }
 
@@ -221,12 +221,13 @@ impl Bound {
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
     ) -> (f64, f64) {
         let (mut bound, mut guess) = (0.0, 0.0);
-        for (r, probes) in self.test_vectors.iter().enumerate() {
+        for (r, test_vectors) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
+            let rounding = test_vectors.rounding_bound(terms, coefficients, initial, weights);
             let (mut largest, mut farthest) = (0.0, 0.0);
-            for group in 0..probes.groups {
-                let (bounds, guesses) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
+            for group in 0..test_vectors.groups {
+                let (bounds, guesses) =
+                    test_vectors.group_bounds(group, terms, coefficients, initial, weights, rounding);
                 for n in 0..LANE_COUNT {
                     // Neither NaN nor an overflow proves anything.
                     if bounds[n] > largest && bounds[n] < f64::MAX {
@@ -277,11 +278,11 @@ impl Bound {
         out: &mut [f64],
     ) {
         out.fill(0.0);
-        for (r, probes) in self.test_vectors.iter().enumerate() {
+        for (r, test_vectors) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
-            let rounding = probes.rounding_bound(terms, coefficients, initial, weights);
-            for (group, out) in out.chunks_exact_mut(LANE_COUNT).enumerate().take(probes.groups) {
-                let (bounds, _) = probes.group_bounds(group, terms, coefficients, initial, weights, rounding);
+            let rounding = test_vectors.rounding_bound(terms, coefficients, initial, weights);
+            for (group, out) in out.chunks_exact_mut(LANE_COUNT).enumerate().take(test_vectors.groups) {
+                let (bounds, _) = test_vectors.group_bounds(group, terms, coefficients, initial, weights, rounding);
                 for (sum, bound) in out.iter_mut().zip(bounds) {
                     if bound > 0.0 && bound < f64::MAX {
                         *sum += self.raw(bound);

@@ -127,7 +127,7 @@ impl Vector {
     /// Return a workspace for test vectors on a record of `m` samples.
     fn with_samples(m: usize) -> Self {
         let none = || [0, 1].map(|_| vec![0.0; m]);
-        let spectra = [0, 1].map(|_| Kernel::noughts(m));
+        let spectra = [0, 1].map(|_| Kernel::zeros(m));
         Self { halves: none(), number: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
     }
 
@@ -177,7 +177,7 @@ pub(super) fn divisor_effects(
     let kernels = |columns: &[usize]| -> Vec<(Kernel, f64)> {
         let kernel = |buffers: &mut Buffers, &column: &usize| {
             let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
-            (Kernel::made_with(bank.kernel(column), buffers), length)
+            (Kernel::with_buffers(bank.kernel(column), buffers), length)
         };
         columns.par_iter().with_max_len(1).map_init(Buffers::default, kernel).collect()
     };

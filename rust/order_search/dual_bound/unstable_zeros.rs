@@ -22,7 +22,7 @@ use crate::simd::LANE_COUNT;
 /// Growth rates at which the paths run, per record length. In the plane of growth rate and angular frequency, a path
 /// encloses the part of a disc about 0 to the right of its rate. The radius of the disc is three times the rate. Modes
 /// that grow more slowly hardly increase the simulated output. If they grow faster, the simulation ends early.
-const PATH_DECAY_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
+const PATH_GROWTH_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
 /// Ratio of the radius of a path in the complex plane to its growth rate.
 const PATH_RADIUS_RATIO: f64 = 3.0;
 /// Number of chords along the arc and along the straight line of the upper half of a path in the complex plane.
@@ -69,8 +69,8 @@ pub fn has_unstable_zeros(record: &Record, equation: &Equation, norm: Norm, limi
         .collect();
     let bank = Bank::new(&index, record, structure.output)?;
     let target = record.signal(structure.output).to_vec();
-    let roots = UnstableZeros::new(&[bank], &[target], norm);
-    Ok(roots.excludes_candidate(&columns, coefficients, limit, &mut 0))
+    let unstable_zeros = UnstableZeros::new(&[bank], &[target], norm);
+    Ok(unstable_zeros.excludes_candidate(&columns, coefficients, limit, &mut 0))
 }
 
 /// Test for unstable zeros of the denominator: values of every regressor column along closed paths in the complex
@@ -189,7 +189,8 @@ impl PathSums {
         let moduli: Vec<&[f64]> = moduli.iter().map(Vec::as_slice).collect();
         let sums = series.iter().map(|x| sum_of_moduli(x)).collect();
         // A larger radius would alias at the sampling interval.
-        let rates: Vec<f64> = PATH_DECAY_RATES.into_iter().filter(|rate| PATH_RADIUS_RATIO * rate <= samples).collect();
+        let rates: Vec<f64> =
+            PATH_GROWTH_RATES.into_iter().filter(|rate| PATH_RADIUS_RATIO * rate <= samples).collect();
         let paths: Vec<_> = rates.par_iter().map(|&rate| path_sums(rate, &series, &moduli, unit)).collect();
         let (values, tails): (Vec<_>, Vec<_>) = paths.into_iter().unzip();
         Self {
@@ -258,7 +259,7 @@ impl UnstableZeros {
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         banks
             .iter()
-            .map(|bank| (bank.len() * PATH_DECAY_RATES.len() * size_of::<[[f64; PADDED_NODE_COUNT]; 3]>()) as u64)
+            .map(|bank| (bank.len() * PATH_GROWTH_RATES.len() * size_of::<[[f64; PADDED_NODE_COUNT]; 3]>()) as u64)
             .sum()
     }
 

@@ -67,9 +67,9 @@ impl OrderGrid {
     /// // Two own terms that may be swapped, and the input at order 0.
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
     /// let input = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// let lattice = OrderGrid::new(0, &[0.8, 1.2], &[own.clone(), own, input], |signal| signal == 1)?;
+    /// let grid = OrderGrid::new(0, &[0.8, 1.2], &[own.clone(), own, input], |signal| signal == 1)?;
     /// // (0.5, 0) below 0.8; (1, 0.5), (1, 0), (0.5, 0) below 1.2.
-    /// assert_eq!(lattice.count(), 4);
+    /// assert_eq!(grid.count(), 4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn new(output: usize, alphas: &[f64], terms: &[TermAxis], is_input: impl Fn(usize) -> bool) -> Result<Self> {

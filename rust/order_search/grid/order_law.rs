@@ -48,11 +48,11 @@ impl OrderLawGrid {
     /// // D^α y = c D^{α−1} u for a free α.
     /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
     /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
-    /// let lattice = OrderLawGrid::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
-    /// assert_eq!((lattice.product(), lattice.free(1)), (2, vec![1.5]));
+    /// let grid = OrderLawGrid::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
+    /// assert_eq!((grid.product(), grid.free(1)), (2, vec![1.5]));
     /// // An order below 0 is for inputs alone.
-    /// assert!(lattice.structures(0).is_none());
-    /// assert_eq!(lattice.structures(1).map(|all| all[0].terms[0].order), Some(0.5));
+    /// assert!(grid.structures(0).is_none());
+    /// assert_eq!(grid.structures(1).map(|all| all[0].terms[0].order), Some(0.5));
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn new(axes: &[Vec<f64>], equations: &[LawEquation], inputs: &[bool]) -> Result<Self> {

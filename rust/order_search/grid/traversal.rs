@@ -12,8 +12,8 @@ impl OrderGrid {
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
     /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
-    /// let lattice = OrderGrid::new(0, &[0.8], &[own], |_| false)?;
-    /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();
+    /// let grid = OrderGrid::new(0, &[0.8], &[own], |_| false)?;
+    /// let orders: Vec<f64> = (0..grid.count()).map(|index| grid.structure(index).terms[0].order).collect();
     /// assert_eq!(orders, [0.5, 0.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -27,7 +27,7 @@ impl OrderGrid {
 /// equation.
 #[derive(Debug, Clone)]
 pub(crate) struct Cursor<'a> {
-    lattice: &'a OrderGrid,
+    grid: &'a OrderGrid,
     /// Index of the block, which has one order α of the equation.
     block: usize,
     /// For each group, the number of the combination of all its orders but the last.
@@ -40,20 +40,20 @@ pub(crate) struct Cursor<'a> {
 
 impl<'a> Cursor<'a> {
     /// Return a cursor at a candidate. An index beyond the end gives the last candidate.
-    pub(crate) fn at(lattice: &'a OrderGrid, index: u64) -> Self {
-        let index = index.min(lattice.count - 1);
-        let block = lattice.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
-        let groups = lattice.groups.len();
+    pub(crate) fn at(grid: &'a OrderGrid, index: u64) -> Self {
+        let index = index.min(grid.count - 1);
+        let block = grid.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
+        let groups = grid.groups.len();
         let mut cursor = Self {
-            lattice,
+            grid,
             block,
             prefixes: vec![0; groups],
             completions: vec![Bits(Vec::new()); groups],
-            digits: lattice.groups.iter().map(|g| vec![0; g.terms.len()]).collect(),
+            digits: grid.groups.iter().map(|g| vec![0; g.terms.len()]).collect(),
         };
-        let mut rest = index - lattice.blocks[block].start;
+        let mut rest = index - grid.blocks[block].start;
         for g in (0..groups).rev() {
-            let count = lattice.blocks[block].tuples[g].count;
+            let count = grid.blocks[block].tuples[g].count;
             cursor.seek(g, rest % count);
             rest /= count;
         }
@@ -62,11 +62,11 @@ impl<'a> Cursor<'a> {
 
     /// Return the index of the candidate in a block whose orders have these axis positions, one per term. `None` if
     /// there is no such candidate.
-    pub(crate) fn find(lattice: &'a OrderGrid, block: usize, digits: &[usize]) -> Option<u64> {
-        let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
+    pub(crate) fn find(grid: &'a OrderGrid, block: usize, digits: &[usize]) -> Option<u64> {
+        let mut cursor = Self::at(grid, grid.blocks.get(block)?.start);
         let mut index = 0;
-        for (g, group) in lattice.groups.iter().enumerate() {
-            let count = lattice.blocks[block].tuples[g].count;
+        for (g, group) in grid.groups.iter().enumerate() {
+            let count = grid.blocks[block].tuples[g].count;
             let digits_of_group = || group.terms.iter().map(|&term| digits[term]);
             let (mut lo, mut hi) = (0, count);
             while lo < hi {
@@ -87,15 +87,15 @@ impl<'a> Cursor<'a> {
             }
             index = index * count + lo;
         }
-        Some(lattice.blocks[block].start + index)
+        Some(grid.blocks[block].start + index)
     }
 
     /// Move a group (the terms of one signal) to its combination of orders with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
-        let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].tuples[g]);
-        let stretch = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
-        let mut rest = rank - slice.before[stretch];
-        for prefix in stretch * PREFIX_STRIDE..slice.prefixes {
+        let (group, slice) = (&self.grid.groups[g], &self.grid.blocks[self.block].tuples[g]);
+        let block = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
+        let mut rest = rank - slice.before[block];
+        for prefix in block * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
             let completions = group.count_completions(&slice.first, &self.digits[g]);
             if rest < completions {
@@ -110,8 +110,8 @@ impl<'a> Cursor<'a> {
     /// Set all orders of a group (the terms of one signal) but the last to combination number `prefix`. Return true if
     /// any value of the last order is allowed with them.
     fn enter(&mut self, g: usize, prefix: usize) -> bool {
-        let group = &self.lattice.groups[g];
-        let first = &self.lattice.blocks[self.block].tuples[g].first;
+        let group = &self.grid.groups[g];
+        let first = &self.grid.blocks[self.block].tuples[g].first;
         group.decode(first, prefix, &mut self.digits[g]);
         let words = &mut self.completions[g].0;
         words.clear();
@@ -128,9 +128,9 @@ impl<'a> Cursor<'a> {
     /// Advance to the next candidate, if there is one. Return the index of the first group (terms of one signal) that
     /// has changed. Return 0 after a change of α.
     pub(crate) fn advance(&mut self) -> usize {
-        let groups = self.lattice.groups.len();
+        let groups = self.grid.groups.len();
         for g in (0..groups).rev() {
-            if self.lattice.blocks[self.block].tuples[g].count == 1 {
+            if self.grid.blocks[self.block].tuples[g].count == 1 {
                 continue;
             }
             if self.step(g) {
@@ -138,7 +138,7 @@ impl<'a> Cursor<'a> {
             }
             self.seek(g, 0);
         }
-        if self.block + 1 < self.lattice.blocks.len() {
+        if self.block + 1 < self.grid.blocks.len() {
             self.block += 1;
             (0..groups).for_each(|g| self.seek(g, 0));
         }
@@ -149,9 +149,9 @@ impl<'a> Cursor<'a> {
     /// candidates, by one axis position each. `None` otherwise.
     #[inline]
     pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].tuples;
+        let slices = &self.grid.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
-        let group = &self.lattice.groups[g];
+        let group = &self.grid.groups[g];
         let digit = self.digits[g][group.last()];
         let whole = digit + len <= group.axes[group.last()].len();
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
@@ -161,9 +161,9 @@ impl<'a> Cursor<'a> {
     /// changes, by one axis position each. `None` if no order varies.
     #[inline]
     pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
-        let slices = &self.lattice.blocks[self.block].tuples;
+        let slices = &self.grid.blocks[self.block].tuples;
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
-        let group = &self.lattice.groups[g];
+        let group = &self.grid.groups[g];
         let digit = self.digits[g][group.last()];
         Some((group.terms[group.last()], digit, self.completions[g].run(digit)))
     }
@@ -171,20 +171,20 @@ impl<'a> Cursor<'a> {
     /// Advance by `count` candidates, within the run of candidates over which only one term changes.
     #[inline]
     pub(crate) fn skip(&mut self, count: usize) {
-        let slices = &self.lattice.blocks[self.block].tuples;
+        let slices = &self.grid.blocks[self.block].tuples;
         if let Some(g) = (0..slices.len()).rev().find(|&g| slices[g].count > 1) {
-            self.digits[g][self.lattice.groups[g].last()] += count;
+            self.digits[g][self.grid.groups[g].last()] += count;
         }
     }
 
     /// Advance a group (the terms of one signal) to its next combination of orders. Return true if there is one.
     fn step(&mut self, g: usize) -> bool {
-        let last = self.lattice.groups[g].last();
+        let last = self.grid.groups[g].last();
         if let Some(next) = self.completions[g].next(self.digits[g][last] + 1) {
             self.digits[g][last] = next;
             return true;
         }
-        let prefixes = self.lattice.blocks[self.block].tuples[g].prefixes;
+        let prefixes = self.grid.blocks[self.block].tuples[g].prefixes;
         if !(self.prefixes[g] + 1..prefixes).any(|prefix| self.enter(g, prefix)) {
             return false;
         }
@@ -208,20 +208,20 @@ impl<'a> Cursor<'a> {
     /// form a group.
     #[inline(always)]
     pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
-        for (group, digits) in self.lattice.groups[from..].iter().zip(&self.digits[from..]) {
+        for (group, digits) in self.grid.groups[from..].iter().zip(&self.digits[from..]) {
             group.terms.iter().zip(digits).for_each(|(&term, &digit)| take(term, digit));
         }
     }
 
     /// Return the structure of the current candidate.
     pub(crate) fn structure(&self) -> Structure {
-        let mut terms = vec![Term { signal: 0, order: 0.0 }; self.lattice.width()];
-        for (group, digits) in self.lattice.groups.iter().zip(&self.digits) {
+        let mut terms = vec![Term { signal: 0, order: 0.0 }; self.grid.width()];
+        for (group, digits) in self.grid.groups.iter().zip(&self.digits) {
             for ((&k, axis), &digit) in group.terms.iter().zip(&group.axes).zip(digits) {
                 terms[k] = Term { signal: group.signal, order: axis[digit] };
             }
         }
-        Structure { output: self.lattice.output(), order: self.lattice.blocks[self.block].alpha, terms }
+        Structure { output: self.grid.output(), order: self.grid.blocks[self.block].alpha, terms }
     }
 }
 
@@ -256,11 +256,11 @@ impl OrderGrid {
     }
 
     /// Return an upper bound of the number of candidates of a slice in the same block, which has one order α.
-    pub(crate) fn max_slice_candidates(&self, slab: &GridSlice) -> u64 {
-        let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
+    pub(crate) fn max_slice_candidates(&self, slice: &GridSlice) -> u64 {
+        let whole = self.groups.iter().find(|group| group.terms.contains(&slice.outer));
         let axis =
-            whole.map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slab.block, slab.outer));
-        (axis * slab.len) as u64
+            whole.map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slice.block, slice.outer));
+        (axis * slice.len) as u64
     }
 
     /// Return the slice that contains a candidate. `None` if the fastest varying signal has several terms, or if the

@@ -84,8 +84,8 @@ impl Table {
 }
 
 /// Coupled equations of an order search, with the data that their candidates share.
-pub struct Stage<'a> {
-    lattice: Cow<'a, OrderLawGrid>,
+pub struct CoupledSearch<'a> {
+    grid: Cow<'a, OrderLawGrid>,
     options: Options,
     /// Candidates of each equation.
     tables: Vec<Table>,
@@ -115,7 +115,7 @@ pub struct SearchState {
     best_rows: Vec<(f64, u64)>,
 }
 
-impl<'a> Stage<'a> {
+impl<'a> CoupledSearch<'a> {
     /// Build the join of the equations under their order law, and the data that the candidates of each equation share.
     ///
     /// `fixed[e]` has one entry per term of equation e, `None` for a free coefficient. `scales[e]` divides the score of
@@ -128,14 +128,14 @@ impl<'a> Stage<'a> {
     /// combination of free orders gives valid orders. [`Error::OutOfRange`] for a scale that is not positive.
     pub fn new(
         records: &[Record],
-        lattice: Cow<'a, OrderLawGrid>,
+        grid: Cow<'a, OrderLawGrid>,
         fixed: &[Vec<Option<f64>>],
         scales: &[f64],
         options: &Options,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<(Self, SearchState)> {
-        let equations = lattice.equations();
+        let equations = grid.equations();
         check_length("fixed coefficients", equations.len(), fixed.len())?;
         check_length("scales", equations.len(), scales.len())?;
         if let Some(e) = scales.iter().position(|scale| !(*scale > 0.0 && scale.is_finite())) {
@@ -148,10 +148,10 @@ impl<'a> Stage<'a> {
         }
         options.check()?;
         for record in records {
-            lattice.check_signals(record.len())?;
+            grid.check_signals(record.len())?;
         }
         let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
-        let (join, used) = Join::new(&lattice, &mut candidates, options.memory, pool, control)?;
+        let (join, used) = Join::new(&grid, &mut candidates, options.memory, pool, control)?;
         if join.tuples() == 0 {
             return Err(Error::EmptyOrderGrid { why: "no tuple of free orders gives orders in range".into() });
         }
@@ -183,18 +183,18 @@ impl<'a> Stage<'a> {
             })?;
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }
-        let stage = Self { lattice, options: options.clone(), tables, samples };
-        let mut course = SearchState {
+        let search = Self { grid, options: options.clone(), tables, samples };
+        let mut state = SearchState {
             join,
-            entries: stage.tables.iter().map(|t| vec![UNEVALUATED_ENTRY; t.candidates.len()]).collect(),
+            entries: search.tables.iter().map(|t| vec![UNEVALUATED_ENTRY; t.candidates.len()]).collect(),
             pass: (0, 0, f64::INFINITY),
             limit_factor: FIRST_LIMIT,
             pending_spans: Vec::new(),
-            total: stage.tables.iter().map(|t| t.used.len() as u64).sum(),
+            total: search.tables.iter().map(|t| t.used.len() as u64).sum(),
             best_rows: Vec::new(),
         };
-        course.plan_next(&stage, pool, control)?;
-        Ok((stage, course))
+        state.plan_next(&search, pool, control)?;
+        Ok((search, state))
     }
 
     /// Return the raw score (Σ|e| or Σe²) of an equation for its score divided by the scale of the equation, with a
@@ -252,23 +252,23 @@ impl<'a> Stage<'a> {
     /// # Errors
     /// [`Error::Structure`] if candidates are still to be evaluated or the state belongs to another search.
     /// [`Error::Internal`] for an internal fault.
-    pub fn outcome(&self, course: &SearchState, control: &Control) -> Result<StageOutcome> {
-        if !course.pending_spans.is_empty() {
+    pub fn outcome(&self, state: &SearchState, control: &Control) -> Result<StageOutcome> {
+        if !state.pending_spans.is_empty() {
             let what = "the search has no result yet, because candidates are still to be evaluated".into();
             return Err(Error::Structure {
                 what,
                 remedy: "evaluate the pending candidates, and add their verdicts".into(),
             });
         }
-        course.check(self)?;
-        let (mut counts, failures) = course.join.count_outcomes(&course.states());
-        counts.table_rows = course.best_rows.len() as u64;
+        state.check(self)?;
+        let (mut counts, failures) = state.join.count_outcomes(&state.states());
+        counts.table_rows = state.best_rows.len() as u64;
         counts.beaten -= counts.table_rows;
         let mut scratch = Scratch::default();
-        let mut rows = Vec::with_capacity(course.best_rows.len());
-        for &(score, index) in &course.best_rows {
+        let mut rows = Vec::with_capacity(state.best_rows.len());
+        for &(score, index) in &state.best_rows {
             let structures = self
-                .lattice
+                .grid
                 .structures(index)
                 .ok_or_else(|| Error::Internal { what: "a kept tuple without structures".into() })?;
             let mut parts = Vec::with_capacity(structures.len());
@@ -277,7 +277,7 @@ impl<'a> Stage<'a> {
                 row.score = table.problem.score(row.score);
                 parts.push(row);
             }
-            rows.push(StageRow { index, free: self.lattice.free(index), score, structures, rows: parts });
+            rows.push(StageRow { index, free: self.grid.free(index), score, structures, rows: parts });
         }
         let distinct = self.tables.iter().map(|t| t.used.len() as u64).collect();
         Ok(StageOutcome { rows, counts, failures, distinct })
@@ -285,8 +285,8 @@ impl<'a> Stage<'a> {
 
     /// Return the order grid of the coupled equations.
     #[must_use]
-    pub fn lattice(&self) -> &OrderLawGrid {
-        &self.lattice
+    pub fn grid(&self) -> &OrderLawGrid {
+        &self.grid
     }
 }
 
@@ -312,12 +312,12 @@ impl SearchState {
     }
 
     /// Return [`Error::Structure`] if the state belongs to another search.
-    fn check(&self, stage: &Stage<'_>) -> Result<()> {
-        let candidates = stage.tables.iter().map(|table| table.candidates.len());
+    fn check(&self, search: &CoupledSearch<'_>) -> Result<()> {
+        let candidates = search.tables.iter().map(|table| table.candidates.len());
         if candidates.eq(self.entries.iter().map(Vec::len)) {
             Ok(())
         } else {
-            Err(mismatch_error("the stage is not the one with which the search was created".into()))
+            Err(mismatch_error("the state belongs to another coupled search".into()))
         }
     }
 
@@ -334,12 +334,12 @@ impl SearchState {
     /// [`Error::Interrupted`] after a stop request.
     pub fn record_verdicts(
         &mut self,
-        stage: &Stage<'_>,
+        search: &CoupledSearch<'_>,
         verdicts: &[Verdict],
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<()> {
-        self.check(stage)?;
+        self.check(search)?;
         let count: usize = self.pending_spans.iter().map(|span| span.last - span.first).sum();
         let sound = |verdict: &Verdict| match *verdict {
             Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
@@ -348,10 +348,10 @@ impl SearchState {
         if verdicts.len() != count || !verdicts.iter().all(sound) {
             return Err(mismatch_error(format!("{} results do not match {count} candidates", verdicts.len())));
         }
-        let first_pass = self.pass.0 < stage.tables.len();
+        let first_pass = self.pass.0 < search.tables.len();
         let mut verdicts = verdicts.iter();
         for span in &self.pending_spans {
-            let table = &stage.tables[span.equation];
+            let table = &search.tables[span.equation];
             for (entry, &verdict) in self.entries[span.equation][span.first..span.last].iter_mut().zip(&mut verdicts) {
                 *entry = table.entry(verdict);
                 if first_pass && entry.class == Class::Exact {
@@ -359,28 +359,28 @@ impl SearchState {
                 }
             }
         }
-        self.plan_next(stage, pool, control)
+        self.plan_next(search, pool, control)
     }
 
     /// Select the candidates to evaluate next, and update the best combinations of free orders after the first pass.
-    fn plan_next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
+    fn plan_next(&mut self, search: &CoupledSearch<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
         control.total.store(self.total, Ordering::Relaxed);
         // The first pass finds the best score of each equation. Evaluations stop at a multiple of it.
-        while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
+        while let Some(Table { used, .. }) = search.tables.get(self.pass.0) {
             let (equation, start, best) = self.pass;
             if start < used.len() {
                 let end = used.len().min(start + if start == 0 { 256 } else { CANDIDATES_PER_UPDATE.max(start / 2) });
-                let limit = if stage.options.pruning { FIRST_LIMIT * best } else { f64::INFINITY };
+                let limit = if search.options.pruning { FIRST_LIMIT * best } else { f64::INFINITY };
                 self.pending_spans = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
                 self.pass.1 = end;
                 return Ok(());
             }
             self.pass = (equation + 1, 0, f64::INFINITY);
         }
-        let keep = stage.options.top;
+        let top = search.options.top;
         let states = self.states();
-        self.best_rows = self.join.best(&states, &self.entries, keep, pool, control)?;
-        let worst = if self.best_rows.len() == keep { self.best_rows[keep - 1].0 } else { f64::INFINITY };
+        self.best_rows = self.join.best(&states, &self.entries, top, pool, control)?;
+        let worst = if self.best_rows.len() == top { self.best_rows[top - 1].0 } else { f64::INFINITY };
         self.pending_spans = self.join.unresolved_spans(&states, &self.entries, worst, self.limit_factor, control)?;
         self.limit_factor *= FIRST_LIMIT;
         self.total += self.pending_spans.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
@@ -392,7 +392,8 @@ impl SearchState {
 /// Search for the free orders that minimize the sum of score / scale over the equations.
 ///
 /// # Errors
-/// An invalid option, scale or record, or no combination of free orders that gives valid orders ([`Stage::new`]).
+/// An invalid option, scale or record, or no combination of free orders that gives valid orders
+/// ([`CoupledSearch::new`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -411,26 +412,26 @@ impl SearchState {
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 1.0);
 /// // D^α y = D^{α−1} u for any α: y is the integral of u.
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
-/// let lattice = OrderLawGrid::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
+/// let grid = OrderLawGrid::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
 /// let fixed = [vec![None]];
-/// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;
+/// let found = search(&[record], &grid, &fixed, &[1.0], &Options::default(), &Control::default())?;
 /// assert_eq!(found.counts.candidates, 2);
 /// assert!((found.rows[0].rows[0].coefficients[0] - 1.0).abs() < 1e-9);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn search(
     records: &[Record],
-    lattice: &OrderLawGrid,
+    grid: &OrderLawGrid,
     fixed: &[Vec<Option<f64>>],
     scales: &[f64],
     options: &Options,
     control: &Control,
 ) -> Result<StageOutcome> {
     let pool = pool(options.threads)?;
-    let (stage, mut course) = Stage::new(records, Cow::Borrowed(lattice), fixed, scales, options, &pool, control)?;
-    while !course.pending_spans().is_empty() {
-        let verdicts = stage.evaluate(course.pending_spans(), &pool, control)?;
-        course.record_verdicts(&stage, &verdicts, &pool, control)?;
+    let (search, mut state) = CoupledSearch::new(records, Cow::Borrowed(grid), fixed, scales, options, &pool, control)?;
+    while !state.pending_spans().is_empty() {
+        let verdicts = search.evaluate(state.pending_spans(), &pool, control)?;
+        state.record_verdicts(&search, &verdicts, &pool, control)?;
     }
-    stage.outcome(&course, control)
+    search.outcome(&state, control)
 }

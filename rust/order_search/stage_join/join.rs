@@ -28,7 +28,7 @@ use crate::order_search::result::Failure;
 pub(super) struct HalfRow {
     /// Number of the bucket. Rows of both halves in the same bucket are compatible. It is computed from the two addends
     /// that compatible rows have in common.
-    bucket: u64,
+    bucket_id: u64,
     /// Contribution of the free orders of this half to the index of a combination of all free orders.
     pub(super) index: u64,
     /// Index of the combination of candidates in [`Half`], with one candidate per equation of this half.
@@ -96,15 +96,15 @@ const MAX_SPLIT_ORDERS: usize = 10;
 /// Return the free orders of the first half of the join for which the total number of rows is smallest. Return an error
 /// if the rows are too many or need more than `memory` bytes.
 fn split_free_orders(
-    lattice: &OrderLawGrid,
+    grid: &OrderLawGrid,
     rows: &[OrderLawSums; 2],
     memory: u64,
     control: &Control,
 ) -> Result<Vec<usize>> {
-    let axes: Vec<usize> = (0..lattice.axes().len()).collect();
-    let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
+    let axes: Vec<usize> = (0..grid.axes().len()).collect();
+    let size = |axes: &[usize]| axes.iter().map(|&a| grid.axes()[a].len() as u128).product::<u128>();
     let several: Vec<usize> =
-        axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(MAX_SPLIT_ORDERS).collect();
+        axes.iter().copied().filter(|&a| grid.axes()[a].len() > 1).take(MAX_SPLIT_ORDERS).collect();
     let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << several.len())
         .map(|mask| {
             let own: Vec<usize> =
@@ -121,15 +121,15 @@ fn split_free_orders(
             break;
         }
         let limit = |size: u128| usize::try_from((least / size).min(MAX_HALF_ROWS)).unwrap_or(usize::MAX);
-        let Some(first) = rows[0].distinct_sums(lattice, &other, limit(size(&own)), control)? else { continue };
-        let Some(second) = rows[1].distinct_sums(lattice, &own, limit(size(&other)), control)? else { continue };
+        let Some(first) = rows[0].distinct_sums(grid, &other, limit(size(&own)), control)? else { continue };
+        let Some(second) = rows[1].distinct_sums(grid, &own, limit(size(&other)), control)? else { continue };
         let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
         if count < least {
             (least, best) = (count, own);
         }
     }
     if least > MAX_HALF_ROWS {
-        return Err(Error::OrderGridTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_HALF_ROWS });
+        return Err(Error::OrderGridTooLarge { count: least.min(u128::from(grid.product())), limit: MAX_HALF_ROWS });
     }
     let (bytes, limit) = (BYTES_PER_HALF_ROW * least, u128::from(memory));
     if bytes > limit {
@@ -143,7 +143,7 @@ impl Join {
     /// occur for some values of the free orders. Return [`Error::Memory`] if the rows need more than `memory` bytes,
     /// [`Error::OrderGridTooLarge`] for more than [`MAX_HALF_ROWS`] rows.
     pub(super) fn new(
-        lattice: &OrderLawGrid,
+        grid: &OrderLawGrid,
         candidates: &mut [Candidates],
         memory: u64,
         pool: &rayon::ThreadPool,
@@ -151,11 +151,11 @@ impl Join {
     ) -> Result<(Self, Vec<Vec<usize>>)> {
         let count = candidates.len();
         let ranges = [0..count.min(1), count.min(1)..count];
-        let rows = ranges.clone().map(|range| OrderLawSums::new(lattice, range));
-        let own = split_free_orders(lattice, &rows, memory, control)?;
-        let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
+        let rows = ranges.clone().map(|range| OrderLawSums::new(grid, range));
+        let own = split_free_orders(grid, &rows, memory, control)?;
+        let other: Vec<usize> = (0..grid.axes().len()).filter(|axis| !own.contains(axis)).collect();
         let full = |axes: &[usize], rows: &OrderLawSums| {
-            rows.distinct_sums(lattice, axes, usize::MAX, control)?
+            rows.distinct_sums(grid, axes, usize::MAX, control)?
                 .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
         };
         let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
@@ -166,26 +166,26 @@ impl Join {
             let mut half = Half { equations: equations.clone(), combinations: Vec::new(), rows: Vec::new() };
             let mut ids_by_key: HashMap<Box<[u32]>, u32> = HashMap::new();
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
-            rows[h].for_each_choice(lattice, axes, &rows[1 - h], |index, sums, theirs| {
+            rows[h].for_each_choice(grid, axes, &rows[1 - h], |index, sums, theirs| {
                 control.check_stop()?;
                 let Some(named) = addends[1 - h].find(theirs) else { return Ok(()) };
                 for (number_of_addend, addend) in addends[h].each().enumerate() {
                     if number_of_addend % ROWS_PER_STOP_CHECK == ROWS_PER_STOP_CHECK - 1 {
                         control.check_stop()?;
                     }
-                    if !rows[h].orders(lattice, sums, addend, &mut orders) {
+                    if !rows[h].orders(grid, sums, addend, &mut orders) {
                         continue;
                     }
                     let combination =
-                        combination(lattice, candidates, &mut half, &mut ids_by_key, &orders, &mut key, &mut ids)?;
+                        combination(grid, candidates, &mut half, &mut ids_by_key, &orders, &mut key, &mut ids)?;
                     let (mine, named) = (number_of_addend as u64, u64::from(named));
-                    let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
-                    half.rows.push(HalfRow { bucket, index, combination });
+                    let bucket_id = if h == 0 { mine * stride + named } else { named * stride + mine };
+                    half.rows.push(HalfRow { bucket_id, index, combination });
                 }
                 Ok(())
             })?;
             control.check_stop()?;
-            pool.install(|| half.rows.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
+            pool.install(|| half.rows.par_sort_unstable_by_key(|row| (row.bucket_id, row.index)));
             halves.push(half);
         }
         let [first, second] =
@@ -198,8 +198,8 @@ impl Join {
                 control.check_stop()?;
             }
             for (half, rows) in join.halves.iter().zip(&bucket.rows) {
-                for part in &half.rows[rows.clone()] {
-                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                for row in &half.rows[rows.clone()] {
+                    for (e, &id) in half.equations.clone().zip(half.ids(row.combination)) {
                         used[e][id as usize] = true;
                     }
                 }
@@ -213,8 +213,12 @@ impl Join {
     /// under the order law.
     fn match_buckets(&mut self, control: &Control) -> Result<()> {
         let [a, b] = [&self.halves[0].rows, &self.halves[1].rows];
-        let end = |parts: &[HalfRow], start: usize| {
-            start + parts[start..].iter().take_while(|part| part.bucket == parts[start].bucket).count()
+        let end = |rows_of_bucket: &[HalfRow], start: usize| {
+            start
+                + rows_of_bucket[start..]
+                    .iter()
+                    .take_while(|row| row.bucket_id == rows_of_bucket[start].bucket_id)
+                    .count()
         };
         let (mut i, mut j) = (0, 0);
         for step in 0usize.. {
@@ -224,7 +228,7 @@ impl Join {
             if step % ROWS_PER_STOP_CHECK == 0 {
                 control.check_stop()?;
             }
-            match a[i].bucket.cmp(&b[j].bucket) {
+            match a[i].bucket_id.cmp(&b[j].bucket_id) {
                 std::cmp::Ordering::Less => i += 1,
                 std::cmp::Ordering::Greater => j += 1,
                 std::cmp::Ordering::Equal => {
@@ -251,7 +255,7 @@ impl Join {
 /// Return the number of the combination of candidates with these orders of the equations of one half of the join. A new
 /// combination is appended. `key` and `ids` are workspace.
 fn combination(
-    lattice: &OrderLawGrid,
+    grid: &OrderLawGrid,
     candidates: &mut [Candidates],
     half: &mut Half,
     ids_by_key: &mut HashMap<Box<[u32]>, u32>,
@@ -262,7 +266,7 @@ fn combination(
     ids.clear();
     let mut rest = orders;
     for e in half.equations.clone() {
-        let (mine, others) = rest.split_at(lattice.equations()[e].terms.len() + 1);
+        let (mine, others) = rest.split_at(grid.equations()[e].terms.len() + 1);
         ids.push(candidates[e].id(mine, key)?);
         rest = others;
     }
@@ -471,10 +475,10 @@ pub(super) struct OrderLawSums {
 }
 
 impl OrderLawSums {
-    pub(super) fn new(lattice: &OrderLawGrid, equations: Range<usize>) -> Self {
-        let laws = || lattice.equations()[equations.clone()].iter().flat_map(LawEquation::laws);
+    pub(super) fn new(grid: &OrderLawGrid, equations: Range<usize>) -> Self {
+        let laws = || grid.equations()[equations.clone()].iter().flat_map(LawEquation::laws);
         let constants = laws().map(|law| law.constant).collect();
-        let weights = (0..lattice.axes().len())
+        let weights = (0..grid.axes().len())
             .map(|axis| laws().map(|law| law.weights.get(axis).copied().unwrap_or(0.0)).collect())
             .collect();
         Self { constants, weights, equations }
@@ -487,7 +491,7 @@ impl OrderLawSums {
     /// [`crate::error::Error::Interrupted`] after a stop request.
     pub(super) fn distinct_sums(
         &self,
-        lattice: &OrderLawGrid,
+        grid: &OrderLawGrid,
         axes: &[usize],
         limit: usize,
         control: &Control,
@@ -498,7 +502,7 @@ impl OrderLawSums {
         for &axis in axes {
             let mut next = DistinctSums::of(width);
             for sums in distinct.each() {
-                for (i, value) in lattice.axes()[axis].iter().enumerate() {
+                for (i, value) in grid.axes()[axis].iter().enumerate() {
                     if i % ROWS_PER_STOP_CHECK == 0 {
                         control.check_stop()?;
                     }
@@ -522,17 +526,17 @@ impl OrderLawSums {
     /// The first error of `take`.
     pub(super) fn for_each_choice(
         &self,
-        lattice: &OrderLawGrid,
+        grid: &OrderLawGrid,
         axes: &[usize],
         others: &Self,
         mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
     ) -> Result<()> {
         let strides: Vec<u64> =
-            axes.iter().map(|&axis| lattice.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
+            axes.iter().map(|&axis| grid.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
         let mut digits = vec![0usize; axes.len()];
         let (mut sums, mut theirs) = (Vec::new(), Vec::new());
         loop {
-            let value = |i: usize| lattice.axes()[axes[i]][digits[i]];
+            let value = |i: usize| grid.axes()[axes[i]][digits[i]];
             let add = |base: &[f64], weights: &[Vec<f64>], out: &mut Vec<f64>| {
                 out.clear();
                 out.extend_from_slice(base);
@@ -544,7 +548,7 @@ impl OrderLawSums {
             add(&vec![0.0; others.constants.len()], &others.weights, &mut theirs);
             let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
             take(index, &sums, &theirs)?;
-            let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < lattice.axes()[axes[i]].len()) else {
+            let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < grid.axes()[axes[i]].len()) else {
                 return Ok(());
             };
             digits[i] += 1;
@@ -553,14 +557,14 @@ impl OrderLawSums {
     }
 
     /// Write the orders `sums` + `addend` of these equations to `orders`. Return true if all orders are valid.
-    pub(super) fn orders(&self, lattice: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
+    pub(super) fn orders(&self, grid: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));
         let mut rest = &orders[..];
-        lattice.equations()[self.equations.clone()].iter().all(|equation| {
+        grid.equations()[self.equations.clone()].iter().all(|equation| {
             let (mine, others) = rest.split_at(equation.terms.len() + 1);
             rest = others;
-            lattice.fits(equation, mine)
+            grid.fits(equation, mine)
         })
     }
 }

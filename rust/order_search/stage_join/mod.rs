@@ -5,5 +5,5 @@ mod best_first;
 mod join;
 mod tuples;
 
-pub use best_first::{search, SearchState, Stage, StageOutcome, StageRow};
+pub use best_first::{search, CoupledSearch, SearchState, StageOutcome, StageRow};
 pub use join::Span;

@@ -24,8 +24,8 @@ impl Join {
     ) -> Option<[f64; 2]> {
         let mut least = [f64::INFINITY; 2];
         for h in 0..2 {
-            for part in &self.halves[h].rows[bucket.rows[h].clone()] {
-                let state = states[h][part.combination as usize];
+            for row in &self.halves[h].rows[bucket.rows[h].clone()] {
+                let state = states[h][row.combination as usize];
                 if passes(state.class) && state.value < least[h] {
                     least[h] = state.value;
                 }
@@ -44,13 +44,13 @@ impl Join {
             .sum()
     }
 
-    /// Return score and index of the best `keep` combinations of free orders whose candidates are evaluated completely.
+    /// Return score and index of the best `top` combinations of free orders whose candidates are evaluated completely.
     /// They are sorted by score, then by index.
     pub(super) fn best(
         &self,
         states: &[Vec<ScoreEntry>; 2],
         scores: &ScoreTables,
-        keep: usize,
+        top: usize,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Vec<(f64, u64)>> {
@@ -67,26 +67,26 @@ impl Join {
         let mut best_pairs: Vec<(f64, u64)> = Vec::new();
         let trim = |best_pairs: &mut Vec<(f64, u64)>| {
             best_pairs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            best_pairs.truncate(keep);
-            if best_pairs.len() == keep {
-                best_pairs[keep - 1].0 * (1.0 + SCORE_TOLERANCE)
+            best_pairs.truncate(top);
+            if best_pairs.len() == top {
+                best_pairs[top - 1].0 * (1.0 + SCORE_TOLERANCE)
             } else {
                 f64::INFINITY
             }
         };
         let mut worst = f64::INFINITY;
-        let room = keep.max(512).saturating_mul(2);
+        let room = top.max(512).saturating_mul(2);
         for (bound, i, least) in order {
             control.check_stop()?;
             if bound > worst {
                 break;
             }
             let rows: [Vec<(f64, HalfRow)>; 2] = std::array::from_fn(|h| {
-                let parts = self.halves[h].rows[self.buckets[i].rows[h].clone()].iter();
-                let mut rows: Vec<(f64, HalfRow)> = parts
-                    .map(|&part| (states[h][part.combination as usize], part))
+                let rows_of_bucket = self.halves[h].rows[self.buckets[i].rows[h].clone()].iter();
+                let mut rows: Vec<(f64, HalfRow)> = rows_of_bucket
+                    .map(|&row| (states[h][row.combination as usize], row))
                     .filter(|(state, _)| exact(state.class) && state.value + least[1 - h] <= worst)
-                    .map(|(state, part)| (state.value, part))
+                    .map(|(state, row)| (state.value, row))
                     .collect();
                 rows.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.index.cmp(&b.1.index)));
                 rows
@@ -106,7 +106,7 @@ impl Join {
                     }
                 }
             }
-            if worst == f64::INFINITY && best_pairs.len() >= keep {
+            if worst == f64::INFINITY && best_pairs.len() >= top {
                 worst = trim(&mut best_pairs);
             }
         }
@@ -134,13 +134,13 @@ impl Join {
                 continue;
             }
             for (h, half) in self.halves.iter().enumerate() {
-                for part in &half.rows[bucket.rows[h].clone()] {
-                    let state = states[h][part.combination as usize];
+                for row in &half.rows[bucket.rows[h].clone()] {
+                    let state = states[h][row.combination as usize];
                     let open = matches!(state.class, Class::Bounded | Class::Open);
                     if !open || state.value + least[1 - h] > worst * (1.0 + SCORE_TOLERANCE) {
                         continue;
                     }
-                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                    for (e, &id) in half.equations.clone().zip(half.ids(row.combination)) {
                         let entry = scores[e][id as usize];
                         if entry.class == Class::Exact {
                             continue;
@@ -174,21 +174,21 @@ impl Join {
         let mut counts = Counts::default();
         let mut failures: Vec<(u64, Failure)> = Vec::new();
         for bucket in &self.buckets {
-            let parts: [&[HalfRow]; 2] = std::array::from_fn(|h| &self.halves[h].rows[bucket.rows[h].clone()]);
-            let tally: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
-                let mut tally: Vec<(Class, u64)> = Vec::new();
-                for part in parts[h] {
-                    let class = states[h][part.combination as usize].class;
-                    match tally.iter_mut().find(|t| t.0 == class) {
+            let rows_of_bucket: [&[HalfRow]; 2] = std::array::from_fn(|h| &self.halves[h].rows[bucket.rows[h].clone()]);
+            let class_counts: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
+                let mut class_counts: Vec<(Class, u64)> = Vec::new();
+                for row in rows_of_bucket[h] {
+                    let class = states[h][row.combination as usize].class;
+                    match class_counts.iter_mut().find(|t| t.0 == class) {
                         Some(t) => t.1 += 1,
-                        None => tally.push((class, 1)),
+                        None => class_counts.push((class, 1)),
                     }
                 }
-                tally
+                class_counts
             });
             let mut failed = false;
-            for &(a, x) in &tally[0] {
-                for &(b, y) in &tally[1] {
+            for &(a, x) in &class_counts[0] {
+                for &(b, y) in &class_counts[1] {
                     let count = x * y;
                     counts.candidates += count;
                     *match a.combine(b) {
@@ -202,7 +202,7 @@ impl Join {
                 }
             }
             if failed {
-                self.list_failures(parts, states, &mut failures);
+                self.list_failures(rows_of_bucket, states, &mut failures);
             }
         }
         failures.sort_unstable();
@@ -211,10 +211,15 @@ impl Join {
     }
 
     /// Append index and reason of the failed combinations of free orders in one bucket that may be among the first by
-    /// index. `parts` are the rows of both halves, sorted by index.
-    fn list_failures(&self, parts: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2], failures: &mut Vec<(u64, Failure)>) {
-        for first in parts[0] {
-            for second in parts[1] {
+    /// index. `rows_of_bucket` are the rows of both halves, sorted by index.
+    fn list_failures(
+        &self,
+        rows_of_bucket: [&[HalfRow]; 2],
+        states: &[Vec<ScoreEntry>; 2],
+        failures: &mut Vec<(u64, Failure)>,
+    ) {
+        for first in rows_of_bucket[0] {
+            for second in rows_of_bucket[1] {
                 let index = first.index + second.index;
                 if failures.len() >= MAX_LISTED_FAILURES && index > failures[MAX_LISTED_FAILURES - 1].0 {
                     break;

@@ -57,8 +57,8 @@ pub fn joint_multistart(
     let candidates = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
         let sizes = OutputScale::of_recordings(&source)?;
-        let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
-        sought.run_multistart(threads, &mut FitProgress::new(&report))
+        let fit_problem = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        fit_problem.run_multistart(threads, &mut FitProgress::new(&report))
     })?;
     Ok(JointMultistart { inner: Arc::new(candidates) })
 }
@@ -105,8 +105,8 @@ pub fn joint_fit<'py>(
     let fit = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
         let sizes = OutputScale::of_recordings(&source)?;
-        let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
-        fit::fit(sought, initialization, settings, report)
+        let fit_problem = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        fit::fit(fit_problem, initialization, settings, report)
     })?;
     fit.map(|fit| fit_to_dict(py, fit, size)).transpose()
 }
@@ -144,10 +144,10 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
     dict.set_item("cost", cost)?;
     dict.set_item("status", status(attempt.status))?;
     dict.set_item("initial_terms", initial.iter().flatten().map(Vec::len).sum::<usize>())?;
-    let starts = candidates.iter().flat_map(|runner| {
-        std::iter::once(&runner.origin)
-            .chain(&runner.duplicates)
-            .map(|origin| (runner.cost_per_residual(), origin.clone()))
+    let starts = candidates.iter().flat_map(|candidate| {
+        std::iter::once(&candidate.origin)
+            .chain(&candidate.duplicates)
+            .map(|origin| (candidate.cost_per_residual(), origin.clone()))
     });
     dict.set_item("starts", starts.collect::<Vec<_>>())?;
     let survivors = select_survivors(&candidates).into_iter().map(|c| (c.cost_per_residual(), c.result.values()));

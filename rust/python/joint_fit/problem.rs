@@ -28,8 +28,8 @@ pub struct JointProblem {
 #[pymethods]
 impl JointProblem {
     #[new]
-    fn new(told: StructureArg) -> PyResult<Self> {
-        let structure = parse_structure(told)?;
+    fn new(structure: StructureArg) -> PyResult<Self> {
+        let structure = parse_structure(structure)?;
         run_attached(|| Ok(Self { inner: Arc::new(ParameterSet::from_structure(structure)?) }))
     }
 
@@ -74,9 +74,9 @@ impl JointProblem {
     /// Minimize the output error on sampled runs by the Levenberg–Marquardt method. Return the optimum as a dictionary.
     ///
     /// `start` holds the values of the free parameters, and the initial states of runs with friction. Coordinates are
-    /// logarithmic where the initial guess allows it, unless `plain` is true. `held` holds the indices of fixed
-    /// parameters. With `steady`, no step leads from a stable model to an unstable one.
-    #[pyo3(signature = (runs, start, plain, held, evaluations, tolerance, steady, stop=None))]
+    /// logarithmic where the initial guess allows it, unless `plain` is true. `fixed` holds the indices of fixed
+    /// parameters. With `requires_stability`, no step leads from a stable model to an unstable one.
+    #[pyo3(signature = (runs, start, plain, fixed, evaluations, tolerance, requires_stability, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn minimize<'py>(
         &self,
@@ -84,23 +84,23 @@ impl JointProblem {
         runs: List<ExperimentArg<'py>>,
         start: (List<f64>, List<List<f64>>),
         plain: bool,
-        held: List<usize>,
+        fixed: List<usize>,
         evaluations: usize,
         tolerance: f64,
-        steady: bool,
+        requires_stability: bool,
         stop: Option<&Stop>,
     ) -> PyResult<Bound<'py, PyDict>> {
         let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
         let place = Iterate { point: self.inner.problem.point(&start.0)?, states: to_vectors(start.1) };
         let size = self.inner.problem.size();
-        if let Some(index) = held.iter().find(|&&number| number >= size) {
+        if let Some(index) = fixed.iter().find(|&&number| number >= size) {
             let what = format!("the parameter to be fixed has index {index}, but there are {size}");
             return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
         }
         let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
         let points = count_evaluated_pulses(&experiments, evaluations);
         let optimum = run_interruptible(py, points, stop, move |stop| {
-            free.problem_at(&place, plain, &held).minimize(&experiments, &place, settings, steady, stop)
+            free.problem_at(&place, plain, &fixed).minimize(&experiments, &place, settings, requires_stability, stop)
         })?;
         let dict = PyDict::new(py);
         dict.set_item("values", optimum.values())?;

@@ -68,7 +68,7 @@ fn order((constant, weights): OrderArg) -> Order {
     Order { constant, weights: weights.into() }
 }
 
-fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
+fn friction_parameters([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
     let number = |(factor, coefficient): NumberArg| (factor, coefficient.into());
     FrictionParameters { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
@@ -85,7 +85,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> 
         output,
         order: order(at),
         terms: terms.into_iter().map(term).collect(),
-        friction: friction.map(rubs),
+        friction: friction.map(friction_parameters),
     };
     let mut inputs = Vec::new();
     for (name, signal, law, bounds) in argument.inputs {

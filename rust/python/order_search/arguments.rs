@@ -148,7 +148,7 @@ impl<'py> FromPyObject<'_, 'py> for OrdersArg {
 }
 
 impl OrdersArg {
-    pub fn lattice(&self, inputs: &[bool]) -> Result<OrderGrid, Error> {
+    pub fn grid(&self, inputs: &[bool]) -> Result<OrderGrid, Error> {
         OrderGrid::new(self.output, &self.alphas, &self.axes, |s| inputs.get(s).copied().unwrap_or(false))
     }
 }
@@ -173,7 +173,7 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
 }
 
 /// Build the order grid of a coupled search. `axes` holds the values of each free order.
-pub fn law_lattice(
+pub fn law_grid(
     axes: &[Vec<f64>],
     laws: List<LawArg>,
     inputs: &[bool],

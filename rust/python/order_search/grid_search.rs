@@ -26,7 +26,7 @@ use crate::python::errors::run_detached;
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn order_grid_size(py: Python<'_>, orders: OrdersArg, inputs: List<bool>) -> PyResult<u64> {
-    run_detached(py, || Ok(orders.lattice(&inputs)?.count()))
+    run_detached(py, || Ok(orders.grid(&inputs)?.count()))
 }
 
 #[pyfunction]
@@ -43,12 +43,9 @@ pub fn search<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
     let result = run_watched(py, progress.as_ref(), |control| {
-        let lattice = orders.lattice(&arguments.inputs)?;
+        let grid = orders.grid(&arguments.inputs)?;
         let records = arguments.records(control)?;
-        Ok(OrderTable::new(
-            &lattice,
-            batches::search(&records, &lattice, &arguments.fixed, &arguments.options, control)?,
-        ))
+        Ok(OrderTable::new(&grid, batches::search(&records, &grid, &arguments.fixed, &arguments.options, control)?))
     })?;
     result.dict(py)
 }
@@ -72,9 +69,9 @@ struct OrderTable {
 }
 
 impl OrderTable {
-    fn new(lattice: &OrderGrid, outcome: Outcome) -> Self {
+    fn new(grid: &OrderGrid, outcome: Outcome) -> Self {
         let orders = |index: u64| {
-            let structure = lattice.structure(index);
+            let structure = grid.structure(index);
             (structure.order, structure.terms.iter().map(|t| t.order).collect::<Vec<f64>>())
         };
         let row = |row: Row| {
@@ -116,7 +113,7 @@ pub fn search_plan(
 ) -> PyResult<(u64, Vec<u64>)> {
     let options = settings.options(terms)?;
     run_detached(py, || {
-        let count = orders.lattice(&inputs)?.count();
+        let count = orders.grid(&inputs)?.count();
         Ok((count, batches::generation_ends(batches::batch_count(count, &options))))
     })
 }
@@ -136,21 +133,21 @@ pub fn search_join<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let options = settings.options(terms)?;
     let result = run_detached(py, || {
-        let lattice = orders.lattice(&inputs)?;
+        let grid = orders.grid(&inputs)?;
         let mut all = Part::default();
         for argument in parts {
             let part = part(argument);
             let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
-            if let Some(index) = index.filter(|&i| i >= lattice.count()) {
-                return Err(mismatch_error(format!("a row has index {index} among {} candidates", lattice.count())));
+            if let Some(index) = index.filter(|&i| i >= grid.count()) {
+                return Err(mismatch_error(format!("a row has index {index} among {} candidates", grid.count())));
             }
-            all.join(part, options.top);
+            all.merge(part, options.top);
         }
-        if all.counts.candidates != lattice.count() || all.counts.processed_count() != lattice.count() {
+        if all.counts.candidates != grid.count() || all.counts.processed_count() != grid.count() {
             return Err(mismatch_error(format!(
                 "parts account for {} of {} candidates",
                 all.counts.processed_count(),
-                lattice.count()
+                grid.count()
             )));
         }
         if all.counts.excluded_by_box > all.counts.excluded_by_bound {
@@ -159,7 +156,7 @@ pub fn search_join<'py>(
                 "parts have {excluded_by_box} candidates in boxes among {excluded_by_bound} excluded ones"
             )));
         }
-        Ok(OrderTable::new(&lattice, all.outcome(options.norm, samples)))
+        Ok(OrderTable::new(&grid, all.outcome(options.norm, samples)))
     })?;
     result.dict(py)
 }
@@ -167,7 +164,7 @@ pub fn search_join<'py>(
 /// Order search that is prepared for the evaluation of its batches, on one or several machines.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct OrderSearch {
-    ready: batches::BatchEvaluator<'static>,
+    evaluator: batches::BatchEvaluator<'static>,
 }
 
 #[pymethods]
@@ -184,27 +181,27 @@ impl OrderSearch {
         settings: SettingsArg,
     ) -> PyResult<Self> {
         let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
-        let ready = run_watched(py, None, |control| {
-            let lattice = orders.lattice(&arguments.inputs)?;
+        let evaluator = run_watched(py, None, |control| {
+            let grid = orders.grid(&arguments.inputs)?;
             let records = arguments.records(control)?;
             let pool = pool(arguments.options.threads)?;
             batches::BatchEvaluator::new(
                 &records,
-                Cow::Owned(lattice),
+                Cow::Owned(grid),
                 &arguments.fixed,
                 &arguments.options,
                 &pool,
                 control,
             )
         })?;
-        Ok(Self { ready })
+        Ok(Self { evaluator })
     }
 
     /// Evaluate the batches `first` to `last` − 1 and return their partial result. All batches must belong to one
     /// generation, a group of batches that start from the same results. `seed` holds (index, raw sum Σ|e| or Σe²) of
     /// the rows found before the generation. `start` is a checkpoint to resume from.
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
-    fn rounds(
+    fn evaluate_batches(
         &self,
         py: Python<'_>,
         first: u64,
@@ -217,7 +214,7 @@ impl OrderSearch {
     ) -> PyResult<PartArg> {
         let result = run_checkpointed(py, progress.as_ref(), save.as_ref(), |control| {
             let pool = pool(threads)?;
-            self.ready.evaluate_batches(first, last, &seed, start.map(checkpoint), &pool, control)
+            self.evaluator.evaluate_batches(first, last, &seed, start.map(checkpoint), &pool, control)
         })?;
         Ok(part_of(result))
     }

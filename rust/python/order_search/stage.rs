@@ -7,13 +7,13 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
 use super::arguments::{
-    counts_to_dict, failure_name, law_lattice, span, verdicts, verdicts_of, LawArg, SearchInputs, SettingsArg, SpanArg,
+    counts_to_dict, failure_name, law_grid, span, verdicts, verdicts_of, LawArg, SearchInputs, SettingsArg, SpanArg,
 };
 use super::watch::run_watched;
 use crate::error::Error;
 use crate::order_search::grid::order_law::OrderLawGrid;
 use crate::order_search::result::Counts;
-use crate::order_search::stage_join::{self, SearchState, Stage, StageOutcome, StageRow};
+use crate::order_search::stage_join::{self, CoupledSearch, SearchState, StageOutcome, StageRow};
 use crate::parallel::pool;
 use crate::python::convert::{to_vectors, InitialArg, List, RecordArg};
 use crate::python::errors::run_detached;
@@ -35,10 +35,10 @@ pub fn search_stage<'py>(
     let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
     let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
     let result = run_watched(py, progress.as_ref(), |control| {
-        let lattice = law_lattice(&axes, laws, &arguments.inputs, &arguments.fixed)?;
+        let grid = law_grid(&axes, laws, &arguments.inputs, &arguments.fixed)?;
         let records = arguments.records(control)?;
-        let outcome = stage_join::search(&records, &lattice, &arguments.fixed, &scales, &arguments.options, control)?;
-        Ok(StageTable::new(&lattice, outcome))
+        let outcome = stage_join::search(&records, &grid, &arguments.fixed, &scales, &arguments.options, control)?;
+        Ok(StageTable::new(&grid, outcome))
     })?;
     result.dict(py)
 }
@@ -55,7 +55,7 @@ struct StageTable {
 }
 
 impl StageTable {
-    fn new(lattice: &OrderLawGrid, outcome: StageOutcome) -> Self {
+    fn new(grid: &OrderLawGrid, outcome: StageOutcome) -> Self {
         let row = |row: StageRow| {
             let equations = row.structures.iter().zip(row.rows).map(|(structure, part)| {
                 let orders = structure.terms.iter().map(|t| t.order).collect();
@@ -63,7 +63,7 @@ impl StageTable {
             });
             (row.index, row.score, row.free, equations.collect())
         };
-        let failure = |&(index, failure): &_| (index, lattice.free(index), failure_name(failure));
+        let failure = |&(index, failure): &_| (index, grid.free(index), failure_name(failure));
         Self {
             rows: outcome.rows.into_iter().map(row).collect(),
             counts: outcome.counts,
@@ -86,15 +86,15 @@ impl StageTable {
 /// the search state and collects the results.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct StageSearch {
-    stage: Stage<'static>,
-    course: Mutex<Option<SearchState>>,
+    search: CoupledSearch<'static>,
+    state: Mutex<Option<SearchState>>,
 }
 
 impl StageSearch {
     /// Apply `work` to the search state. Return an error if this instance stores no state.
-    fn course<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
-        let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
-        let state = course.as_mut().ok_or_else(|| Error::Structure {
+    fn with_state<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
+        let mut guard = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = guard.as_mut().ok_or_else(|| Error::Structure {
             what: "this search stores no state".into(),
             remedy: "create a search with a state".into(),
         })?;
@@ -116,35 +116,45 @@ impl StageSearch {
         scales: List<f64>,
         terms: InitialArg,
         settings: SettingsArg,
-        keeps_course: bool,
+        keeps_state: bool,
     ) -> PyResult<Self> {
         let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
         let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
-        let (stage, course) = run_watched(py, None, |control| {
-            let lattice = law_lattice(&axes, laws, &arguments.inputs, &arguments.fixed)?;
+        let (search, state) = run_watched(py, None, |control| {
+            let grid = law_grid(&axes, laws, &arguments.inputs, &arguments.fixed)?;
             let records = arguments.records(control)?;
             let pool = pool(arguments.options.threads)?;
-            Stage::new(&records, Cow::Owned(lattice), &arguments.fixed, &scales, &arguments.options, &pool, control)
+            CoupledSearch::new(
+                &records,
+                Cow::Owned(grid),
+                &arguments.fixed,
+                &scales,
+                &arguments.options,
+                &pool,
+                control,
+            )
         })?;
-        Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
+        Ok(Self { search, state: Mutex::new(keeps_state.then_some(state)) })
     }
 
     /// Return the blocks of candidates to evaluate next as (equation, first, end, limit). Empty if the search is
     /// complete.
     fn pending_spans(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
         run_detached(py, || {
-            self.course(|c| Ok(c.pending_spans().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
+            self.with_state(|state| {
+                Ok(state.pending_spans().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect())
+            })
         })
     }
 
     /// Return (number of candidates to evaluate as known so far, best score so far).
     fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
-        run_detached(py, || self.course(|c| Ok((c.total(), c.best()))))
+        run_detached(py, || self.with_state(|state| Ok((state.total(), state.best()))))
     }
 
     /// Evaluate blocks of candidates. Return (raw sums Σ|e| or Σe², kinds of outcome) of the candidates as bytes.
     #[allow(clippy::needless_pass_by_value)]
-    fn follow<'py>(
+    fn evaluate_spans<'py>(
         &self,
         py: Python<'py>,
         spans: List<SpanArg>,
@@ -153,24 +163,24 @@ impl StageSearch {
     ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
         let requests: Vec<_> = spans.into_iter().map(span).collect();
         let (values, kinds) = run_watched(py, progress.as_ref(), |control| {
-            Ok(verdicts_of(&self.stage.evaluate(&requests, &pool(threads)?, control)?))
+            Ok(verdicts_of(&self.search.evaluate(&requests, &pool(threads)?, control)?))
         })?;
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
 
     /// Add the outcomes of the pending candidates to the search state, in the order of `pending_spans`.
-    fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
+    fn record_outcomes(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         run_watched(py, None, |control| {
             let decoded = verdicts(values, kinds)?;
-            self.course(|course| course.record_verdicts(&self.stage, &decoded, &pool(threads)?, control))
+            self.with_state(|state| state.record_verdicts(&self.search, &decoded, &pool(threads)?, control))
         })
     }
 
     /// Return the result of the search as a dictionary, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let result = run_watched(py, None, |control| {
-            let outcome = self.course(|course| self.stage.outcome(course, control))?;
-            Ok(StageTable::new(self.stage.lattice(), outcome))
+            let outcome = self.with_state(|state| self.search.outcome(state, control))?;
+            Ok(StageTable::new(self.search.grid(), outcome))
         })?;
         result.dict(py)
     }

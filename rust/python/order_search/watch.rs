@@ -175,7 +175,7 @@ pub fn run_with_progress<T: Send + 'static>(
             drop(send.send(WorkerMessage::Ends(ended)));
         });
         loop {
-            let looked = match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
+            let outcome = match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 Ok(WorkerMessage::Ends(result)) => return result.map_err(PyErr::from),
                 Ok(WorkerMessage::Progresses(count, of)) => {
                     Python::attach(|py| progress.map_or(Ok(()), |progress| progress.call1(py, (count, of)).map(drop)))
@@ -186,7 +186,7 @@ pub fn run_with_progress<T: Send + 'static>(
                     return Err(Error::Internal { what }.into());
                 }
             };
-            if let Err(error) = looked {
+            if let Err(error) = outcome {
                 stop.set();
                 return Err(error);
             }

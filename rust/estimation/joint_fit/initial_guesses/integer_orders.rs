@@ -207,14 +207,14 @@ impl<'a> Equation<'a> {
         let model = FreeModel { equations: vec![equation.clone()], coupled: false, ..model.clone() };
         let order = integer(&equation.order)?;
         let mut own = vec![None; order];
-        let alone = |monomial: &Monomial| match monomial.powers[..] {
+        let single_parameter = |monomial: &Monomial| match monomial.powers[..] {
             [(j, 1)] if monomial.factor != 0.0 => Some(j),
             _ => None,
         };
         let linear = model.linear_coefficients();
         for (signal, nu, monomial) in &equation.terms {
             if *signal == equation.output {
-                let (j, nu) = (alone(monomial)?, integer(nu)?);
+                let (j, nu) = (single_parameter(monomial)?, integer(nu)?);
                 if nu >= order || own[nu].replace((j, monomial.factor)).is_some() || linear.contains(&j) {
                     return None;
                 }
@@ -617,7 +617,7 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
     let Some(weights) = experiment.sample_weights.first().filter(|w| w.contains(&0.0)) else {
         return Cow::Borrowed(samples);
     };
-    let marked_value = |(k, v): (usize, &f64)| {
+    let value_or_missing = |(k, v): (usize, &f64)| {
         let read = k == 0 || weights.get(k - 1).is_none_or(|w| *w > 0.0);
         if read {
             *v
@@ -625,8 +625,8 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
             f64::NAN
         }
     };
-    let marked: Vec<f64> = samples.iter().enumerate().map(marked_value).collect();
-    Cow::Owned(interpolate_gaps(&marked).into_owned())
+    let with_missing: Vec<f64> = samples.iter().enumerate().map(value_or_missing).collect();
+    Cow::Owned(interpolate_gaps(&with_missing).into_owned())
 }
 
 /// Measured output as input of a filter, linear between samples.

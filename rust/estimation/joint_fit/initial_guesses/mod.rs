@@ -78,11 +78,15 @@ impl<'a> OrderGrids<'a> {
 
     /// Bandwidth \[rad/s\] of the output of each equation, indexed by equation and run.
     fn frequencies(&self, free: &ParameterSet) -> Result<Vec<Vec<f64>>> {
-        let spans = self.source.spans();
+        let intervals_and_durations = self.source.intervals_and_durations();
         let of = |output: usize| {
             let samples = self.source.samples(output)?;
-            check_length("runs", spans.len(), samples.len())?;
-            Ok(samples.iter().zip(&spans).map(|(run, (step, _))| power_frequency(run, *step)).collect())
+            check_length("runs", intervals_and_durations.len(), samples.len())?;
+            Ok(samples
+                .iter()
+                .zip(&intervals_and_durations)
+                .map(|(run, (step, _))| power_frequency(run, *step))
+                .collect())
         };
         free.structure.equations.iter().map(|e| of(e.output)).collect()
     }
@@ -102,13 +106,13 @@ impl<'a> OrderGrids<'a> {
         &self,
         free: &ParameterSet,
         frequencies: &[Vec<f64>],
-        numbers: &[f64],
+        input_values: &[f64],
     ) -> Result<Vec<Candidate>> {
         self.check_hold_orders(free)?;
         let frequency = median(frequencies.concat());
         let natural = natural_axes(free);
         let grids: Vec<_> = std::iter::once(start_axes(free)).chain(natural.clone()).collect();
-        let unfiltered = self.source.records(self.pulse_count(free)?, numbers)?;
+        let unfiltered = self.source.records(self.pulse_count(free)?, input_values)?;
         let unfiltered = self.prefilter(&unfiltered, None)?;
         let fastest = PI / unfiltered.iter().map(Record::step).fold(f64::NEG_INFINITY, f64::max);
         let inputs: Vec<bool> = self.source.inputs().iter().map(Option::is_some).collect();

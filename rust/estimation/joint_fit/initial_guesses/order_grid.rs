@@ -69,38 +69,38 @@ impl GridSearch<'_> {
         GridSearch { records, ..*self }
     }
 
-    /// Return the best rows of a coarse order grid by least squares, at most `keep`.
-    pub(super) fn best_rows(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
+    /// Return the best rows of a coarse order grid by least squares, at most `top`.
+    pub(super) fn best_rows(&self, structure: &ParametricStructure, axes: &Axes, top: usize) -> Result<Vec<GridRow>> {
         if !structure.has_order_law() {
             let tables: Result<Vec<_>> =
-                structure.equations.iter().map(|e| self.search_equation(structure, e, axes, keep)).collect();
+                structure.equations.iter().map(|e| self.search_equation(structure, e, axes, top)).collect();
             return Ok(merge_tables(&tables?, structure));
         }
         let stages = independent_groups(structure);
         if stages.len() <= 1 {
-            return self.search_coupled(structure, axes, keep);
+            return self.search_coupled(structure, axes, top);
         }
         // Groups of equations without common orders are searched separately; their best rows are combined.
         let table = |stage: &ParametricStructure| {
             let names = stage.order_names();
             let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
-            self.best_rows(stage, &own, keep)
+            self.best_rows(stage, &own, top)
         };
         Ok(merge_tables(&stages.iter().map(table).collect::<Result<Vec<_>>>()?, structure))
     }
 
-    fn options(&self, keep: usize) -> Options {
+    fn options(&self, top: usize) -> Options {
         let (initial, threads, memory) = (self.initial.clone(), self.threads, self.memory);
-        Options { initial, top: keep, threads, memory, ..Options::default() }
+        Options { initial, top, threads, memory, ..Options::default() }
     }
 
     fn control(&self) -> Control {
         Control { stop: self.stop.clone(), ..Control::default() }
     }
 
-    /// Return the best rows of coupled equations with an order law, at most `keep`.
+    /// Return the best rows of coupled equations with an order law, at most `top`.
     #[allow(clippy::cast_precision_loss)]
-    fn search_coupled(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
+    fn search_coupled(&self, structure: &ParametricStructure, axes: &Axes, top: usize) -> Result<Vec<GridRow>> {
         let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
         let law = |e: &ParametricEquation| LawEquation {
             output: e.output,
@@ -114,8 +114,8 @@ impl GridSearch<'_> {
             self.records.iter().map(|r| standard_deviation(r.signal(e.output)) * r.m() as f64).sum()
         };
         let scales: Vec<f64> = equations.iter().map(size).collect();
-        let lattice = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
-        let result = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
+        let grid = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
+        let result = stage_join::search(self.records, &grid, &fixed, &scales, &self.options(top), &self.control())?;
         let row = |result: stage_join::StageRow| {
             let pairs = equations.iter().zip(&result.rows);
             let coefficients = pairs.flat_map(|(item, part)| named_coefficients(item, &part.coefficients)).collect();
@@ -124,13 +124,13 @@ impl GridSearch<'_> {
         Ok(result.rows.into_iter().map(row).collect())
     }
 
-    /// Return the best rows of one equation with independent free orders, at most `keep`.
+    /// Return the best rows of one equation with independent free orders, at most `top`.
     fn search_equation(
         &self,
         structure: &ParametricStructure,
         item: &ParametricEquation,
         axes: &Axes,
-        keep: usize,
+        top: usize,
     ) -> Result<Vec<GridRow>> {
         check_linear(structure, item, "an order search")?;
         let axis = |order: &Order| match order.names().next() {
@@ -145,12 +145,12 @@ impl GridSearch<'_> {
         let terms: Vec<TermAxis> = item.terms.iter().map(term).collect();
         let is_input = |signal: usize| self.inputs.get(signal).copied().unwrap_or(false);
         let named = |error| name_signals(error, &structure.signals);
-        let lattice = OrderGrid::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
-        let (options, control) = (self.options(keep), self.control());
+        let grid = OrderGrid::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
+        let (options, control) = (self.options(top), self.control());
         let result =
-            batches::search(self.records, &lattice, &fixed_coefficients(item), &options, &control).map_err(named)?;
+            batches::search(self.records, &grid, &fixed_coefficients(item), &options, &control).map_err(named)?;
         let row = |result: crate::order_search::result::Row| {
-            let at = lattice.structure(result.index);
+            let at = grid.structure(result.index);
             let term_orders = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
             let pairs = item.orders().zip(term_orders);
             let orders = pairs.filter_map(|(order, value)| Some((order.names().next()?.clone(), value))).collect();
@@ -262,18 +262,18 @@ pub(super) fn grid_candidates(
     let (count, rows) =
         if free.structure.has_order_law() { (MAX_GUESSES_UNDER_ORDER_LAW, ROWS_UNDER_ORDER_LAW) } else { (1, 1) };
     let mut candidates: Vec<Candidate> = Vec::new();
-    let mut picked: Vec<Vec<f64>> = Vec::new();
+    let mut selected: Vec<Vec<f64>> = Vec::new();
     for row in coarse.best_rows(&free.structure, axes, rows)? {
         let values = row.values(&free.orders);
         let is_apart = |other: &Vec<f64>| values.iter().zip(other).any(|(a, b)| (a - b).abs() >= MIN_ORDER_SEPARATION);
-        if !picked.iter().all(is_apart) {
+        if !selected.iter().all(is_apart) {
             continue;
         }
         if !before.iter().any(|other| are_orders_close(&values, &other.result.iterate.point.orders)) {
             candidates.push(new_candidate(values.clone(), free.free_from(&row.coefficients), origin));
         }
-        picked.push(values);
-        if picked.len() == count {
+        selected.push(values);
+        if selected.len() == count {
             break;
         }
     }
@@ -297,11 +297,11 @@ pub(super) fn law_candidates(
     origin: &str,
 ) -> Result<Vec<Candidate>> {
     let (structure, signs) = (&free.structure, &free.structure.hints.positive);
-    let tied: Vec<(&Law, &String, usize)> = (free.products.iter())
+    let sign_laws: Vec<(&Law, &String, usize)> = (free.products.iter())
         .filter_map(|law| law.factors.split_first().map(|(first, others)| (law, first, others.len())))
         .filter(|(_, first, _)| signs.contains(*first))
         .collect();
-    if tied.is_empty() {
+    if sign_laws.is_empty() {
         return Ok(Vec::new());
     }
     let named = structure.coefficient_names();
@@ -313,7 +313,7 @@ pub(super) fn law_candidates(
                 let size = row.coefficients.get(&law.name).copied().unwrap_or(f64::NAN).abs();
                 ((*first).clone(), (0..*others).fold(size, |size, _| size / ratio))
             };
-            let values_by_name: BTreeMap<String, f64> = tied.iter().map(value).collect();
+            let values_by_name: BTreeMap<String, f64> = sign_laws.iter().map(value).collect();
             if !values_by_name.values().all(|v| v.is_finite() && *v != 0.0) {
                 continue;
             }
@@ -357,8 +357,8 @@ pub(super) type Axes = Vec<(String, Vec<f64>)>;
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn start_axes(free: &ParameterSet) -> Axes {
     let equations = &free.structure.equations;
-    let alone = equations.iter().filter(|e| e.order.is_single());
-    let highest: BTreeSet<&String> = alone.flat_map(|e| e.order.names()).collect();
+    let with_single_order = equations.iter().filter(|e| e.order.is_single());
+    let highest: BTreeSet<&String> = with_single_order.flat_map(|e| e.order.names()).collect();
     let usual = free.structure.hints.highest.unwrap_or((MIN_TYPICAL_ORDER, SEARCHED_ORDER));
     let axis = |(name, &bounds): (&String, &(f64, f64))| {
         let above = highest.contains(name);
@@ -370,8 +370,8 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
             return (name.clone(), vec![low]);
         }
         let count = ((high - low) / START_INCREMENT).round_ties_even() as usize;
-        let tidied = |v: &f64| (v * ROUNDING_STEPS_PER_ORDER).round_ties_even() / ROUNDING_STEPS_PER_ORDER;
-        let values = linspace(low, high, count + 1).iter().map(tidied).collect();
+        let rounded = |v: &f64| (v * ROUNDING_STEPS_PER_ORDER).round_ties_even() / ROUNDING_STEPS_PER_ORDER;
+        let values = linspace(low, high, count + 1).iter().map(rounded).collect();
         (name.clone(), values)
     };
     let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();

@@ -80,7 +80,7 @@ pub(super) fn scan_candidates(
 
 /// Return true if an offset coincides with an initial term, so that the two are not separately identifiable.
 fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
-    let exponents = match fixed.initial.under() {
+    let exponents = match fixed.initial.base() {
         Initial::Powers(powers) if !fixed.history => powers,
         _ => return false,
     };

@@ -26,8 +26,8 @@ const MIN_DEVIATION_RATIO: f64 = 0.7;
 /// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampling> {
-    let spans = source.spans();
-    let each = (MAX_COARSE_SAMPLES / spans.len().max(1)).max(MIN_RUN_SAMPLES);
+    let intervals_and_durations = source.intervals_and_durations();
+    let each = (MAX_COARSE_SAMPLES / intervals_and_durations.len().max(1)).max(MIN_RUN_SAMPLES);
     let outputs = output_samples(free, source)?;
     let shortest = outputs.iter().flatten().map(|samples| samples.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = ((shortest as f64 / each as f64).round_ties_even() as usize).max(1);
@@ -36,7 +36,7 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
         return Ok(all);
     }
     let turns = |runs: &Vec<&[f64]>| {
-        let pairs = runs.iter().zip(&spans);
+        let pairs = runs.iter().zip(&intervals_and_durations);
         pairs.map(|(samples, &(step, _))| power_frequency(samples, step) * step).fold(f64::NEG_INFINITY, f64::max)
     };
     let fastest = outputs.iter().map(turns).fold(f64::NEG_INFINITY, f64::max);
@@ -56,7 +56,8 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
 /// # Errors
 /// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
 pub fn leading_part(free: &ParameterSet, source: &Recordings, count: usize) -> Result<Option<usize>> {
-    let (outputs, each) = (output_samples(free, source)?, (count / source.spans().len().max(1)).max(MIN_RUN_SAMPLES));
+    let (outputs, each) =
+        (output_samples(free, source)?, (count / source.intervals_and_durations().len().max(1)).max(MIN_RUN_SAMPLES));
     let is_long = outputs.iter().flatten().all(|samples| samples.len() > 2 * each);
     Ok((is_long && varies_like_whole(&outputs, each)).then_some(each))
 }

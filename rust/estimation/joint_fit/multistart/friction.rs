@@ -57,23 +57,23 @@ pub(super) type Values = BTreeMap<String, f64>;
 /// [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. An error also if the
 /// runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it returns
 /// one.
-pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+pub fn run_friction_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     if !structure.has_friction() {
-        return run_multistart(free, course);
+        return run_multistart(free, context);
     }
-    check_motion(structure, course.source)?;
-    let shortest = course.source.runs().iter().map(Recording::len).min().unwrap_or(1);
+    check_motion(structure, context.source)?;
+    let shortest = context.source.runs().iter().map(Recording::len).min().unwrap_or(1);
     let sampling = Sampling { decimation: ((shortest - 1) / COARSE_SAMPLES).max(1), ..Sampling::default() };
-    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
-    let starts = initial_guesses(free, course, &grid)?;
-    let mut reached = optimize_on_coarse_grids(free, &grid, &starts, course.threads)?;
-    let is_at_noise = reached.first().is_some_and(|c| c.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor);
+    let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
+    let grid = Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)?;
+    let starts = initial_guesses(free, context, &grid)?;
+    let mut reached = optimize_on_coarse_grids(free, &grid, &starts, context.threads)?;
+    let is_at_noise = reached.first().is_some_and(|c| c.cost_per_residual() <= NOISE_FLOOR_FACTOR * context.floor);
     if !is_at_noise && !has_stribeck_body(structure) {
         // The structure without friction is nested in this one, so its optima are initial guesses.
-        let more = guesses_from_frictionless_optima(free, course, &grid)?;
-        reached.extend(optimize_on_coarse_grids(free, &grid, &more, course.threads)?);
+        let more = guesses_from_frictionless_optima(free, context, &grid)?;
+        reached.extend(optimize_on_coarse_grids(free, &grid, &more, context.threads)?);
         reached = sort_by_cost(reached);
     }
     Ok(reached)
@@ -82,11 +82,11 @@ pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_
 /// Return initial guesses from the optima without friction, with zero friction and with fractions of the input force.
 fn guesses_from_frictionless_optima(
     free: &ParameterSet,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     grid: &Objective<'_>,
 ) -> Result<Vec<Candidate>> {
-    let (linear, source) = without_friction(&free.structure, course.source)?;
-    let own = MultistartContext { listener: None, ..course };
+    let (linear, source) = without_friction(&free.structure, context.source)?;
+    let own = MultistartContext { listener: None, ..context };
     let optima = none_if_invalid_model(run_on(&linear, &source, own))?.unwrap_or_default();
     let mut guesses = Vec::new();
     for optimum in optima.iter().take(MAX_FINAL_SURVIVORS) {
@@ -104,14 +104,19 @@ fn without_friction(structure: &ParametricStructure, source: &Recordings) -> Res
     Ok((ParameterSet::from_structure(with_friction(structure, |_| None))?, Recordings::new(runs)?))
 }
 
-fn initial_guesses(free: &ParameterSet, course: MultistartContext<'_>, grid: &Objective<'_>) -> Result<Vec<Candidate>> {
+fn initial_guesses(
+    free: &ParameterSet,
+    context: MultistartContext<'_>,
+    grid: &Objective<'_>,
+) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let bodies = bodies(structure).count();
     if has_stribeck_body(structure) {
         let less = ParameterSet::from_structure(with_friction(structure, |friction| Some(without_stribeck(friction))))?;
-        let reached = run_friction_multistart(&less, course)?;
+        let reached = run_friction_multistart(&less, context)?;
         let best = reached.iter().take(MAX_FINAL_SURVIVORS);
-        let starts = best.map(|runner| stribeck_guesses(free, grid, &less, runner)).collect::<Result<Vec<_>>>()?;
+        let starts =
+            best.map(|candidate| stribeck_guesses(free, grid, &less, candidate)).collect::<Result<Vec<_>>>()?;
         return Ok(starts.concat());
     }
     let mut starts = Vec::new();
@@ -119,28 +124,28 @@ fn initial_guesses(free: &ParameterSet, course: MultistartContext<'_>, grid: &Ob
         // Equations of attached bodies without friction are fitted separately. The equation of a body with friction is
         // not, because the measured motion of all attached bodies may explain it.
         for orders in order_sets(free) {
-            let values = fit_frictionless_equations(structure, course, &orders)?;
-            starts.extend(loaded_body_guesses(free, course, &values, false)?);
+            let values = fit_frictionless_equations(structure, context, &orders)?;
+            starts.extend(loaded_body_guesses(free, context, &values, false)?);
         }
         return Ok(starts);
     }
     // With measured signals as inputs, the equation of each body does not depend on the other equations.
-    let (signed, source) = with_measured_sign(structure, course.source)?;
+    let (signed, source) = with_measured_sign(structure, context.source)?;
     let signed = ParameterSet::from_structure(signed)?;
-    let reached = run_on(&signed, &source, course)?;
-    for runner in reached.iter().take(MAX_FINAL_SURVIVORS) {
-        starts.extend(coulomb_guesses(free, grid, &signed, runner)?);
+    let reached = run_on(&signed, &source, context)?;
+    for candidate in reached.iter().take(MAX_FINAL_SURVIVORS) {
+        starts.extend(coulomb_guesses(free, grid, &signed, candidate)?);
     }
     if let Some(best) = reached.first().filter(|_| structure.equations.len() > 1) {
-        starts.extend(loaded_body_guesses(free, course, &values_of(&signed, best), true)?);
+        starts.extend(loaded_body_guesses(free, context, &values_of(&signed, best), true)?);
     }
     Ok(starts)
 }
 
 /// Run the multistart of a problem without friction on other recordings.
-fn run_on(free: &ParameterSet, source: &Recordings, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    let starts = course.starts.for_recordings(source);
-    run_multistart(free, MultistartContext { source, starts: starts.as_ref(), ..course })
+fn run_on(free: &ParameterSet, source: &Recordings, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let starts = context.starts.for_recordings(source);
+    run_multistart(free, MultistartContext { source, starts: starts.as_ref(), ..context })
 }
 
 /// Equations of the bodies with friction, with their friction parameters.
@@ -151,13 +156,13 @@ fn bodies(structure: &ParametricStructure) -> impl Iterator<Item = (&ParametricE
 /// Return [`Error::Recording`] if a body with friction moves in no run.
 fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<()> {
     for (item, _) in bodies(structure) {
-        let still = |samples: &&[f64]| {
+        let is_at_rest = |samples: &&[f64]| {
             let finite = samples.iter().filter(|v| !v.is_nan());
             let (low, high) =
                 finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
             high - low <= MIN_MOTION_NOISE_RATIO * white_noise_deviation(samples)
         };
-        if source.samples(item.output)?.iter().all(still) {
+        if source.samples(item.output)?.iter().all(is_at_rest) {
             let names: Vec<&str> = source.runs().iter().map(Recording::name).collect();
             let (output, names) = (&structure.signals[item.output], names.join(", "));
             let what = format!(
@@ -196,9 +201,9 @@ fn without_stribeck(friction: &FrictionParameters) -> FrictionParameters {
 }
 
 /// Return the values of all parameters of a candidate, including the coefficients that a coefficient law determines.
-pub(super) fn values_of(free: &ParameterSet, runner: &Candidate) -> Values {
-    let mut values: Values = free.names().cloned().zip(runner.result.values()).collect();
-    values.extend(free.coefficients_by_name(&runner.result.iterate.point.coefficients));
+pub(super) fn values_of(free: &ParameterSet, candidate: &Candidate) -> Values {
+    let mut values: Values = free.names().cloned().zip(candidate.result.values()).collect();
+    values.extend(free.coefficients_by_name(&candidate.result.iterate.point.coefficients));
     values
 }
 
@@ -246,25 +251,25 @@ fn with_measured_inputs(
     let mut runs = Vec::new();
     for run in source.runs() {
         let channels = used.iter().map(|&signal| channel(run, signal)).collect::<Result<Vec<_>>>()?;
-        let mut alone = run.with_channels(channels, (0..outputs).collect())?;
-        (alone.is_coupled, alone.has_friction) = (false, false);
+        let mut isolated = run.with_channels(channels, (0..outputs).collect())?;
+        (isolated.is_coupled, isolated.has_friction) = (false, false);
         if !is_filtered {
-            (alone.filter, alone.filter_states) = (None, 0);
+            (isolated.filter, isolated.filter_states) = (None, 0);
         }
         let free = run.free_inputs.iter().filter(|(signal, _)| used.contains(signal));
-        alone.free_inputs = free.map(|&(signal, law)| (place(signal), law)).collect();
-        runs.push(alone);
+        isolated.free_inputs = free.map(|&(signal, law)| (place(signal), law)).collect();
+        runs.push(isolated);
     }
-    let mut alone = structure.clone();
-    alone.inputs.retain(|input| used.contains(&input.free.signal));
-    alone.inputs.iter_mut().for_each(|input| input.free.signal = place(input.free.signal));
-    if let Initial::Filtered { under, .. } = alone.initial.clone()
+    let mut isolated = structure.clone();
+    isolated.inputs.retain(|input| used.contains(&input.free.signal));
+    isolated.inputs.iter_mut().for_each(|input| input.free.signal = place(input.free.signal));
+    if let Initial::Filtered { base, .. } = isolated.initial.clone()
         && !is_filtered
     {
-        alone.initial = *under;
+        isolated.initial = *base;
     }
-    alone.signals = used.iter().map(|&signal| structure.signals[signal].clone()).collect();
-    Ok((ParametricStructure { equations, coupled: false, ..alone }, Recordings::new(runs)?))
+    isolated.signals = used.iter().map(|&signal| structure.signals[signal].clone()).collect();
+    Ok((ParametricStructure { equations, coupled: false, ..isolated }, Recordings::new(runs)?))
 }
 
 /// Replace the friction of each body by an input, the sign of its measured velocity.
@@ -332,21 +337,21 @@ fn order_sets(free: &ParameterSet) -> Vec<Values> {
 /// Return orders and coefficients by name. The coefficients of the other equations are 0.
 fn fit_frictionless_equations(
     structure: &ParametricStructure,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     orders: &Values,
 ) -> Result<Values> {
     let mut values = orders.clone();
     values.extend(structure.coefficient_names().into_iter().map(|name| (name, 0.0)));
-    for (item, &weight) in structure.equations.iter().zip(course.weights) {
+    for (item, &weight) in structure.equations.iter().zip(context.weights) {
         if item.friction.is_some() {
             continue;
         }
-        let (alone, source) = with_measured_inputs(structure, course.source, vec![item.clone()])?;
-        let alone = ParametricStructure { laws: Vec::new(), ..alone };
-        let alone = ParameterSet::from_structure(alone.with_orders(orders)?)?;
-        let reached = run_on(&alone, &source, MultistartContext { weights: &[weight], listener: None, ..course })?;
+        let (isolated, source) = with_measured_inputs(structure, context.source, vec![item.clone()])?;
+        let isolated = ParametricStructure { laws: Vec::new(), ..isolated };
+        let isolated = ParameterSet::from_structure(isolated.with_orders(orders)?)?;
+        let reached = run_on(&isolated, &source, MultistartContext { weights: &[weight], listener: None, ..context })?;
         if let Some(best) = reached.first() {
-            values.extend(alone.coefficients_by_name(&best.result.iterate.point.coefficients));
+            values.extend(isolated.coefficients_by_name(&best.result.iterate.point.coefficients));
         }
     }
     Ok(values)
@@ -359,14 +364,14 @@ fn fit_frictionless_equations(
 /// inertia is the same fraction of the inertia of every body. Otherwise each body has its own fraction.
 fn loaded_body_guesses(
     free: &ParameterSet,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     values: &Values,
     together: bool,
 ) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let mut fitted = Vec::new();
     for (item, _) in bodies(structure) {
-        let (orders, numbers) = fit_isolated_body(free, course, item, values)?;
+        let (orders, numbers) = fit_isolated_body(free, context, item, values)?;
         if !numbers.is_empty() {
             fitted.push((item, orders, numbers));
         }
@@ -414,17 +419,17 @@ fn fit_isolated_body(
 ) -> Result<(Values, Values)> {
     let structure = &free.structure;
     let is_output = |signal: usize| structure.equations.iter().any(|e| e.output == signal);
-    let mut alone = item.clone();
-    alone.terms.retain(|term| term.signal == item.output || !is_output(term.signal));
+    let mut isolated = item.clone();
+    isolated.terms.retain(|term| term.signal == item.output || !is_output(term.signal));
     // Orders that depend on several free orders are fixed: 1 for the motion of the body itself, 0 for inputs.
-    for term in alone.terms.iter_mut().filter(|term| term.order.is_free() && !term.order.is_single()) {
+    for term in isolated.terms.iter_mut().filter(|term| term.order.is_free() && !term.order.is_single()) {
         term.order = Order::number(if term.signal == item.output { 1.0 } else { 0.0 });
     }
     let mut usual = Values::new();
-    for term in alone.input_terms() {
+    for term in isolated.input_terms() {
         usual.extend(term.order.names().map(|name| (name.clone(), 0.0)));
     }
-    for term in alone.autoregressive_terms() {
+    for term in isolated.autoregressive_terms() {
         usual.extend(term.order.names().map(|name| (name.clone(), 1.0)));
     }
     usual.extend(item.order.names().map(|name| (name.clone(), MAX_BODY_ORDER)));
@@ -439,12 +444,12 @@ fn fit_isolated_body(
             *value = value.max(low).min(high);
         }
     }
-    alone.order = alone.order.substitute(&usual);
-    alone.terms.iter_mut().for_each(|term| term.order = term.order.substitute(&usual));
+    isolated.order = isolated.order.substitute(&usual);
+    isolated.terms.iter_mut().for_each(|term| term.order = term.order.substitute(&usual));
     let inputs = guess_at(free, values, String::new())?.result.iterate.point.inputs;
     let mut runs = source.runs().iter().map(|run| run.with_free_inputs(&inputs)).collect::<Result<Vec<_>>>()?;
     runs.iter_mut().for_each(|run| run.filter = None);
-    let numbers = fit_sliding_body(&runs, &alone, stop)?;
+    let numbers = fit_sliding_body(&runs, &isolated, stop)?;
     Ok((usual, numbers))
 }
 
@@ -493,16 +498,16 @@ fn number((factor, coefficient): (f64, &Coefficient), values: &Values) -> f64 {
         }
 }
 
-/// Return initial guesses of Coulomb friction from the fit `runner` with measured velocity sign.
+/// Return initial guesses of Coulomb friction from the fit `candidate` with measured velocity sign.
 ///
 /// Further guesses are fractions of the input force.
 fn coulomb_guesses(
     free: &ParameterSet,
     grid: &Objective<'_>,
     signed: &ParameterSet,
-    runner: &Candidate,
+    candidate: &Candidate,
 ) -> Result<Vec<Candidate>> {
-    let (mut values, origin) = (values_of(signed, runner), &runner.origin);
+    let (mut values, origin) = (values_of(signed, candidate), &candidate.origin);
     let coulomb = free_coulomb_coefficients(&free.structure);
     if coulomb.is_empty() {
         return Ok(vec![guess_at(free, &values, origin.clone())?]);
@@ -576,9 +581,9 @@ fn stribeck_guesses(
     free: &ParameterSet,
     grid: &Objective<'_>,
     less: &ParameterSet,
-    runner: &Candidate,
+    candidate: &Candidate,
 ) -> Result<Vec<Candidate>> {
-    let (values, origin) = (values_of(less, runner), &runner.origin);
+    let (values, origin) = (values_of(less, candidate), &candidate.origin);
     let (mut forces, mut speeds) = (Values::new(), Values::new());
     for (item, friction) in bodies(&free.structure).filter(|(_, friction)| has_stribeck(friction)) {
         if let (factor, Coefficient::Free(name)) = &friction.stribeck {
@@ -598,13 +603,13 @@ fn stribeck_guesses(
         }
     };
     let mut out = Vec::new();
-    for near in some(&forces, STRIBECK_COULOMB_RATIOS) {
-        for fall in some(&speeds, STRIBECK_SPEED_RATIOS) {
+    for force_ratio in some(&forces, STRIBECK_COULOMB_RATIOS) {
+        for speed_ratio in some(&speeds, STRIBECK_SPEED_RATIOS) {
             let mut guess = values.clone();
-            guess.extend(forces.iter().map(|(name, force)| (name.clone(), near * force)));
-            guess.extend(speeds.iter().map(|(name, speed)| (name.clone(), fall * speed)));
-            let (near, fall) = (format_general(near, 6), format_general(fall, 6));
-            let words = format!("{origin}, Stribeck {near} of Coulomb below {fall} of the speed");
+            guess.extend(forces.iter().map(|(name, force)| (name.clone(), force_ratio * force)));
+            guess.extend(speeds.iter().map(|(name, speed)| (name.clone(), speed_ratio * speed)));
+            let (force_ratio, speed_ratio) = (format_general(force_ratio, 6), format_general(speed_ratio, 6));
+            let words = format!("{origin}, Stribeck {force_ratio} of Coulomb below {speed_ratio} of the speed");
             out.push(guess_at(free, &guess, words)?);
         }
     }
@@ -618,7 +623,7 @@ fn stribeck_guesses(
 fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     let every = grid.sampling.decimation;
     let mut speeds = Vec::new();
-    for (samples, (step, _)) in grid.source().samples(output)?.iter().zip(grid.source().spans()) {
+    for (samples, (step, _)) in grid.source().samples(output)?.iter().zip(grid.source().intervals_and_durations()) {
         let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).step_by(every).collect();
         speeds.extend(finite.windows(2).map(|w| (w[1] - w[0]) / (step * every as f64)));
     }

@@ -16,7 +16,7 @@ pub(in crate::estimation::joint_fit) const FIRST_BUDGET_EVALUATIONS: usize = 15;
 /// Number of evaluations in the second budget, for candidates with a cost near the best.
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
 /// Number of initial guesses of a submodel that continue after the prescreening.
-pub(super) const MIN_SURVIVORS: usize = 8;
+pub(super) const SUBMODEL_SURVIVORS: usize = 8;
 /// Number of evaluations of each candidate in the prescreening.
 pub(super) const PRESCREEN_EVALUATIONS: usize = 2;
 /// Maximum number of candidates that continue on all samples.
@@ -50,10 +50,10 @@ impl RungExecutor<'_> {
         &self,
         free: &ParameterSet,
         grid: &Objective<'_>,
-        runners: &[Candidate],
+        candidates: &[Candidate],
         evaluations: usize,
     ) -> Result<Vec<Candidate>> {
-        let ended = self.run_each(free, grid, runners, evaluations)?;
+        let ended = self.run_each(free, grid, candidates, evaluations)?;
         Ok(sort_by_cost(ended.into_iter().flatten().collect()))
     }
 
@@ -62,65 +62,65 @@ impl RungExecutor<'_> {
         &self,
         free: &ParameterSet,
         grid: &Objective<'_>,
-        runners: &[Candidate],
+        candidates: &[Candidate],
         evaluations: usize,
     ) -> Result<Vec<Option<Candidate>>> {
-        let lap = Rung {
+        let rung = Rung {
             free,
             experiments: grid.experiments(),
-            steady: grid.requires_stability,
+            requires_stability: grid.requires_stability,
             evaluations,
             stop: grid.stop(),
         };
         let mut count = 0;
-        let mut heard = || {
+        let mut report_progress = || {
             let so_far = count.min(self.starts.saturating_sub(1));
             count += 1;
             self.listener.map_or(Ok(()), |listener| listener(so_far, self.starts))
         };
-        if self.threads.min(runners.len()) <= 1 {
-            let each = runners.iter().map(|runner| {
-                let ended = lap.optimize(runner)?;
-                heard()?;
+        if self.threads.min(candidates.len()) <= 1 {
+            let each = candidates.iter().map(|candidate| {
+                let ended = rung.optimize(candidate)?;
+                report_progress()?;
                 Ok(ended)
             });
             return each.collect();
         }
-        let mut ended: Vec<Option<Candidate>> = vec![None; runners.len()];
+        let mut ended: Vec<Option<Candidate>> = vec![None; candidates.len()];
         let (next, stop_flag) = (AtomicUsize::new(0), Stop::default());
         let (send, receive) = channel();
-        let (lap, next, stop_flag) = (&lap, &next, &stop_flag);
+        let (rung, next, stop_flag) = (&rung, &next, &stop_flag);
         std::thread::scope(|scope| {
-            let mut refused = None;
-            let threads = self.threads.min(runners.len());
+            let mut first_error = None;
+            let threads = self.threads.min(candidates.len());
             for _ in 0..threads {
                 let send = send.clone();
                 let runs = move || {
                     while !stop_flag.is_set() {
                         let k = next.fetch_add(1, Ordering::Relaxed);
-                        let Some(runner) = runners.get(k) else { return };
-                        if send.send((k, lap.optimize(runner))).is_err() {
+                        let Some(candidate) = candidates.get(k) else { return };
+                        if send.send((k, rung.optimize(candidate))).is_err() {
                             return;
                         }
                     }
                 };
                 if let Err(error) = std::thread::Builder::new().spawn_scoped(scope, runs) {
                     stop_flag.set();
-                    refused = Some(Error::Threads { threads, why: error.to_string() });
+                    first_error = Some(Error::Threads { threads, why: error.to_string() });
                     break;
                 }
             }
             drop(send);
             for (k, outcome) in &receive {
-                match outcome.and_then(|outcome| heard().map(|()| outcome)) {
+                match outcome.and_then(|outcome| report_progress().map(|()| outcome)) {
                     Ok(outcome) => ended[k] = outcome,
                     Err(error) => {
                         stop_flag.set();
-                        refused.get_or_insert(error);
+                        first_error.get_or_insert(error);
                     }
                 }
             }
-            refused.map_or(Ok(()), Err)
+            first_error.map_or(Ok(()), Err)
         })?;
         Ok(ended)
     }
@@ -130,19 +130,19 @@ impl RungExecutor<'_> {
 struct Rung<'a> {
     free: &'a ParameterSet,
     experiments: &'a [Experiment],
-    steady: bool,
+    requires_stability: bool,
     evaluations: usize,
     stop: &'a Stop,
 }
 
 impl Rung<'_> {
     /// Optimize one candidate. Return None if its simulation is not finite.
-    fn optimize(&self, runner: &Candidate) -> Result<Option<Candidate>> {
+    fn optimize(&self, candidate: &Candidate) -> Result<Option<Candidate>> {
         let settings = MinimizationSettings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
-        let place = &runner.result.iterate;
-        let turned = self.free.problem_at(place, false, &[]);
-        match turned.minimize(self.experiments, place, settings, self.steady, self.stop) {
-            Ok(attempt) => Ok(Some(zero_vanishing_coefficients(self.free, runner, runner.with_result(attempt)))),
+        let place = &candidate.result.iterate;
+        let problem = self.free.problem_at(place, false, &[]);
+        match problem.minimize(self.experiments, place, settings, self.requires_stability, self.stop) {
+            Ok(attempt) => Ok(Some(zero_vanishing_coefficients(self.free, candidate, candidate.with_result(attempt)))),
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
         }
@@ -163,9 +163,9 @@ fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended
 }
 
 /// Sort candidates by cost per residual; equal costs keep their sequence.
-pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
-    runners.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
-    runners
+pub(in crate::estimation::joint_fit) fn sort_by_cost(mut candidates: Vec<Candidate>) -> Vec<Candidate> {
+    candidates.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
+    candidates
 }
 
 /// Split the candidates of a short fit into those that continue and the others.
@@ -173,15 +173,15 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>
 /// A candidate continues if its budget is exhausted. `floor` is the cost per residual of the noise alone. If some
 /// candidate has converged at this noise floor, only candidates without a larger cost continue.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
-    runners: Vec<Candidate>,
+    candidates: Vec<Candidate>,
     floor: f64,
 ) -> (Vec<Candidate>, Vec<Candidate>) {
-    let converged = runners.iter().filter(|runner| runner.result.has_converged());
+    let converged = candidates.iter().filter(|candidate| candidate.result.has_converged());
     let least = converged.map(Candidate::cost_per_residual).fold(f64::INFINITY, f64::min);
     let limit = if least <= MAX_NOISE_COST_RATIO * floor { (1.0 + SAME_COST_TOLERANCE) * least } else { f64::INFINITY };
     let continues =
-        |runner: &Candidate| runner.result.status == Status::Exhausted && runner.cost_per_residual() <= limit;
-    runners.into_iter().partition(continues)
+        |candidate: &Candidate| candidate.result.status == Status::Exhausted && candidate.cost_per_residual() <= limit;
+    candidates.into_iter().partition(continues)
 }
 
 /// Return the survivors that continue on all samples: the best distinct optima within the cost ratio.
@@ -196,14 +196,14 @@ pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
 #[must_use]
 pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
     let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
-    reached.iter().filter(|runner| runner.cost_per_residual() <= limit).cloned().collect()
+    reached.iter().filter(|candidate| candidate.cost_per_residual() <= limit).cloned().collect()
 }
 
 /// Return true if two candidates agree in cost, orders and input parameters.
 #[must_use]
 pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
-    let orders = |runner: &Candidate| runner.result.iterate.point.orders.clone();
-    let inputs = |runner: &Candidate| runner.result.iterate.point.inputs.clone();
+    let orders = |candidate: &Candidate| candidate.result.iterate.point.orders.clone();
+    let inputs = |candidate: &Candidate| candidate.result.iterate.point.inputs.clone();
     (one.cost_per_residual() - other.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * one.cost_per_residual()
         && are_all_close(&orders(other), &orders(one), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
         // Delays that differ by a period belong to different optima.
@@ -225,14 +225,14 @@ pub(super) fn are_all_close(numbers: &[f64], others: &[f64], share: f64, distanc
 
 /// Merge each candidate into an earlier one that is the same, and append the origins to that candidate.
 #[must_use]
-pub fn merge_duplicates(runners: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
+pub fn merge_duplicates(candidates: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
     let mut distinct: Vec<Candidate> = Vec::new();
-    for runner in runners {
-        match distinct.iter_mut().find(|distinct| same(distinct, runner)) {
-            None => distinct.push(runner.clone()),
+    for candidate in candidates {
+        match distinct.iter_mut().find(|distinct| same(distinct, candidate)) {
+            None => distinct.push(candidate.clone()),
             Some(first) => {
-                first.duplicates.push(runner.origin.clone());
-                first.duplicates.extend(runner.duplicates.iter().cloned());
+                first.duplicates.push(candidate.origin.clone());
+                first.duplicates.extend(candidate.duplicates.iter().cloned());
             }
         }
     }

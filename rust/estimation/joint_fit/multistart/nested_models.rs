@@ -23,8 +23,8 @@ pub struct ReducedProblem {
 impl ReducedProblem {
     /// Restrict a candidate of the full problem, which has the parameter set `whole`, to this submodel.
     #[must_use]
-    pub fn restrict(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
+    pub fn restrict(&self, source: &Candidate, whole: &ParameterSet) -> Candidate {
+        let ParameterPoint { orders, coefficients, inputs } = &source.result.iterate.point;
         let order = |name: &String| whole.orders.iter().position(|o| o == name).map(|at| orders[at]);
         let value = |name: &String| whole.coefficients.iter().position(|c| c == name).map(|at| coefficients[at]);
         let point = ParameterPoint {
@@ -32,15 +32,15 @@ impl ReducedProblem {
             coefficients: self.free.coefficients.iter().filter_map(value).collect(),
             inputs: inputs.clone(),
         };
-        Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
+        Candidate::at(Iterate { point, states: Vec::new() }, source.origin.clone())
     }
 
     /// Embed a candidate of this submodel in the full problem, which has the parameter set `whole`.
     ///
     /// The free order of a removed term is set to half of the highest order of its equation.
     #[must_use]
-    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
+    pub fn embed(&self, source: &Candidate, whole: &ParameterSet) -> Candidate {
+        let ParameterPoint { orders, coefficients, inputs } = &source.result.iterate.point;
         let values_by_name: BTreeMap<&String, f64> = self.free.orders.iter().zip(orders.iter().copied()).collect();
         let highest = self.order.at(|name| values_by_name.get(&name.to_owned()).copied().unwrap_or(0.0));
         let values: BTreeMap<&String, f64> = self.free.coefficients.iter().zip(coefficients.iter().copied()).collect();
@@ -53,12 +53,12 @@ impl ReducedProblem {
             coefficients: whole.coefficients.iter().map(|n| values.get(n).copied().unwrap_or(self.value)).collect(),
             inputs: inputs.clone(),
         };
-        let origin = format!("{}, from {} = {}", runner.origin, self.coefficient, format_general(self.value, 6));
-        let place = Iterate { point, states: runner.result.iterate.states.clone() };
+        let origin = format!("{}, from {} = {}", source.origin, self.coefficient, format_general(self.value, 6));
+        let place = Iterate { point, states: source.result.iterate.states.clone() };
         Candidate {
-            result: OptimizationResult { iterate: place, ..runner.result.clone() },
+            result: OptimizationResult { iterate: place, ..source.result.clone() },
             origin,
-            duplicates: runner.duplicates.clone(),
+            duplicates: source.duplicates.clone(),
         }
     }
 }
@@ -133,10 +133,10 @@ pub struct IntegerOrderProblem {
 impl IntegerOrderProblem {
     /// Embed a candidate of this problem in the full problem.
     #[must_use]
-    pub fn embed(&self, runner: &Candidate) -> Candidate {
-        let mut candidate = runner.clone();
+    pub fn embed(&self, source: &Candidate) -> Candidate {
+        let mut candidate = source.clone();
         candidate.result.iterate.point.orders.clone_from(&self.orders);
-        candidate.origin = format!("{}, from integer orders", runner.origin);
+        candidate.origin = format!("{}, from integer orders", source.origin);
         candidate
     }
 }
@@ -210,24 +210,24 @@ pub struct FixedOrderProblem {
 impl FixedOrderProblem {
     /// Restrict a candidate of the full problem to this submodel, without a change of the coefficients in scaled time.
     #[must_use]
-    pub fn restrict(&self, runner: &Candidate, clock: &TimeScaling) -> Candidate {
-        let mut scaled_values = clock.to_scaled(&runner.result.values());
+    pub fn restrict(&self, source: &Candidate, time_scaling: &TimeScaling) -> Candidate {
+        let mut scaled_values = time_scaling.to_scaled(&source.result.values());
         scaled_values[self.order] = self.value;
-        let mut values = clock.to_unscaled(&scaled_values);
+        let mut values = time_scaling.to_unscaled(&scaled_values);
         values.remove(self.order);
         let (orders, rest) = values.split_at(self.free.orders.len());
         let (coefficients, inputs) = rest.split_at(self.free.coefficients.len());
         let point = ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() };
-        Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
+        Candidate::at(Iterate { point, states: Vec::new() }, source.origin.clone())
     }
 
     /// Embed a candidate of this submodel in the full problem, which has the parameter set `whole`.
     #[must_use]
-    pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let mut candidate = runner.clone();
+    pub fn embed(&self, source: &Candidate, whole: &ParameterSet) -> Candidate {
+        let mut candidate = source.clone();
         candidate.result.iterate.point.orders.insert(self.order, self.value);
         candidate.origin =
-            format!("{}, from {} = {}", runner.origin, whole.orders[self.order], format_general(self.value, 6));
+            format!("{}, from {} = {}", source.origin, whole.orders[self.order], format_general(self.value, 6));
         candidate
     }
 }

@@ -10,7 +10,7 @@ use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, run_friction_multistart, values_of};
 use super::halving::{
     is_same_iterate, is_same_optimum, merge_duplicates, sort_by_cost, RungExecutor, FIRST_BUDGET_EVALUATIONS,
-    MAX_FINAL_SURVIVORS, MIN_SURVIVORS, SECOND_BUDGET_EVALUATIONS,
+    MAX_FINAL_SURVIVORS, SECOND_BUDGET_EVALUATIONS, SUBMODEL_SURVIVORS,
 };
 use super::search::{none_if_invalid_model, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR};
 use crate::error::Result;
@@ -37,40 +37,40 @@ const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 /// # Errors
 /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
 /// if it returns one. [`crate::error::Error::Interrupted`] after a stop request.
-pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+pub fn run_nonlinear_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let linear = ParameterSet::from_structure(ParametricStructure { derived: Vec::new(), ..structure.clone() })?;
-    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-    let sampling = coarse_sampling(free, course.source)?;
-    let mut grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
+    let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
+    let sampling = coarse_sampling(free, context.source)?;
+    let mut grid = Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)?;
     let differentiates = structure.derived.iter().flat_map(|derived| &derived.channels).any(|channel| channel.1 > 0.0);
     let widths = if differentiates { vec![0, SMOOTHING_HALF_WIDTH] } else { vec![0] };
-    let sources = widths.into_iter().map(|width| with_derived_signals(structure, course.source, width));
+    let sources = widths.into_iter().map(|width| with_derived_signals(structure, context.source, width));
     let sources = sources.collect::<Result<Vec<_>>>()?;
     let mut starts = Vec::new();
     for source in &sources {
-        let of_source = course.starts.for_recordings(source);
+        let of_source = context.starts.for_recordings(source);
         if structure.has_friction() {
-            let own = MultistartContext { source, starts: of_source.as_ref(), listener: None, ..course };
+            let own = MultistartContext { source, starts: of_source.as_ref(), listener: None, ..context };
             let candidates = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
             starts.extend(embed(free, &linear, &candidates)?);
             continue;
         }
         starts.extend(none_if_invalid_model(of_source.initial_guesses(&linear))?.unwrap_or_default());
     }
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
-    let mut ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
+    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
+    let mut ranked = merge_duplicates(&executor.run(free, &grid, &starts, 0)?, is_same_iterate);
     while ranked.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         grid = grid.finer()?;
-        ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
+        ranked = merge_duplicates(&executor.run(free, &grid, &starts, 0)?, is_same_iterate);
     }
-    let laps = RungExecutor { listener: None, ..laps };
+    let executor = RungExecutor { listener: None, ..executor };
     let is_at_noise = |reached: &[Candidate]| {
-        reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor)
+        reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * context.floor)
     };
     let mut reached = Vec::new();
-    for going in ranked.chunks(MAX_FINAL_SURVIVORS).take(MIN_SURVIVORS.div_ceil(MAX_FINAL_SURVIVORS)) {
-        reached.extend(laps.run(free, &grid, going, FIRST_BUDGET_EVALUATIONS)?);
+    for selected in ranked.chunks(MAX_FINAL_SURVIVORS).take(SUBMODEL_SURVIVORS.div_ceil(MAX_FINAL_SURVIVORS)) {
+        reached.extend(executor.run(free, &grid, selected, FIRST_BUDGET_EVALUATIONS)?);
         reached = sort_by_cost(reached);
         if is_at_noise(&reached) {
             break;
@@ -82,29 +82,29 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
     {
         grid = grid.finer()?;
-        reached = laps.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
+        reached = executor.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
     }
     if !is_at_noise(&reached) {
         let mut more = Vec::new();
         // With friction, these fits are the initial guesses already.
         let others = if structure.has_friction() { &[][..] } else { &sources };
         for source in others {
-            let starts = course.starts.for_recordings(source);
-            let own = MultistartContext { source, starts: starts.as_ref(), listener: None, ..course };
+            let starts = context.starts.for_recordings(source);
+            let own = MultistartContext { source, starts: starts.as_ref(), listener: None, ..context };
             let candidates = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
             more.extend(embed(free, &linear, &candidates)?);
         }
         if let Some(less) = without_nonlinear_terms(structure) {
-            let own = MultistartContext { listener: None, ..course };
+            let own = MultistartContext { listener: None, ..context };
             let candidates = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
             more.extend(embed(free, &less, &candidates)?);
         }
-        reached.extend(laps.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
+        reached.extend(executor.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
         reached = sort_by_cost(reached);
     }
-    let going = merge_duplicates(&reached, is_same_optimum);
-    let (first, rest) = going.split_at(MAX_FINAL_SURVIVORS.min(going.len()));
-    let mut ended = laps.run(free, &grid, first, SECOND_BUDGET_EVALUATIONS)?;
+    let selected = merge_duplicates(&reached, is_same_optimum);
+    let (first, rest) = selected.split_at(MAX_FINAL_SURVIVORS.min(selected.len()));
+    let mut ended = executor.run(free, &grid, first, SECOND_BUDGET_EVALUATIONS)?;
     ended.extend(rest.iter().cloned());
     Ok(ended)
 }
@@ -113,12 +113,12 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
 ///
 /// At most [`MAX_FINAL_SURVIVORS`] candidates are returned. Missing coefficients are 0.
 fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
-    let of = |runner: &Candidate| {
-        let mut values = values_of(less, runner);
+    let of = |candidate: &Candidate| {
+        let mut values = values_of(less, candidate);
         for name in &free.coefficients {
             values.entry(name.clone()).or_insert(0.0);
         }
-        guess_at(free, &values, format!("{}, from a linear fit", runner.origin))
+        guess_at(free, &values, format!("{}, from a linear fit", candidate.origin))
     };
     candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
 }

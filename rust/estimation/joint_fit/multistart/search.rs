@@ -4,7 +4,7 @@ use super::coarse_grid::{coarse_sampling, leading_part};
 use super::halving::{
     competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
     split_unfinished, RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
-    MIN_SURVIVORS, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
+    PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS, SUBMODEL_SURVIVORS,
 };
 use super::nested_models::{
     fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, ReducedProblem,
@@ -74,7 +74,7 @@ impl<'a> MultistartContext<'a> {
     }
 
     fn time_scaling(self, free: &ParameterSet) -> TimeScaling {
-        TimeScaling::from_runs(&free.problem, &self.source.spans())
+        TimeScaling::from_runs(&free.problem, &self.source.intervals_and_durations())
     }
 }
 
@@ -83,14 +83,14 @@ impl<'a> MultistartContext<'a> {
 /// # Errors
 /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
 /// if it returns one. [`Error::Interrupted`] after a stop request.
-pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    if let Some(candidates) = integer_order_multistart(free, course, None)? {
+pub fn run_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    if let Some(candidates) = integer_order_multistart(free, context, None)? {
         return Ok(candidates);
     }
     if free.structure.history {
-        return multistart_with_history(free, course);
+        return multistart_with_history(free, context);
     }
-    Ok(multistart_without_history(free, course)?.0)
+    Ok(multistart_without_history(free, context)?.0)
 }
 
 /// Return the optima of a problem of integer orders, best first; None for other problems.
@@ -98,29 +98,29 @@ pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Res
 /// The fit uses the first `leading_intervals` intervals of each run, or all samples if it is None.
 fn integer_order_multistart(
     free: &ParameterSet,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     leading_intervals: Option<usize>,
 ) -> Result<Option<Vec<Candidate>>> {
     if !free.orders.is_empty() || !free.problem.is_linear() {
         return Ok(None);
     }
     let objective = |sampling| {
-        let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-        Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)
+        let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
+        Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)
     };
     let grid = objective(Sampling { leading_intervals, ..Sampling::default() })?;
     let mut starts = Vec::new();
-    for sampling in guess_samplings(free, course.source, leading_intervals)? {
-        starts.extend(course.starts.integer_order_optima(free, &objective(sampling)?)?.unwrap_or_default());
+    for sampling in guess_samplings(free, context.source, leading_intervals)? {
+        starts.extend(context.starts.integer_order_optima(free, &objective(sampling)?)?.unwrap_or_default());
     }
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
-    let mut starts = merge_duplicates(&laps.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
+    let mut starts = merge_duplicates(&executor.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
     if starts.is_empty() {
-        let Some(optima) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
+        let Some(optima) = context.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
         starts = optima;
     }
-    let laps = RungExecutor { starts: starts.len(), ..laps };
-    let candidates = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
+    let executor = RungExecutor { starts: starts.len(), ..executor };
+    let candidates = executor.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
     Ok((!candidates.is_empty()).then_some(candidates))
 }
 
@@ -154,8 +154,8 @@ pub(super) fn none_if_invalid_model<T>(outcome: Result<T>) -> Result<Option<T>> 
 /// State of a multistart.
 struct MultistartState<'a> {
     free: &'a ParameterSet,
-    course: MultistartContext<'a>,
-    laps: RungExecutor<'a>,
+    context: MultistartContext<'a>,
+    executor: RungExecutor<'a>,
     coarse: Objective<'a>,
     /// Objective on a grid with half the step; None if it was not needed.
     half: Option<Objective<'a>>,
@@ -172,23 +172,24 @@ struct MultistartState<'a> {
 /// Return the candidates, best first, and the objective on which they were optimized.
 fn multistart_without_history<'a>(
     free: &'a ParameterSet,
-    course: MultistartContext<'a>,
+    context: MultistartContext<'a>,
 ) -> Result<(Vec<Candidate>, Objective<'a>)> {
-    let mut starts = course.starts.initial_guesses(free)?;
-    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-    let sampling = coarse_sampling(free, course.source)?;
-    let coarse = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
-    let integer_order_optima = integer_order_optima(free, course, &coarse, &starts)?;
+    let mut starts = context.starts.initial_guesses(free)?;
+    let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
+    let sampling = coarse_sampling(free, context.source)?;
+    let coarse = Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)?;
+    let integer_order_optima = integer_order_optima(free, context, &coarse, &starts)?;
     starts.extend(integer_order_optima.iter().cloned());
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
+    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
     let (first, candidates, half) = (Vec::new(), Vec::new(), None);
-    let mut run = MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima, candidates };
+    let mut run =
+        MultistartState { free, context, executor, coarse, half, starts, first, integer_order_optima, candidates };
     run.optimize_starts()?;
     run.add_nested_models()?;
-    let total = run.laps.starts;
+    let total = run.executor.starts;
     let candidates = run.promote_survivors()?;
-    if let Some(heard) = course.listener {
-        heard(total, total)?;
+    if let Some(report_progress) = context.listener {
+        report_progress(total, total)?;
     }
     Ok(candidates)
 }
@@ -198,46 +199,47 @@ fn multistart_without_history<'a>(
 /// The integer orders are near the usual ones and near those of the first guess.
 fn integer_order_optima(
     free: &ParameterSet,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     coarse: &Objective<'_>,
     starts: &[Candidate],
 ) -> Result<Vec<Candidate>> {
     let usual = free.integer_orders();
-    let near = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
+    let orders = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
     let mut candidates = Vec::new();
-    for less in integer_order_problems(free, near) {
+    for less in integer_order_problems(free, orders) {
         // With fixed orders, most initial guesses lead to the same optimum.
-        let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
-        candidates.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
+        let ended = optimize_submodel(&less.free, context, coarse, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
+        candidates.extend(ended.iter().take(1).map(|candidate| less.embed(candidate)));
     }
     Ok(candidates)
 }
 
 /// Optimize a submodel from its initial guesses and return its optima, best first.
 ///
-/// The best `going` guesses continue after the prescreening. `level` is the cost per residual of the full problem.
-/// Optima that can compete with it, and the best one, get the second budget. For integer orders, the leading intervals
-/// of long records suffice. The result is empty if the submodel is invalid, such as with two equal terms.
+/// The best `survivor_count` guesses continue after the prescreening. `level` is the cost per residual of the full
+/// problem. Optima that can compete with it, and the best one, get the second budget. For integer orders, the leading
+/// intervals of long records suffice. The result is empty if the submodel is invalid, such as with two equal terms.
 fn optimize_submodel(
     free: &ParameterSet,
-    course: MultistartContext<'_>,
+    context: MultistartContext<'_>,
     coarse: &Objective<'_>,
-    going: usize,
+    survivor_count: usize,
     level: f64,
 ) -> Result<Vec<Candidate>> {
-    let part = leading_part(free, course.source, SELECTION_INTERVALS)?;
-    if let Some(candidates) = integer_order_multistart(free, course.for_submodel(), part)? {
+    let part = leading_part(free, context.source, SELECTION_INTERVALS)?;
+    if let Some(candidates) = integer_order_multistart(free, context.for_submodel(), part)? {
         return Ok(candidates);
     }
-    let Some(starts) = none_if_invalid_model(course.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: None };
-    let mut runners = merge_duplicates(&laps.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
-    runners.truncate(going);
-    let ended = laps.run(free, coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+    let Some(starts) = none_if_invalid_model(context.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
+    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: None };
+    let mut candidates =
+        merge_duplicates(&executor.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    candidates.truncate(survivor_count);
+    let ended = executor.run(free, coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
     let mut survivors = select_survivors(&ended);
-    let competitive = |runner: &Candidate| runner.cost_per_residual() <= MAX_SURVIVOR_COST_RATIO * level;
-    survivors.truncate(survivors.iter().filter(|runner| competitive(runner)).count().max(1));
-    laps.run(free, coarse, &survivors, SECOND_BUDGET_EVALUATIONS)
+    let competitive = |candidate: &Candidate| candidate.cost_per_residual() <= MAX_SURVIVOR_COST_RATIO * level;
+    survivors.truncate(survivors.iter().filter(|candidate| competitive(candidate)).count().max(1));
+    executor.run(free, coarse, &survivors, SECOND_BUDGET_EVALUATIONS)
 }
 
 impl<'a> MultistartState<'a> {
@@ -249,13 +251,13 @@ impl<'a> MultistartState<'a> {
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
-            let screened = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
+            let screened = self.executor.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
             let mut screened = merge_duplicates(&screened, is_same_iterate);
             if self.coarse.sampling.pulses_per_sample > 1 {
                 // Nearly all candidates were already optimized on the coarser grid.
-                screened.truncate(competitive_candidates(&screened).len().max(MIN_SURVIVORS));
+                screened.truncate(competitive_candidates(&screened).len().max(SUBMODEL_SURVIVORS));
             }
-            self.candidates = self.laps.run(self.free, &self.coarse, &screened, FIRST_BUDGET_EVALUATIONS)?;
+            self.candidates = self.executor.run(self.free, &self.coarse, &screened, FIRST_BUDGET_EVALUATIONS)?;
             self.first.clone_from(&self.candidates);
             if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
                 return Ok(());
@@ -281,21 +283,21 @@ impl<'a> MultistartState<'a> {
         for less in reduced_problems(self.free) {
             self.add_reduced_model(&less)?;
         }
-        let unit = self.course.time_scaling(self.free);
+        let unit = self.context.time_scaling(self.free);
         for one in fixed_order_problems(self.free) {
             self.add_fixed_order_model(&one, &unit)?;
         }
         self.add_model_without_offset()
     }
 
-    fn add(&mut self, runners: Vec<Candidate>) {
-        self.candidates.extend(runners);
+    fn add(&mut self, candidates: Vec<Candidate>) {
+        self.candidates.extend(candidates);
         self.candidates = sort_by_cost(std::mem::take(&mut self.candidates));
     }
 
     /// Evaluate candidates with the full problem on the coarse grid and add them.
-    fn evaluate_and_add(&mut self, runners: &[Candidate]) -> Result<()> {
-        let evaluated = self.laps.run(self.free, &self.coarse, runners, 1)?;
+    fn evaluate_and_add(&mut self, candidates: &[Candidate]) -> Result<()> {
+        let evaluated = self.executor.run(self.free, &self.coarse, candidates, 1)?;
         self.add(evaluated);
         Ok(())
     }
@@ -306,46 +308,48 @@ impl<'a> MultistartState<'a> {
             // in the autoregressive terms only, and those of the full problem suffice.
             let first = merge_duplicates(&self.first, is_same_optimum);
             let from = first.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
-            let runners: Vec<Candidate> = from.map(|runner| less.restrict(runner, self.free)).collect();
-            let mut runners = self.laps.run(&less.free, &self.coarse, &runners, PRESCREEN_EVALUATIONS)?;
-            runners.truncate(MAX_FINAL_SURVIVORS);
-            let ended = self.laps.run(&less.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
+            let candidates: Vec<Candidate> = from.map(|candidate| less.restrict(candidate, self.free)).collect();
+            let mut candidates = self.executor.run(&less.free, &self.coarse, &candidates, PRESCREEN_EVALUATIONS)?;
+            candidates.truncate(MAX_FINAL_SURVIVORS);
+            let ended = self.executor.run(&less.free, &self.coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
             return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
         }
         let level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
-        let ended = optimize_submodel(&less.free, self.course, &self.coarse, MIN_SURVIVORS, level)?;
+        let ended = optimize_submodel(&less.free, self.context, &self.coarse, SUBMODEL_SURVIVORS, level)?;
         self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
     /// Add the optimum with one order fixed, because the full problem must not fit worse.
     fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
         let level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
-        if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.course.floor {
+        if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.context.floor {
             // Within its bounds, the submodel may have no order grid.
             if let Some((ended, _)) =
-                none_if_invalid_model(multistart_without_history(&one.free, self.course.for_submodel()))?
+                none_if_invalid_model(multistart_without_history(&one.free, self.context.for_submodel()))?
             {
                 let embedded = competitive_candidates(&ended).into_iter().take(MAX_FINAL_SURVIVORS);
-                let embedded = embedded.map(|runner| one.embed(&runner, self.free));
+                let embedded = embedded.map(|candidate| one.embed(&candidate, self.free));
                 return self.evaluate_and_add(&embedded.collect::<Vec<_>>());
             }
         }
         // Start from the optima found so far and from those with integer orders.
         let (reached, first) =
             (merge_duplicates(&self.candidates, is_same_optimum), merge_duplicates(&self.first, is_same_optimum));
-        let near = reached
+        let sources = reached
             .iter()
             .take(MAX_FINAL_SURVIVORS)
             .chain(first.iter().take(MAX_FINAL_SURVIVORS))
             .chain(&self.integer_order_optima);
-        let runners: Vec<Candidate> = near.map(|runner| one.restrict(runner, unit)).collect();
-        let mut runners = merge_duplicates(
-            &self.laps.run(&one.free, &self.coarse, &runners, PRESCREEN_EVALUATIONS)?,
+        let candidates: Vec<Candidate> = sources.map(|candidate| one.restrict(candidate, unit)).collect();
+        let mut candidates = merge_duplicates(
+            &self.executor.run(&one.free, &self.coarse, &candidates, PRESCREEN_EVALUATIONS)?,
             is_same_iterate,
         );
-        runners.truncate(MAX_FINAL_SURVIVORS);
-        let ended = self.laps.run(&one.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
-        self.evaluate_and_add(&ended.iter().take(1).map(|runner| one.embed(runner, self.free)).collect::<Vec<_>>())
+        candidates.truncate(MAX_FINAL_SURVIVORS);
+        let ended = self.executor.run(&one.free, &self.coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
+        self.evaluate_and_add(
+            &ended.iter().take(1).map(|candidate| one.embed(candidate, self.free)).collect::<Vec<_>>(),
+        )
     }
 
     /// Add the optima of the model without offsets.
@@ -358,7 +362,7 @@ impl<'a> MultistartState<'a> {
             return Ok(());
         }
         let plain = ParameterSet::from_structure(ParametricStructure { initial: plain, ..structure.clone() })?;
-        let mut ended = run_multistart(&plain, self.course.for_submodel())?;
+        let mut ended = run_multistart(&plain, self.context.for_submodel())?;
         ended.truncate(MAX_FINAL_SURVIVORS);
         self.add(ended);
         Ok(())
@@ -370,9 +374,9 @@ impl<'a> MultistartState<'a> {
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
-        let short = self.laps.run(self.free, &self.coarse, survivors, FIRST_BUDGET_EVALUATIONS)?;
-        let (unfinished, ended) = split_unfinished(short, self.course.floor);
-        let mut candidates = self.laps.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?;
+        let short = self.executor.run(self.free, &self.coarse, survivors, FIRST_BUDGET_EVALUATIONS)?;
+        let (unfinished, ended) = split_unfinished(short, self.context.floor);
+        let mut candidates = self.executor.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?;
         candidates.extend(ended);
         let mut candidates = rank_candidates(&self.coarse, self.half, sort_by_cost(candidates))?;
         candidates.extend_from_slice(rest);
@@ -386,41 +390,42 @@ impl<'a> MultistartState<'a> {
 fn rank_candidates(
     coarse: &Objective<'_>,
     half: Option<Objective<'_>>,
-    runners: Vec<Candidate>,
+    candidates: Vec<Candidate>,
 ) -> Result<Vec<Candidate>> {
-    if runners.is_empty() {
-        return Ok(runners);
+    if candidates.is_empty() {
+        return Ok(candidates);
     }
     let half = match half.map_or_else(|| coarse.finer(), Ok) {
         Err(Error::Interrupted) => return Err(Error::Interrupted),
-        Err(_) => return Ok(sort_by_cost(runners)),
+        Err(_) => return Ok(sort_by_cost(candidates)),
         Ok(half) => half,
     };
-    let order = half.rank_results(&runners.iter().map(|runner| &runner.result).collect::<Vec<_>>())?;
-    let mut runners: Vec<Option<Candidate>> = runners.into_iter().map(Some).collect();
-    Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
+    let order = half.rank_results(&candidates.iter().map(|candidate| &candidate.result).collect::<Vec<_>>())?;
+    let mut candidates: Vec<Option<Candidate>> = candidates.into_iter().map(Some).collect();
+    Ok(order.into_iter().filter_map(|i| candidates[i].take()).collect())
 }
 
 /// Run the multistart of a problem with many initial terms per run, and return the candidates, best first.
 ///
 /// The initial terms are added for the survivors only, because they shift most optima by less than the distance between
 /// two optima. The survivors are ranked again after a budget with all initial terms.
-fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    let few = free.with_initial_terms(free.structure.initial.with_under(Initial::Caputo), false)?;
-    let (reached, coarse) = multistart_without_history(&few, course)?;
+fn multistart_with_history(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let few = free.with_initial_terms(free.structure.initial.with_base(Initial::Caputo), false)?;
+    let (reached, coarse) = multistart_without_history(&few, context)?;
     let (reached, coarse) = (merge_duplicates(&reached, is_same_optimum), coarse.with_problem(&free.problem));
-    let laps = RungExecutor { starts: reached.len(), threads: course.threads, listener: None };
-    let ends = laps.run_each(free, &coarse, &reached, 0)?;
+    let executor = RungExecutor { starts: reached.len(), threads: context.threads, listener: None };
+    let ends = executor.run_each(free, &coarse, &reached, 0)?;
     let levels: Vec<f64> =
         ends.iter().map(|end| end.as_ref().map_or(f64::INFINITY, Candidate::cost_per_residual)).collect();
     let mut order: Vec<usize> = (0..reached.len()).collect();
     order.sort_by(|&i, &j| levels[i].total_cmp(&levels[j]));
     let limit = order.first().map_or(0.0, |&i| MAX_SURVIVOR_COST_RATIO * levels[i]);
-    let going: Vec<Candidate> =
-        order.iter().take(MIN_SURVIVORS).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
-    let mut rest = order[going.len()..].to_vec();
+    let selected: Vec<Candidate> =
+        order.iter().take(SUBMODEL_SURVIVORS).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
+    let mut rest = order[selected.len()..].to_vec();
     rest.sort_unstable();
-    let mut leaders = rank_candidates(&coarse, None, laps.run(free, &coarse, &going, FIRST_BUDGET_EVALUATIONS)?)?;
+    let mut leaders =
+        rank_candidates(&coarse, None, executor.run(free, &coarse, &selected, FIRST_BUDGET_EVALUATIONS)?)?;
     leaders.extend(rest.into_iter().map(|i| reached[i].clone()));
     Ok(merge_duplicates(&leaders, is_same_optimum))
 }
@@ -437,13 +442,13 @@ pub(super) fn optimize_on_coarse_grids(
     starts: &[Candidate],
     threads: usize,
 ) -> Result<Vec<Candidate>> {
-    let laps = RungExecutor { starts: starts.len(), threads, listener: None };
+    let executor = RungExecutor { starts: starts.len(), threads, listener: None };
     let mut coarse = coarse.clone();
-    let mut ended = laps.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
+    let mut ended = executor.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && ended.is_empty() {
         coarse = coarse.finer()?;
-        ended = laps.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
+        ended = executor.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
     }
     ended.truncate(2 * MAX_FINAL_SURVIVORS);
-    laps.run(free, &coarse, &ended, SECOND_BUDGET_EVALUATIONS)
+    executor.run(free, &coarse, &ended, SECOND_BUDGET_EVALUATIONS)
 }

@@ -24,7 +24,7 @@ const MAX_REST_ITERATIONS: usize = 4;
 /// Block-pulse record of one run, and the friction force of each pulse relative to Coulomb friction.
 ///
 /// While the body slides, this is the sign of the measured velocity. At rest it is between −1 and 1.
-struct Part {
+struct RunFriction {
     record: Record,
     sign: Vec<f64>,
 }
@@ -54,16 +54,16 @@ pub(super) fn fit_sliding_body(
     if item.terms.is_empty() || item.terms.iter().any(|term| alpha < term.order.constant) {
         return Ok(BTreeMap::new());
     }
-    let mut parts = runs.iter().map(|run| Part::of(run, item.output)).collect::<Result<Vec<_>>>()?;
+    let mut parts = runs.iter().map(|run| RunFriction::of(run, item.output)).collect::<Result<Vec<_>>>()?;
     let rest: Vec<Vec<bool>> = parts.iter().map(|part| part.sign.iter().map(|v| *v == 0.0).collect()).collect();
     let mut estimates = BTreeMap::new();
     for _ in 0..MAX_REST_ITERATIONS {
         stop.check()?;
         estimates = signed_least_squares(item, &parts);
-        let Some(holds) = estimates.get(strength).map(|value| factor * value).filter(|holds| *holds > 0.0) else {
+        let Some(coulomb) = estimates.get(strength).map(|value| factor * value).filter(|coulomb| *coulomb > 0.0) else {
             break;
         };
-        for (part, still) in parts.iter_mut().zip(&rest) {
+        for (part, at_rest) in parts.iter_mut().zip(&rest) {
             let mut push = vec![0.0; part.sign.len()];
             for term in item.input_terms().filter(|term| term.order.constant == 0.0) {
                 let free = || {
@@ -74,15 +74,15 @@ pub(super) fn fit_sliding_body(
                 let value = term.fixed_coefficient().unwrap_or_else(free);
                 push.iter_mut().zip(part.record.signal(term.signal)).for_each(|(p, v)| *p += value * v);
             }
-            for ((sign, push), _) in part.sign.iter_mut().zip(push).zip(still).filter(|(_, still)| **still) {
-                *sign = (push / holds).clamp(-1.0, 1.0);
+            for ((sign, push), _) in part.sign.iter_mut().zip(push).zip(at_rest).filter(|(_, at_rest)| **at_rest) {
+                *sign = (push / coulomb).clamp(-1.0, 1.0);
             }
         }
     }
     Ok(estimates)
 }
 
-impl Part {
+impl RunFriction {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn of(run: &Recording, output: usize) -> Result<Self> {
         let m = run.len() - 1;
@@ -106,9 +106,9 @@ impl Part {
 }
 
 /// Return the least-squares coefficients by name, under the sign constraints; empty if the columns are not finite.
-fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<String, f64> {
+fn signed_least_squares(item: &ParametricEquation, parts: &[RunFriction]) -> BTreeMap<String, f64> {
     let (alpha, rows) = (item.order.constant, parts.iter().map(|part| part.sign.len()).sum());
-    let stacked = |of: &dyn Fn(&Part) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
+    let stacked = |of: &dyn Fn(&RunFriction) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
     let mut target = stacked(&|part| part.record.signal(item.output).to_vec());
     // Columns, each with the name of its coefficient. A column occurs with both signs if its coefficient may have any
     // sign.
@@ -135,7 +135,7 @@ fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<S
         }
     }
     if let Some((factor, coefficient)) = item.friction.as_ref().map(|friction| &friction.coulomb) {
-        let force = |part: &Part| {
+        let force = |part: &RunFriction| {
             let m = part.sign.len();
             let integral = series::multiply(&kernel(alpha, m, part.record.step()), &part.sign, m);
             integral.into_iter().map(|v| -factor * v).collect()

@@ -100,7 +100,7 @@ pub struct BoundSearch {
     /// Maximum distance of a refit from the optimum.
     farthest: f64,
     /// Distance of the next refit from the optimum.
-    way: f64,
+    distance: f64,
     /// Distance from the optimum of the last refit whose cost is below the threshold.
     inside: f64,
     /// Distance from the optimum of the first refit whose cost is above the threshold.
@@ -135,7 +135,7 @@ impl BoundSearch {
             start,
             first,
             farthest,
-            way: first.min(farthest),
+            distance: first.min(farthest),
             inside: 0.0,
             outside: f64::INFINITY,
             within: around.best.clone(),
@@ -164,16 +164,16 @@ impl BoundSearch {
         allowed: usize,
         is_cancelled: &dyn Fn() -> bool,
     ) -> Result<BoundOutcome> {
-        while self.refits < MAX_REFITS_PER_BOUND && (self.origin.is_some() || self.way > self.inside) {
+        while self.refits < MAX_REFITS_PER_BOUND && (self.origin.is_some() || self.distance > self.inside) {
             around.stop().check()?;
             if is_cancelled() {
                 return Ok(BoundOutcome::Paused);
             }
             let origin = self.origin.take().unwrap_or_else(|| self.within.clone());
-            let lap = MAX_REFIT_EVALUATIONS.min(allowed.saturating_sub(self.evaluations));
-            let refit = match lap {
+            let budget = MAX_REFIT_EVALUATIONS.min(allowed.saturating_sub(self.evaluations));
+            let refit = match budget {
                 0 => Refit::Infeasible,
-                _ => around.refit(self.parameter, self.start + self.side * self.way, &origin, lap)?,
+                _ => around.refit(self.parameter, self.start + self.side * self.distance, &origin, budget)?,
             };
             let refit_result = match refit {
                 Refit::Lower(lower) => {
@@ -183,9 +183,9 @@ impl BoundSearch {
                 Refit::Optimum(refit_result) => Some(refit_result),
                 Refit::Infeasible => None,
             };
-            let took = refit_result.as_ref().map_or(lap, |refit_result| refit_result.evaluations);
-            self.evaluations += took;
-            if lap < MAX_REFIT_EVALUATIONS && took >= lap {
+            let used = refit_result.as_ref().map_or(budget, |refit_result| refit_result.evaluations);
+            self.evaluations += used;
+            if budget < MAX_REFIT_EVALUATIONS && used >= budget {
                 // The result of an interrupted refit is not a point of the profile.
                 self.origin = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
@@ -196,8 +196,9 @@ impl BoundSearch {
             }
         }
         // The interval is bounded only if some finite cost beyond the threshold was computed.
-        let risen = self.outside.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
-        let bound = if risen { self.start + self.side * self.outside } else { self.side * f64::INFINITY };
+        let is_bounded =
+            self.outside.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
+        let bound = if is_bounded { self.start + self.side * self.outside } else { self.side * f64::INFINITY };
         Ok(BoundOutcome::Found(self.side_of(bound)))
     }
 
@@ -215,38 +216,38 @@ impl BoundSearch {
         let (mut rise, mut following, mut near) = (f64::INFINITY, f64::INFINITY, false);
         if let Some(refit_result) = &refit_result {
             rise = around.rise(i, 2.0 * refit_result.cost);
-            self.points.push((self.start + self.side * self.way + around.shift[i], rise * rise));
+            self.points.push((self.start + self.side * self.distance + around.shift[i], rise * rise));
             let slope =
                 if rise > 0.0 { self.side * around.slope(refit_result, i) / (around.units[i] * rise) } else { 0.0 };
             if slope > 0.0 {
-                following = self.way + (width - rise) / slope;
+                following = self.distance + (width - rise) / slope;
             }
             near = (rise / width - 1.0).abs() <= RISE_TOLERANCE;
-            let short = (following - self.way).abs() <= BOUND_TOLERANCE * self.way;
+            let short = (following - self.distance).abs() <= BOUND_TOLERANCE * self.distance;
             if near && short && self.inside < following && following <= self.farthest {
                 return Some(following);
             }
         }
         match refit_result {
             Some(refit_result) if rise <= width => {
-                (self.inside, self.within) = (self.way, refit_result);
-                if self.way >= self.outside {
+                (self.inside, self.within) = (self.distance, refit_result);
+                if self.distance >= self.outside {
                     // The earlier refit at the outer point did not find the optimum.
                     self.outside = f64::INFINITY;
                 }
-                if self.way >= self.farthest {
-                    self.way = f64::NAN;
+                if self.distance >= self.farthest {
+                    self.distance = f64::NAN;
                     return None;
                 }
             }
             _ => {
-                if self.way >= self.outside {
+                if self.distance >= self.outside {
                     // Small steps confirm that the outer point is outside: the profile jumps here, or the simulation
                     // diverges.
-                    self.way = f64::NAN;
+                    self.distance = f64::NAN;
                     return None;
                 }
-                self.outside = self.way;
+                self.outside = self.distance;
             }
         }
         let (inside, outside) = (self.inside, self.outside);
@@ -255,34 +256,34 @@ impl BoundSearch {
         let narrow = closed && outside - inside <= BOUND_TOLERANCE * scale;
         if near && !narrow && inside < following && following < outside.min(self.farthest) {
             // Close to the bound, Newton's step is more accurate than a step of fixed ratio.
-            self.way = following;
+            self.distance = following;
         } else if !closed {
             let gain = rise - self.reached;
             self.reached = rise;
             let levels = gain <= LEVELING_RATIO * self.gained && rise + gain < (1.0 - LEVELING_MARGIN) * width;
-            if levels && self.way > MAX_STEP_FACTOR * self.first {
-                self.way = f64::NAN;
+            if levels && self.distance > MAX_STEP_FACTOR * self.first {
+                self.distance = f64::NAN;
                 return None;
             }
             self.gained = gain;
-            let longest = (MAX_STEP_FACTOR * self.way).min(self.farthest);
-            self.way = following.max(MIN_STEP_FACTOR * self.way).min(longest);
+            let longest = (MAX_STEP_FACTOR * self.distance).min(self.farthest);
+            self.distance = following.max(MIN_STEP_FACTOR * self.distance).min(longest);
         } else if narrow {
-            self.way = outside;
+            self.distance = outside;
         } else {
             let margin = BRACKET_MARGIN * (outside - inside);
             let within = inside < following && following < outside;
             let next = if within { following } else { self.bracket_midpoint() };
-            self.way = next.max(inside + margin).min(outside - margin);
+            self.distance = next.max(inside + margin).min(outside - margin);
         }
         None
     }
 
     /// Distance of the midpoint of the bracket from the optimum; a geometric mean if both values have the same sign.
     fn bracket_midpoint(&self) -> f64 {
-        let (near, far) = (self.start + self.side * self.inside, self.start + self.side * self.outside);
-        if near * far > 0.0 {
-            self.side * ((near * far).sqrt().copysign(near) - self.start)
+        let (inner, outer) = (self.start + self.side * self.inside, self.start + self.side * self.outside);
+        if inner * outer > 0.0 {
+            self.side * ((inner * outer).sqrt().copysign(inner) - self.start)
         } else {
             0.5 * (self.inside + self.outside)
         }

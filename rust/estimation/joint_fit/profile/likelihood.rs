@@ -79,7 +79,7 @@ pub struct ProfileLikelihood<'a> {
     /// Difference between the estimate, extrapolated to step 0, and the optimum on the grid, per parameter.
     pub shift: Vec<f64>,
     /// Inverse of the Gauss–Newton Hessian of the cost, row-major.
-    bread: Vec<f64>,
+    inverse_hessian: Vec<f64>,
     /// Standard errors of all free parameters.
     pub errors: Vec<f64>,
     /// Rise of the sum of squares at one standard error of each parameter.
@@ -122,16 +122,16 @@ impl<'a> ProfileLikelihood<'a> {
 
     fn at(free: &'a ParameterSet, grid: Objective<'a>, values: &[f64], evaluations: usize) -> Result<Self> {
         let best = minimize(free, &grid, values, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let bread = covariance_of_residuals(&best.jacobian, &[], 1.0)?;
+        let inverse_hessian = covariance_of_residuals(&best.jacobian, &[], 1.0)?;
         let (spread, size) = (covariance(&best, &grid)?, values.len());
         let diagonal = |of: &[f64]| (0..size).map(|i| of[i * size + i]).collect::<Vec<f64>>();
-        let (variances, curvatures) = (diagonal(&spread), diagonal(&bread));
+        let (variances, curvatures) = (diagonal(&spread), diagonal(&inverse_hessian));
         Ok(Self {
             free,
             grid,
             best,
             shift: vec![0.0; size],
-            bread,
+            inverse_hessian,
             errors: variances.iter().map(|v| v.sqrt()).collect(),
             units: variances.iter().zip(&curvatures).map(|(v, c)| v / c).collect(),
             on_grid: values.to_vec(),
@@ -148,10 +148,10 @@ impl<'a> ProfileLikelihood<'a> {
     }
 
     fn is_near(&self, values: &[f64]) -> bool {
-        let near = |((a, b), error): ((f64, &f64), &f64)| {
+        let is_close = |((a, b), error): ((f64, &f64), &f64)| {
             (a - b).abs() <= (MAX_OPTIMUM_SHIFT_ERRORS * error).max(MAX_OPTIMUM_SHIFT_RATIO * b.abs())
         };
-        self.values().into_iter().zip(values).zip(&self.errors).all(near)
+        self.values().into_iter().zip(values).zip(&self.errors).all(is_close)
     }
 
     /// Number of free parameters.
@@ -225,7 +225,7 @@ impl<'a> ProfileLikelihood<'a> {
         }
         let (size, values, mut worst) = (self.size(), self.values(), 0.0_f64);
         let (low, high) = self.bounds()[i];
-        let direction: Vec<f64> = (0..size).map(|j| self.bread[j * size + i]).collect();
+        let direction: Vec<f64> = (0..size).map(|j| self.inverse_hessian[j * size + i]).collect();
         for side in [-1.0, 1.0] {
             let end = values[i] + side * width * self.errors[i];
             if !(low <= end && end <= high) {
@@ -277,11 +277,11 @@ impl<'a> ProfileLikelihood<'a> {
     fn refit_starts(&self, i: usize, value: f64, near: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
         let (values, tangent) = (near.values(), tangent(near, i)?);
         let (orders, by) = (self.free.orders.len(), value - values[i]);
-        let still = vec![0.0; values.len()];
+        let no_change = vec![0.0; values.len()];
         let mut points =
-            vec![self.point_along(i, &values, &tangent, value)?, self.point_along(i, &values, &still, value)?];
-        let far = |(t, v): (&f64, &f64)| (t * by).abs() > POWER_LAW_MOVE_RATIO * v.abs();
-        if value * values[i] <= 0.0 || !tangent.iter().zip(&values).any(far) {
+            vec![self.point_along(i, &values, &tangent, value)?, self.point_along(i, &values, &no_change, value)?];
+        let is_strong = |(t, v): (&f64, &f64)| (t * by).abs() > POWER_LAW_MOVE_RATIO * v.abs();
+        if value * values[i] <= 0.0 || !tangent.iter().zip(&values).any(is_strong) {
             return Ok(points);
         }
         let power = |(t, v): (&f64, &f64)| {

@@ -102,9 +102,9 @@ pub fn profile_intervals(
         around = around.moved_to(&lower)?;
     }
     let units: Vec<f64> = around.units.iter().copied().filter(|unit| unit.is_finite()).collect();
-    let falls = !units.is_empty() && 2.0 * (cost - around.cost()) > MIN_COST_REDUCTION * median(units);
+    let is_lower = !units.is_empty() && 2.0 * (cost - around.cost()) > MIN_COST_REDUCTION * median(units);
     let mut result = ProfileResult { evaluations: spent, ..ProfileResult::default() };
-    if falls {
+    if is_lower {
         result.lower_optimum = Some(around.values());
         result.lower_on_finer_grid = around.is_lower_on_finer_grid()?;
     }
@@ -146,13 +146,13 @@ fn search_bounds(
     let total = searches.len();
     let mut bounds: Vec<(usize, Option<Interval>)> = searches.iter().map(|search| (search.parameter, None)).collect();
     let (workers, first_lower) = (pool(settings.threads.max(1))?, AtomicUsize::new(usize::MAX));
-    let mut took = vec![0; total];
+    let mut evaluations = vec![0; total];
     let mut lower = None;
     while bounds.iter().any(|(_, bound)| bound.is_none()) {
         let open = bounds.iter().filter(|(_, bound)| bound.is_none()).count();
         // Budgets are assigned in whole rounds, so that they do not depend on the number of threads.
         let share = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |most| {
-            most.saturating_sub(took.iter().sum()) / open
+            most.saturating_sub(evaluations.iter().sum()) / open
         });
         if share < MIN_BUDGET_PER_BOUND {
             break;
@@ -161,7 +161,7 @@ fn search_bounds(
         let mut outcomes: Vec<Option<BoundOutcome>> = (0..total).map(|_| None).collect();
         workers.in_place_scope(|scope| {
             for (k, search) in searches.iter_mut().enumerate().filter(|(k, _)| bounds[*k].1.is_none()) {
-                let (send, allowed, first_lower) = (send.clone(), took[k] + share, &first_lower);
+                let (send, allowed, first_lower) = (send.clone(), evaluations[k] + share, &first_lower);
                 scope.spawn(move |_| {
                     let bound = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
                     if matches!(bound, Ok(BoundOutcome::Lower(_))) {
@@ -184,7 +184,7 @@ fn search_bounds(
         })?;
         for (k, outcome) in outcomes.into_iter().enumerate() {
             let Some(outcome) = outcome else { continue };
-            took[k] = searches[k].evaluations();
+            evaluations[k] = searches[k].evaluations();
             match outcome {
                 BoundOutcome::Found(interval) => bounds[k].1 = Some(interval),
                 BoundOutcome::Paused => {}
@@ -198,5 +198,5 @@ fn search_bounds(
             break;
         }
     }
-    Ok(FoundBounds { bounds, lower, evaluations: took.iter().sum() })
+    Ok(FoundBounds { bounds, lower, evaluations: evaluations.iter().sum() })
 }
