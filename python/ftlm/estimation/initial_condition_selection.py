@@ -28,14 +28,12 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import JointFit
 from ftlm.findings import Finding, make_finding
-from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
+from ftlm.simulation.initial_conditions import START_SETTINGS, has_memory, rest_evidence
 from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
 
 #: Initial conditions that are tried together with an output level.
 INITIAL_CONDITIONS_WITH_LEVEL: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
-#: Offsets that are tried with nonzero initial conditions, if the first samples suggested rest.
-OFFSETS_IN_MOTION: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Minimum ratio of the mean of an output to its standard deviation that suggests a level.
 MIN_LEVEL_MEAN_RATIO = 3.0
 #: Minimum ratio of the RMS residual to the standard deviation of an output that suggests a level.
@@ -149,7 +147,7 @@ def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -
         return level
     test = fit_offset_test(fit) if sum(run.length for run in fit.task.runs) <= MAX_OFFSET_TEST_SAMPLES else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
-    if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
+    if offset_findings and not is_level_tried and fit.task.structure.initial == "auto" and not _has_quiet_samples(fit):
         level = _fit_with_level(fit, structure, fits, is_suggested=False)
         if level is not None:
             return level
@@ -191,7 +189,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
     residuals are not white but have no slow component, those of the new fit must be white.
     """
     joint, runs = fit.joint, fit.task.runs
-    automatic = structure.initial == "auto" and structure.offset in ("none", "constant") and structure.is_linear
+    automatic = structure.initial == "auto" and structure.is_linear
     if joint is None or not automatic or joint.initial != "rest":
         return None
     slow = has_colored_residuals(joint)
@@ -202,9 +200,13 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    offsets = OFFSETS_IN_MOTION if structure.offset == "none" and fits.may_add_offset else (structure.offset,)
-    for offset in offsets:
-        request = replace(structure, initial="caputo", offset=offset)
+    starts: list[tuple[Initial, Offset]] = [("caputo", structure.offset)]
+    if structure.offset == "none" and fits.may_add_offset:
+        starts.append(("caputo", "level"))
+        if not _has_quiet_samples(fit):
+            starts.insert(0, ("rest", "level"))
+    for initial, offset in starts:
+        request = replace(structure, initial=initial, offset=offset)
 
         def is_better(candidate: JointFit, *, most: float = least) -> bool:
             return fit_score(candidate, joint) < most
@@ -219,9 +221,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
             least, candidate = fit_score(other.joint, joint), (request, other)
     if candidate is None:
         return None
-    whole = fits.with_intervals(*candidate)
-    start_finding = make_finding("rest_rejected", run=", ".join(r.name for r in runs))
-    return replace(whole, findings=[*whole.findings, start_finding])
+    return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=True)
 
 
 def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, is_suggested: bool) -> Fit | None:
@@ -243,7 +243,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     for initial in INITIAL_CONDITIONS_WITH_LEVEL:
         request = replace(structure, initial=initial, offset="level")
         try:
-            fresh = is_suggested and candidate is None
+            # With integer orders, automatic guesses cost little and lead to the best optimum.
+            fresh = candidate is None and (is_suggested or not has_memory(structure))
             near = fit if candidate is None else candidate[1]
             level = fits.fit(request) if fresh else fits.refit(request, near, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
@@ -255,12 +256,24 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
             best, candidate, margin = level.joint, (request, level), 0.0
     if candidate is None:
         return None
-    whole = fits.with_intervals(*candidate)
-    was = "rested" if best.initial == "rest" else "moved"
-    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
-    # The saved model keeps the requested initial conditions, because other runs may start differently.
-    model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
-    return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
+    return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=False)
+
+
+def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bool) -> Fit:
+    """Return a fit under other initial conditions than those that the first samples suggested, with its findings.
+
+    Its model keeps the requested initial conditions, because other runs may start differently.
+    """
+    initial = None if fit.joint is None else fit.joint.initial
+    names = ", ".join(run.name for run in fit.task.runs)
+    findings = [*fit.findings]
+    if is_rest_rejected and initial != "rest":
+        findings.append(make_finding("rest_rejected", run=names))
+    if fit.task.structure.offset == "level" and structure.offset != "level":
+        was = "rested" if initial == "rest" else "moved"
+        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=was))
+    model = replace(fit.model, structure=replace(fit.model.structure, initial=structure.initial))
+    return replace(fit, model=model, findings=findings)
 
 
 def _suggests_level(fit: Fit) -> bool:
@@ -282,13 +295,19 @@ def _suggests_level(fit: Fit) -> bool:
 
 
 def _may_hide_level(fit: Fit) -> bool:
-    """Whether estimated initial conditions and colored residuals may keep the offset test from detecting a level."""
+    """Whether estimated initial conditions and residuals that are not white may hide a level from the offset test."""
     joint = fit.joint
     if joint is None or not _has_estimated_initial_conditions(fit):
         return False
     sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
     is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
-    return not is_negligible and has_colored_residuals(joint)
+    return not is_negligible and not has_white_residuals(joint)
+
+
+def _has_quiet_samples(fit: Fit) -> bool:
+    """Whether a run has samples before its inputs change, in which a level of the outputs would be visible."""
+    evidence = (rest_evidence(run, fit.task.structure) for run in fit.task.runs)
+    return any(item is not None and item.rows > 1 for item in evidence)
 
 
 def _has_estimated_initial_conditions(fit: Fit) -> bool:

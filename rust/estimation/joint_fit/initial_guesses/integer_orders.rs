@@ -75,10 +75,11 @@ type Pole = (f64, f64);
 struct Equation<'a> {
     model: FreeModel,
     experiments: &'a [Experiment],
-    /// Indices of the coefficients of the output derivatives, by ascending order of the derivative.
+    /// Index and known factor of the coefficient of each output derivative, by ascending order of the derivative. The
+    /// factor is −1 for a term such as −a y.
     ///
     /// The derivatives of lower order do not occur. Their number is `integrators`.
-    own: Vec<usize>,
+    own: Vec<(usize, f64)>,
     integrators: usize,
     stop: &'a Stop,
     /// Frequency \[rad/s\] below which half of the output power lies; median over the runs.
@@ -224,10 +225,6 @@ impl<'a> Equation<'a> {
         }
         let integrators = own.iter().position(Option::is_some).unwrap_or(order);
         let own: Vec<(usize, f64)> = own[integrators..].iter().copied().collect::<Option<_>>()?;
-        // An autoregressive coefficient must be the parameter itself.
-        if own.iter().any(|(_, factor)| *factor != 1.0) {
-            return None;
-        }
         let frequency = median(
             experiments
                 .iter()
@@ -237,7 +234,6 @@ impl<'a> Equation<'a> {
         );
         let step = experiments.iter().map(|e| e.record.step()).fold(f64::INFINITY, f64::min);
         let duration = experiments.iter().map(|e| e.record.step() * e.record.m() as f64).fold(0.0, f64::max);
-        let own = own.into_iter().map(|(j, _)| j).collect();
         (frequency > 0.0).then_some(Self { model, experiments, own, integrators, stop, frequency, step, duration })
     }
 
@@ -247,7 +243,7 @@ impl<'a> Equation<'a> {
 
     /// Indices of the free coefficients of the equation: those of the denominator, then the linear ones.
     fn coefficients(&self) -> Vec<usize> {
-        self.own.iter().copied().chain(self.model.linear_coefficients()).collect()
+        self.own.iter().map(|own| own.0).chain(self.model.linear_coefficients()).collect()
     }
 
     /// Return the same equation at a lower order, without the input terms that exceed this order.
@@ -415,7 +411,7 @@ impl<'a> Equation<'a> {
 
     /// Coefficients of s^0, …, s^(n − 1) of the monic denominator of degree n.
     fn divisor(&self, point: &ParameterPoint) -> Vec<f64> {
-        let own = self.own.iter().map(|&j| -point.coefficients[j]);
+        let own = self.own.iter().map(|&(j, factor)| -factor * point.coefficients[j]);
         std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
     }
 
@@ -433,8 +429,8 @@ impl<'a> Equation<'a> {
 
     fn at_poles(&self, point: &ParameterPoint, poles: &[Pole]) -> ParameterPoint {
         let mut mirrored = point.clone();
-        for (&j, c) in self.own.iter().zip(polynomial(poles)) {
-            mirrored.coefficients[j] = -c;
+        for (&(j, factor), c) in self.own.iter().zip(polynomial(poles)) {
+            mirrored.coefficients[j] = -c / factor;
         }
         mirrored
     }
@@ -495,8 +491,9 @@ impl<'a> Equation<'a> {
             let Some(output) = respond(Some(&measured_input(experiment))) else { return Ok(None) };
             let mut target = companion.derivative(&output, n);
             let mut columns = vec![vec![0.0; count]; self.own.len() + linear.len()];
-            for (place, column) in columns.iter_mut().enumerate().take(self.own.len()) {
-                *column = companion.derivative(&output, self.integrators + place);
+            for (place, (column, (_, factor))) in columns.iter_mut().zip(&self.own).enumerate() {
+                let derivative = companion.derivative(&output, self.integrators + place);
+                *column = derivative.iter().map(|v| factor * v).collect();
             }
             for (signal, nu, monomial) in equation.terms.iter().filter(|(signal, ..)| *signal != equation.output) {
                 let input = source_input(&self.model, experiment, *signal, start)?;
@@ -535,7 +532,7 @@ impl<'a> Equation<'a> {
             .collect();
         let Ok(solution) = solve_linear_steps(&sides) else { return Ok(None) };
         let mut point = start.clone();
-        for (&j, value) in self.own.iter().chain(&linear).zip(&solution) {
+        for (j, value) in self.coefficients().into_iter().zip(&solution) {
             point.coefficients[j] = *value;
         }
         Ok(Some(point))
@@ -549,7 +546,7 @@ impl<'a> Equation<'a> {
             let (mut share, mut next) = (1.0, None);
             for _ in 0..MAX_HALVINGS {
                 let mut point = iterate.point.clone();
-                for (&j, by) in self.own.iter().zip(&step) {
+                for (&(j, _), by) in self.own.iter().zip(&step) {
                     point.coefficients[j] += share * by;
                 }
                 next = self.evaluate(&self.stabilize(&point))?.filter(|trial| cost(trial) < cost(&iterate));
@@ -576,7 +573,7 @@ impl<'a> Equation<'a> {
         let linear = self.model.linear_coefficients();
         let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, evaluation) else { return Ok(None) };
         let orders = evaluation.point.orders.len();
-        let places: Vec<usize> = self.own.iter().chain(&linear).map(|j| orders + j).collect();
+        let places: Vec<usize> = self.coefficients().iter().map(|j| orders + j).collect();
         let own: Vec<f64> = self.divisor(&evaluation.point).iter().map(|c| -c).collect();
         let mut regressors: Vec<Vec<f64>> = vec![Vec::new(); self.own.len()];
         let mut companions = Vec::new();
@@ -586,9 +583,10 @@ impl<'a> Equation<'a> {
             let Some(output) = companion.respond(Some(&measured_input(experiment)), None, grid) else {
                 return Ok(None);
             };
-            for (place, column) in regressors.iter_mut().enumerate() {
+            for (place, (column, (_, factor))) in regressors.iter_mut().zip(&self.own).enumerate() {
                 let part = companion.derivative(&output, self.integrators + place);
-                let mut part: Vec<f64> = part.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
+                let mut part: Vec<f64> =
+                    part.iter().zip(experiment.weights_of(0)).map(|(v, w)| factor * v * w).collect();
                 project_out(basis, &mut part);
                 column.extend(part);
             }
@@ -727,8 +725,8 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
         let product = self.factors(&point[..count]).iter().fold(vec![1.0], |a, (section, _)| multiply(&a, section));
         let mut at = self.base.clone();
         at.inputs = point[count..].to_vec();
-        for (&j, c) in equation.own.iter().zip(&product) {
-            at.coefficients[j] = -c;
+        for (&(j, factor), c) in equation.own.iter().zip(&product) {
+            at.coefficients[j] = -c / factor;
         }
         self.exact.evaluate(&equation.model, equation.experiments, &at, &self.linear)
     }
@@ -756,8 +754,8 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
             let others = others.fold(vec![1.0], |a, (_, (section, _))| multiply(&a, section));
             for slope in slopes {
                 let mut column = vec![0.0; evaluation.residuals.len()];
-                for (&j, by) in equation.own.iter().zip(multiply(&others, slope)) {
-                    column.iter_mut().zip(&of[orders + j]).for_each(|(v, d)| *v -= by * d);
+                for (&(j, factor), by) in equation.own.iter().zip(multiply(&others, slope)) {
+                    column.iter_mut().zip(&of[orders + j]).for_each(|(v, d)| *v -= by / factor * d);
                 }
                 columns.push(column);
             }
