@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -130,8 +131,47 @@ def test_models_of_integer_orders_become_exact_transfer_functions_and_come_back(
         assert states.nstates == order
         assert states.delay == delay
         np.testing.assert_allclose(np.reshape(states(1j * w), (1, 2, -1)) * late, one.frequency_response(w), rtol=1e-9)
-        back = ftlm.Model.from_control(system)
-        np.testing.assert_allclose(back.frequency_response(w), np.reshape(system(1j * w), (1, 2, -1)), rtol=1e-9)
+        for made in (system, states):
+            back = ftlm.Model.from_control(made)
+            assert back.structure.delay == delay
+            np.testing.assert_allclose(back.frequency_response(w), one.frequency_response(w), rtol=1e-8)
+        renamed = ftlm.Model.from_control(system, inputs=["force", "torque"])
+        assert renamed.structure.delay == {{"u": "force"}[name]: seconds for name, seconds in delay.items()}
+
+
+def test_delays_of_a_system_that_are_not_by_input_are_refused():
+    system = control.tf([1], [1, 1])
+    for delay in (0.2, {"v": 0.2}):
+        system.delay = delay
+        with pytest.raises(ftlm.ModelError, match=r"attribute delay of the system is .*each of the inputs u\[0\]"):
+            ftlm.Model.from_control(system)
+    system.delay = {"u[0]": 0.2}
+    assert ftlm.Model.from_control(system).structure.delay == {"u": 0.2}
+
+
+def test_warnings_of_a_conversion_name_the_cause_and_show_the_line_of_the_caller():
+    late = ftlm.transfer_function([1], [1, 1], 0.2)
+    calls = {
+        r"delay of u, 0\.2 s, is left out above 28\.5 rad/s": lambda: late.to_control(band=(0.1, 100)),
+        "fractional orders have 3 poles each": lambda: model(ONE).to_control(band=(1e-4, 1e4), order=1),
+        "the delay of u, 0.2 s, is not in the system": late.to_tf,
+    }
+    for words, call in calls.items():
+        with pytest.warns(UserWarning, match=words) as caught:
+            call()
+        assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        late.to_control(band=(0.1, 28))
+
+
+def test_a_band_is_needed_for_an_approximation_only():
+    w = np.geomspace(0.01, 100, 30)
+    exact = ftlm.transfer_function([1, 2], [1, 0.3, 4])
+    np.testing.assert_allclose(exact.to_control()(1j * w), exact.frequency_response(w)[0, 0], rtol=1e-12)
+    for one, reason in ((ftlm.transfer_function([1], [1, 1], 0.2), "the delay of u"), (model(ONE), "order")):
+        with pytest.raises(ftlm.ModelError, match=rf"{reason}.*approximated within a frequency band; .*band="):
+            one.to_control()
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 0.04, 0.27])

@@ -1,5 +1,6 @@
 """Tests that load() reads what measurement programs write, and refuses hostile, damaged and doubtful files."""
 
+import functools
 import gzip
 import json
 import math
@@ -18,6 +19,7 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import ftlm
 from ftlm.data.run import Run
 from ftlm.errors import DataError
 from ftlm.io import isolated_reader as apart
@@ -120,7 +122,7 @@ def test_times_units_and_slices(tmp_path):
     path = write(tmp_path, "t,u,y\n" + rows(100))
     run = load(path, **HEADED, units={"y": "deg"}, window=(0.2, 0.5), intersample={"u": "foh"}, name="part")
     assert (run.start, run.length, run.name, run.units["y"], run.intersample["u"]) == (0.2, 30, "part", "rad", "foh")
-    assert load(path, **HEADED, step=2.0).step == 2.0
+    assert load(path, **HEADED, step=0.01).step == 0.01
     assert load(path, **HEADED, time_unit="ms").step == 1e-5
     assert load(path, **HEADED, resample=0.02).length == 50
     assert load(str(path), outputs="y").inputs == ()
@@ -341,18 +343,46 @@ I = "foh"
 """
 
 
+def test_a_step_that_contradicts_the_time_column_is_refused(tmp_path):
+    def reads(text, seconds, **options):
+        return load(write(tmp_path, text), inputs=["u"], outputs=["y"], step=seconds, **options).step
+
+    plain = rows(100)
+    for header, factor in (("t,u,y", 1.0), ("time [ms],u,y", 1e-3), ("clock,u,y", 1.0)):
+        text, columns = f"{header}\n{plain}", {"time": header.split(",")[0]}
+        own = 0.01 * factor
+        assert reads(text, own, columns=columns) == own
+        assert reads(text, 1.01 * own, columns=columns) == 1.01 * own
+        for wrong in (1.1 * own, 2 * own, 0.5 * own):
+            for given_columns in (columns, {}) if header[0] == "t" else (columns,):
+                call = functools.partial(reads, text, wrong, columns=given_columns)
+                messages([f"step={wrong!r}", f"{own:g} s", "omit"], call)
+    # A column of any other name, a unit that is unknown, and times that do not increase are no time axis.
+    assert reads(f"clock,u,y\n{plain}", 3.0) == reads(f"time [ticks],u,y\n{plain}", 3.0) == 3.0
+    assert reads("t,u,y\n" + "0,1,2\n" * 9, 3.0) == 3.0
+    dated = "when,u,y\n" + "".join(f"2024-05-01 12:00:{s:02},{s % 3},{s}\n" for s in range(20))
+    assert reads(dated, 1.0) == 1.0
+    messages(["step=2.0", "'when'", "1 s"], lambda: reads(dated, 2.0))
+    path = write(tmp_path, f"t,u,y\n{plain}")
+    opened = ftlm.open_file(path, step=0.01)
+    assert [c.role for c in opened.columns] == ["time", "input", "output"]
+    assert opened.problem == ""
+    assert opened.load().step == 0.01
+    assert "0.01 s" in ftlm.open_file(path, step=0.02).problem
+
+
 def test_columns_file(tmp_path):
     lines = [f"{line},{line.split(',')[2]}\n" for line in rows().splitlines()]
     path, toml = write(tmp_path, "t,u,y,v\n" + "".join(lines)), write(tmp_path, TOML, "arm.toml")
     run = load(path, columns=toml)
     assert (run.signals, run.units, run.intersample) == (("I", "theta"), {"I": "", "theta": "rad"}, {"I": "foh"})
-    assert load(path, columns=toml, step=5.0, intersample={"I": "zoh"}).step == 5.0
+    assert load(path, columns=toml, step=0.01, intersample={"I": "zoh"}).step == 0.01
     more = load(path, columns=toml, inputs={"I": "v", "w": "u"}, units={"theta": "mrad", "w": "A"})
     assert more.inputs == ("I", "w")
     np.testing.assert_array_equal(more["I"], 0.1 * np.arange(12))
     assert more["theta"][10] == pytest.approx(1e-3)
     as_dict = {"step": 0.5, "outputs": {"theta": "y"}}
-    assert load(path, columns=as_dict).step == 0.5
+    messages(["step=0.5", "column 't'", "0.01 s", "omit step="], lambda: load(path, columns=as_dict))
     assert load(path, columns=as_dict, time="t").step == 0.01
     for content in ("time = ", b"\xff\xfe", "a = [" * 50_000):
         messages(["bad.toml", "not a TOML file"], lambda c=content: load(path, columns=write(tmp_path, c, "bad.toml")))

@@ -76,7 +76,10 @@ def test_an_index_is_the_time_where_it_says_so():
     run = ftlm.Run.from_frame(frame(pd.Index(np.arange(N) * 500.0, name="time [ms]")), **ROLES)
     assert run.step == 0.5
     assert "time read in ms, as the header 'time [ms]' says" in run.warnings
-    assert ftlm.Run.from_frame(frame(STAMPS), step=2.0, **ROLES).step == 2.0
+    for index in (STAMPS, STAMPS - STAMPS[0], pd.Index(np.arange(N) * 500.0, name="time [ms]")):
+        assert ftlm.Run.from_frame(frame(index), step=0.5, **ROLES).step == 0.5
+        with pytest.raises(ftlm.DataError, match=r"step=2.0, but time \(the index.* 0.5 s"):
+            ftlm.Run.from_frame(frame(index), step=2.0, **ROLES)
     named = frame(pd.Index(np.arange(N) * 0.5, name="clock"))
     assert ftlm.Run.from_frame(named, time="clock", **ROLES).step == 0.5
     for index in (None, pd.Index(np.arange(N) * 0.5), named.index, pd.MultiIndex.from_arrays([U, Y])):

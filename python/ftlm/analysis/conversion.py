@@ -6,7 +6,6 @@ import importlib
 import json
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -28,7 +27,7 @@ from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
-from ftlm.utils.arguments import check_arguments
+from ftlm.utils.arguments import check_arguments, warn_caller
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats
@@ -304,11 +303,9 @@ def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
     """Return a system with an attribute `delay`, and warn about each delay that is not 0."""
     system.delay = {name: seconds for name, seconds in delay.items() if seconds}
     for name, seconds in system.delay.items():
-        warnings.warn(
+        warn_caller(
             f"the delay of {name}, {seconds:g} s, is not in the system; it is in its attribute delay, to_ss with "
-            f"{parameter('step')} includes it, and to_control with {parameter('band')} approximates it",
-            UserWarning,
-            stacklevel=4,
+            f"{parameter('step')} includes it, and to_control with {parameter('band')} approximates it"
         )
     return system
 
@@ -427,7 +424,27 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
             f"{parameter('outputs')} with other names"
         )
     rows = zip(results, parts, strict=True)
-    return equation("\n".join(_equation_text(name, signals, *part) for name, part in rows), coupling="measured")
+    return equation(
+        "\n".join(_equation_text(name, signals, *part) for name, part in rows),
+        coupling="measured",
+        delay=_input_delays(system, signals),
+    )
+
+
+def _input_delays(system: Any, signals: Sequence[str]) -> dict[str, float]:
+    """Return the delays [s] in the attribute `delay` of a system, which :func:`to_tf` and :func:`to_ss` set.
+
+    The attribute has the delay by input label; `signals` are the names of the inputs in the model. Raise ModelError for
+    an attribute of another form.
+    """
+    delays = getattr(system, "delay", None) or {}
+    labels = list(getattr(system, "input_labels", None) or signals)
+    if not isinstance(delays, Mapping) or not set(delays) <= set(labels):
+        raise ModelError(
+            f"the attribute delay of the system is {delays!r}; give a dict with the delay [s] of each of the inputs "
+            f"{', '.join(labels)}"
+        )
+    return {name: float(delays[label]) for label, name in zip(labels, signals, strict=True) if delays.get(label)}
 
 
 def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -17,7 +16,8 @@ from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
-from ftlm.utils.arguments import check_arguments
+from ftlm.utils.arguments import check_arguments, warn_caller
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats, as_floats, check_integer, check_vector, frequency_pair
 
@@ -33,6 +33,8 @@ ORIGIN_POLE_RATIO = 1e-3
 MAX_APPROXIMATION_ORDER = 50
 #: Order of the Padé approximation of a delay.
 PADE_ORDER = 4
+#: Phase of a delay [rad] up to which its Padé approximation of order 4 is within 5 degrees.
+PADE_ACCURATE_ANGLE = 5.7
 
 
 def identifier(name: str) -> str:
@@ -313,8 +315,14 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     if not (worst_gain <= MAX_GAIN_ERROR_DB and worst_phase <= MAX_PHASE_ERROR_DEGREES):
         words.append(
             f"from {low:g} to {high:g} rad/s the error of the approximation is up to {worst_gain:.2g} dB "
-            f"and {worst_phase:.2g} degrees, so smaller gain and phase margins are meaningless; raise order, or "
-            "change the band"
+            f"and {worst_phase:.2g} degrees, so smaller gain and phase margins are meaningless; "
+            + _error_cause(model, system)
+        )
+    sensor = model.structure.sensor_filter
+    if sensor is not None:
+        words.append(
+            f"the sensor filter of {', '.join(sensor.signals)} is not in the system; multiply its transfer function by "
+            "that of the filter"
         )
     if stability(model).unstable_poles != np.sum(roots.real > ORIGIN_POLE_RATIO * low):
         words.append(
@@ -324,14 +332,47 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
+def _error_cause(model: Model, system: Approximation) -> str:
+    """Return text on the cause of large errors of an approximation, with the remedy."""
+    late = {name: delay for name, delay in model.structure.delay.items() if delay}
+    if late and system.band[1] * max(late.values()) > PADE_ACCURATE_ANGLE:
+        name = max(late, key=lambda n: late[n])
+        return (
+            f"the delay of {name}, {late[name]:g} s, is left out above {PADE_ACCURATE_ANGLE / late[name]:.3g} rad/s, "
+            f"where its Padé approximation of order {PADE_ORDER} ends; lower the upper end of the band, or use "
+            "frequency_response, which is exact"
+        )
+    return (
+        f"the fractional orders have {2 * system.order + 1} poles each, which is too few for the band; raise order, or "
+        "narrow the band"
+    )
+
+
+def _exact_band(model: Model) -> tuple[float, float]:
+    """Return a frequency band [rad/s] for a system that needs no approximation; raise ModelError for other models."""
+    orders = (o.constant for e in model.equations for o in (e.order, *(t.order for t in e.terms)))
+    fractional = next((order for order in orders if not order.is_integer()), None)
+    late = next((name for name, delay in model.structure.delay.items() if delay), None)
+    if fractional is not None or late is not None:
+        reason = f"order {fractional:g}" if fractional is not None else f"the delay of {late}"
+        raise ModelError(
+            f"{reason} is approximated within a frequency band; give the band in rad/s, as in "
+            f"{parameter('band', (0.1, 100))}"
+        )
+    return 1.0, 1.0 + 1e-9
+
+
 @check_arguments
-def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> Any:
+def to_control(model: Model, *, band: tuple[float, float] | None = None, order: int = 5) -> Any:
     """Return a python-control system that approximates a model within a frequency band.
 
     Parameters
     ----------
-    model, band, order
+    model, order
         See :func:`approximate`.
+    band
+        Frequency band (low, high) of the approximation [rad/s]. It may be omitted if no order is fractional and no
+        input has a delay, because the system is then exact.
 
     Returns
     -------
@@ -342,17 +383,20 @@ def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> An
     Warns
     -----
     UserWarning
-        If the errors are too large for stability margins to be computed from the approximation.
+        If the errors are too large for stability margins to be computed from the approximation, or the model has a
+        sensor filter, which is not part of the system.
 
     Raises
     ------
     ModelError
-        If python-control is not installed; see also :func:`approximate`.
+        If python-control is not installed, or the band is missing; see also :func:`approximate`.
     """
     control = python_control()
+    if band is None:
+        band = _exact_band(model)
     near = approximate(model, band=band, order=order)
     for words in near.warnings:
-        warnings.warn(words, UserWarning, stacklevel=2)
+        warn_caller(words)
     system = control.ss(
         near.a,
         near.b,

@@ -18,8 +18,8 @@ import numpy as np
 
 from ftlm.data.construction import RunArguments
 from ftlm.data.run import Run
-from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
-from ftlm.data.units import is_time_name, parse_unit, time_unit_of
+from ftlm.data.sampling import as_seconds, as_vector, check_step_agrees, missing_mask, uniform_times
+from ftlm.data.units import TIME_UNITS, is_time_name, parse_unit, split_time_header, time_unit_of
 from ftlm.errors import DataError
 from ftlm.utils.files import check_new, write_atomically
 from ftlm.utils.resources import optional_module
@@ -57,9 +57,12 @@ def arguments_from_frame(
     label, clock = "time" if time is None else f"time (column {time!r})", None
     if time is not None:
         clock = pick(time, "time")
-    elif step is None and index is not None and _is_time_index(*index):
-        time, clock = index
-        label = "time (the index)" if time is None else f"time (the index {time!r})"
+    elif index is not None and _is_time_index(*index):
+        name = "time (the index)" if index[0] is None else f"time (the index {index[0]!r})"
+        if step is None:
+            label, (time, clock) = name, index
+        else:
+            _check_index_step(step, name, index)
     columns_by_role = [
         names_to_columns(argument, names) for argument, names in (("inputs", inputs), ("outputs", outputs))
     ]
@@ -83,6 +86,15 @@ def arguments_from_frame(
         time_label=label,
         **more,
     )
+
+
+def _check_index_step(step: float, label: str, index: tuple[Hashable, object]) -> None:
+    """Raise DataError if a given step [s] contradicts the index of a frame, which is a time."""
+    dated, unit = as_seconds(index[1], label), split_time_header(str(index[0]))[1] or "s"
+    if dated is not None:
+        check_step_agrees(step, dated[0], label)
+    elif unit in TIME_UNITS:
+        check_step_agrees(step, as_vector(index[1], label, gaps=True)[0] * TIME_UNITS[unit], label)
 
 
 def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:

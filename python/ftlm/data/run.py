@@ -225,7 +225,7 @@ class Run:
             Time column, or the name of the frame's index. Default without `step`: the index (for a dataset its only
             dimension) if it contains dates or is called t, time or seconds.
         step : float, optional
-            Time between rows [s], > 0.
+            Time between rows [s], > 0. An index that is the time and has another step raises DataError.
         inputs, outputs : mapping of str to column, or list of str
             Column of each signal; a list contains the names of columns that are also the names of the signals.
         units

@@ -312,6 +312,23 @@ def regular_step(
     return _short_decimal(mean, count, 4.0 * resolution, 2.0 * worst), fact
 
 
+def check_step_agrees(step: object, clock: Floats, thing: str) -> None:
+    """Raise DataError if a given step [s] contradicts the sample times [s] of the same rows.
+
+    The step agrees if it differs by at most 2 % from the mean or the median interval. Times that do not increase are no
+    time axis and are not compared.
+    """
+    seconds, steps = check_step(step, "step"), np.diff(clock[np.isfinite(clock)])
+    if not steps.size or not np.all(steps > 0):
+        return
+    intervals = float(np.mean(steps)), float(np.median(steps))
+    if min(abs(interval / seconds - 1.0) for interval in intervals) > _MAX_JITTER_SHARE:
+        raise DataError(
+            f"{parameter('step', step)}, but {thing} has a step of {intervals[1]:.6g} s; omit {parameter('step')}, "
+            f"with {parameter('time_unit')} if the times have another unit, or rename the column if it is not the time"
+        )
+
+
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
     """Return the decimal with the fewest digits that agrees with the mean step, or the mean step if there is none.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -14,11 +14,11 @@ import msgspec
 from ftlm.data.construction import RunArguments
 from ftlm.data.export import Header
 from ftlm.data.run import Run
-from ftlm.data.sampling import MissingPolicy, check_missing_policy
-from ftlm.data.units import split_time_header, time_unit_of
+from ftlm.data.sampling import MissingPolicy, check_missing_policy, check_step_agrees
+from ftlm.data.units import TIME_UNITS, split_time_header, time_unit_of
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import split_unit
-from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles
+from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles, has_numbers
 from ftlm.io.delimited_text import read_text
 from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Assumption, Layout
 from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
@@ -99,7 +99,7 @@ def load(
     intersample : mapping of str to {"zoh", "foh"}, optional
         Intersample behavior of an input; default ``"zoh"``.
     step : float, optional
-        Time between rows [s], > 0, in place of `time`.
+        Time between rows [s], > 0, of files without a time column. A time column whose step differs raises an error.
     window : pair of float or None, optional
         Times (a, b) [s] since the first row: only rows with a ≤ t < b are used.
     resample : float, optional
@@ -266,6 +266,14 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
                 f"{parameter('time_unit', unit_option)} is the unit of {parameter('time')}, which is not used; "
                 f"{parameter('step')} is in s"
             )
+        unused = unused_time(selection, pool, {column.name for column in columns})
+        if unused is not None:
+            label = f"{unused.source.name}: column {unused.name!r} (time)"
+            unit = split_time_header(time_header(unused))[1] or "s"
+            if unused.timestamps is not None:
+                check_step_agrees(selection.step, unused.timestamps.seconds(label, selection.layout.dates), label)
+            elif unit in TIME_UNITS:
+                check_step_agrees(selection.step, unused.numbers(blank=True) * TIME_UNITS[unit], label)
         return _TimeColumn()
     matrices = [column.matrix for column in columns if column.matrix is not None]
     column, assumed = pool.time(selection.time, matrices, {column.name for column in columns})
@@ -291,10 +299,26 @@ def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | Non
     if selection.inputs or selection.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
-    clock = None
+    clock = unused_time(selection, pool, set())
     if selection.step is None:
         clock, _ = pool.time(selection.time, matrices if len(matrices) == 1 else [], set())
     return assume_roles(selection, [c for c in pool.columns if c is not clock], signals)
+
+
+def unused_time(selection: ColumnSelection, pool: Pool, signals: Collection[str]) -> Column | None:
+    """Return the time column beside a given step; None without a step, or if no column is a time by its name or unit.
+
+    `signals` are the names of the columns that are used as signals.
+    """
+    if selection.step is None:
+        return None
+    try:
+        column, _ = pool.time(selection.time, (), signals)
+    except DataError:
+        if selection.time is not None:
+            raise
+        return None
+    return column if has_numbers(column) or column.timestamps is not None else None
 
 
 def base_name(path: Path) -> str:
@@ -428,10 +452,11 @@ def select_columns(
     specification = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError(f"{parameter('time')} and {parameter('step')}: both are given; pass one of them")
-    if time is None and step is None:
-        time, step = specification.get("time"), specification.get("step")
-        if time is not None and step is not None:
-            raise DataError(f"{parameter('columns')}: both time and step are given; keep one of them")
+    if specification.get("time") is not None and specification.get("step") is not None:
+        raise DataError(f"{parameter('columns')}: both time and step are given; keep one of them")
+    if time is None:
+        # A time column in the columns file is compared with a given step.
+        time, step = specification.get("time"), specification.get("step") if step is None else step
     return ColumnSelection(
         time,
         cast("float | None", step),

@@ -28,6 +28,7 @@ from ftlm.io.load import (
     run_from_tables,
     select_columns,
     time_header,
+    unused_time,
 )
 from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
@@ -276,7 +277,7 @@ class _FilePreview:
         table, selection = self.table, self.selection
         every = self.pool.columns
         clock, assumed, problem = self._time(every)
-        of_clock = () if clock is None else self._time_assumptions(clock)
+        of_clock = () if clock is None or selection.step is not None else self._time_assumptions(clock)
         roles, role_assumptions, open_roles = self._roles(every, clock)
         assumed = (*table.assumed, *assumed, *of_clock, *role_assumptions)
         step, notes = None, tuple[str, ...]()
@@ -306,9 +307,9 @@ class _FilePreview:
         selection, header = self.selection, self.table.header
         if header is not None and selection.time is None and selection.step is None:
             selection.time = CSV_TIME
-        if selection.step is not None:
-            return None, (), ""
         signals = self._named_signals()
+        if selection.step is not None:
+            return unused_time(selection, self.pool, signals), (), ""
         if header is None and selection.time is None and not signals and is_response(self.pool):
             path = shlex.quote(os.fspath(self.table.path))
             command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
@@ -381,7 +382,7 @@ class _FilePreview:
         """Return the arguments of :func:`ftlm.load` that give the same run without assumptions."""
         selection = self.selection
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
-        if clock is not None and self.table.header is None:
+        if clock is not None and selection.step is None and self.table.header is None:
             options["time"] = clock.name
         more = {key: getattr(self.asked, key) for key in ("window", "resample", "time_unit", "missing")}
         options |= {key: value for key, value in more.items() if value is not None}

@@ -344,7 +344,8 @@ class Model:
         ----------
         system
             ``control.StateSpace`` or ``control.TransferFunction``. The equations represent its transfer functions.
-            Uncontrollable or unobservable parts are removed only if they cancel exactly.
+            Uncontrollable or unobservable parts are removed only if they cancel exactly. The attribute ``delay`` of
+            the system, which :meth:`to_tf` and :meth:`to_ss` set, has the delays of the inputs [s].
         inputs, outputs
             Names of the signals. The default is the names in the system, where ``u[0]`` becomes ``u``, or ``u0`` if
             there are several signals.
@@ -353,14 +354,15 @@ class Model:
         ------
         ModelError
             If the system is discrete-time or of another type, an output has no poles or no input, a transfer function
-            has more zeros than poles, an order is above 10, or names are invalid or of a wrong number.
+            has more zeros than poles, an order is above 10, names are invalid or of a wrong number, or ``delay`` is not
+            a mapping of inputs to numbers.
         """
         from ftlm.analysis.conversion import structure_of
 
         return cls(structure_of(system, inputs, outputs))
 
     @check_arguments
-    def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
+    def to_control(self, *, band: tuple[float, float] | None = None, order: int = 5) -> Any:
         """Return a python-control system by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
         from ftlm.analysis.rational_approximation import to_control
 

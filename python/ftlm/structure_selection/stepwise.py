@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import math
 import time
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -34,6 +33,7 @@ from ftlm.structure_selection.cross_validation import (
     validate_fit,
     validation_score_bound,
 )
+from ftlm.utils.arguments import warn_caller
 from ftlm.utils.resources import interruptible_pool
 
 #: Options of the prescreening: number of samples of the subsampled records, maximum number of evaluations of an
@@ -512,12 +512,10 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
         work.trials += work.map_candidates(one, items[: work.threads])
         took = work.clock() - start_time
         rest = len(items) - work.threads
-        warnings.warn(
+        warn_caller(
             f"{len(items)} candidates: the first {work.threads} took {format_duration(took)}, so the other {rest} "
             f"take about {format_duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C stops the "
-            "selection, and one structure with a stepwise search of its terms needs far fewer fits",
-            UserWarning,
-            stacklevel=3,
+            "selection, and one structure with a stepwise search of its terms needs far fewer fits"
         )
         items = items[work.threads :]
     work.trials += work.map_candidates(one, items)

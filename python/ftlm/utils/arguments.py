@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import types
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -86,6 +87,14 @@ def check_arguments(decorated: Decorated) -> Decorated:
             raise
 
     return cast("Decorated", call_function)
+
+
+def warn_caller(message: str) -> None:
+    """Issue a UserWarning that shows the line of the user's code which called ftlm."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "ftlm":
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, UserWarning, stacklevel=level)
 
 
 def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
