@@ -53,6 +53,22 @@ def same(first, second):
         ("y = K/(0.5 s + 1) u", "D y = -2 y + 2 K u"),
         ("y/u = 1/(s^2 + 2 s + 1)", "D^2 y = -2 D y - y + u"),
         ("y(s) = 1/(s + 1)^2 u(s)", "D^2 y = -2 D y - y + u"),
+        ("Y(s) = 2 U(s)/(s + 1)", "D Y = -Y + 2 U"),
+        ("y = u(s)/(s + 1) - 3 v(s) s/(s + 2)", "D^2 y = -3 D y - 2 y + D u + 2 u - 3 D^2 v - 3 D v"),
+        ("y = 1/(1 + s/4) u", "D y = -4 y + 4 u"),
+        ("y = 1/(s/4 + 1)^2 u", "D^2 y = -8 D y - 16 y + 16 u"),
+        ("y = 9/(s^2 + 2*0.5*3*s + 3^2) u", "D^2 y = -3 D y - 9 y + 9 u"),
+        ("y''(t) + 2 y'(t) + y(t) = u(t)", "D^2 y = -2 D y - 1 y + u"),
+        ("dy(t)/dt = -y(t) + u(t)", "D y = -y + u"),
+        ("d^2 y(t)/dt^2 = -y(t) + u(t)", "D^2 y = -y + u"),
+        ("d^0.5 y/dt^0.5 = -a y + b u", "D^0.5 y = -a y + b u"),
+        ("d^alpha y(t)/dt^alpha = -a d^0.5 y/dt^0.5 + b u", "D^alpha y = -a D^0.5 y + b u"),
+        ("y'' = u - fc*sign(y')", "D^2 y = u - fc*sign(D y)"),
+        ("y'' = u - fc sign(dy/dt)", "D^2 y = u - fc*sign(D y)"),
+        (
+            "y'' = u - fc sign(y'(t)) - fs*exp(-(y'/vs)^2)*sign(y')",
+            "D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)",
+        ),
         ("y = 1/(sqrt(s) + 2) u - 3 s/(sqrt(s) + 2) v", "D^0.5 y = -2 y + u - 3 D v"),
     ],
 )
@@ -83,6 +99,8 @@ def test_forms_that_mean_the_same(text, plain):
         ("D y = a y + b u(t - -0.02:0.5 s)", {}, {"u": (-0.02, 0.5)}),
         ("D y = a y + b D^0.5 u(t - 0.1) + k u(t - 0.1)", {"u": 0.1}, {}),
         ("D y = a y + b sat(u(t - 0.035 s), 0.94)", {"u": 0.035}, {}),
+        ("y'(t) = a y(t) + b u'(t - 0.1)", {"u": 0.1}, {}),
+        ("y = 2 u(s)/(s + 1) e^(-0.1 s)", {"u": 0.1}, {}),
         ("y = 1/(s + 1) e^(-0.1 s) u + exp(-0.2*s)/(s + 2) v", {"u": 0.1, "v": 0.2}, {}),
     ],
 )
@@ -91,6 +109,29 @@ def test_delays_are_read(text, delay, free):
     assert (dict(read.delay), dict(read.free_delays)) == (delay, free)
     # As it is printed, a lead included.
     assert ftlm.equation(str(read)) == read
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("y' = -a y(t - 0.1) + u", "the output y is delayed, but only inputs have delays"),
+        ("dy/dt = -a y(t - 0.1) + u", "the output y is delayed, but only inputs have delays"),
+        ("y' + a y(t - 0.1) = u(t - 0.2)", "the output y is delayed, but only inputs have delays"),
+        ("y' = -a y + u + b u(t - 0.1)", "u has two delays; give the input with the longer delay its own name"),
+        ("y' = -2 zeta wn y + u", "one name for a product of coefficients, as in 'a1 y'"),
+        ("y' = -wn^2 y + u", "write one name for it, as in 'a1 y'"),
+        ("y'' = u - fc*sign(y'')", r"friction depends on the first derivative; write sign\(D y\)"),
+        ("D y' = -y + u", "y has both D and primes"),
+        ("y' = -y + sat(u', 2)", r"limits a signal, not its derivative; write sat\(u, …\)'"),
+        ("y = 1/(1 + s/T) u", "'T' at character 14 divides, but a divisor must be a number"),
+        ("y = u/(s + 1)", r"write '1/\(s \+ 1\) u' if u is the input"),
+        ("y = 2*u/(s + 1) + v", r"write '2/\(s \+ 1\) u' if u is the input"),
+        ("y = K u/(s + 1) e^(-0.1 s)", r"write 'K/\(s \+ 1\) e\^\(-0.1 s\) u' if u is the input"),
+    ],
+)
+def test_a_form_that_is_not_computed_is_refused_with_the_form_that_is(text, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        ftlm.equation(text)
 
 
 def test_a_delay_is_given_once():
@@ -187,7 +228,7 @@ def test_what_is_printed_is_read(structure):
         ("y = (s + 1) (a s + 1)/(s + 2) u", "a occurs in several terms after multiplication"),
         (f"y = 1/(s + 1)^{MAX_POLYNOMIAL_POWER + 1} u", "not a whole number from 1 to 10"),
         ("y = 1/(s + 1", "expected ')' at character 13"),
-        ("G(s) = 2/(s + 3)", "the transfer function has no input; write both signals"),
+        ("G(s) = 2/(s + 3)", "the transfer function has no input at its end; write both signals"),
         ("D^u y = a y + b u", "u names an order and a signal"),
         ("D^y y = a y + b u", "y names an order and a signal"),
         ("D y - D y = u", "D^1 y cancels out"),

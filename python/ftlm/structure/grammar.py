@@ -12,24 +12,27 @@ expression in parentheses. Blanks between names, numbers and symbols do not matt
                 |  number ["*"] "(" sum ")" ["/" number]
     term        = {number ["*" | "/"]} [name ["*"]] (derivative | product | "D" ["^" order] group) ["/" number]
     derivative  = ["D" ["^" order]] signal  |  signal {"'"}  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
-    signal      = name ["(t" [("-" | "+") delay ["s"]] ")"]
+                (y or y(t); a power of d and dt is a whole number, a number or a name, the same in both)
+    signal      = name {"'"} ["(t" [("-" | "+") delay ["s"]] ")"]
                 |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
     product     = power {"*" power}
     power       = (number | group | function group | derivative) ["^" number]
     group       = "(" {sign} product {sign {sign} product} ")"
     function    = "sin" | "cos" | "exp" | "tanh" | "abs" | "sqrt"
-    friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"
-    transfer    = signal "=" {sign} ratio signal {sign ratio signal}  |  signal "/" signal "=" ratio
+    friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"      (or y', dy/dt for D y)
+    transfer    = signal "=" {sign} path {sign path}  |  signal "/" signal "=" ratio
+    path        = ratio signal  |  a ratio with a factor name "(s)"
     ratio       = factor {("*" | "/" | "") factor}
     factor      = number  |  name ["^" whole number]  |  "s" ["^" order]  |  "sqrt(s)"  |  "e^(-" delay "s)"
                 |  "(" polynomial ")" ["^" whole number]
+    polynomial  = {sign} product of factors and ["/" number] {sign product}
 """
 
 from __future__ import annotations
 
+import itertools
 import re
-import unicodedata
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from ftlm.errors import ModelError
@@ -47,46 +50,21 @@ from ftlm.structure.expression import (
 )
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
 from ftlm.structure.order import Order
-from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import nearest
+from ftlm.structure.token_reader import FUNCTION_NAMES, IDENTIFIER_PATTERN, TokenReader
 
-IDENTIFIER_PATTERN = r"[^\W\d]\w*"
 #: Input non-linearities with a syntax in equation texts.
 NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
 #: Names of offsets, such as c and c1: a term that consists of this name alone is an offset.
 _OFFSET_PATTERN = re.compile(r"c\d*")
-_TOKEN_PATTERN = re.compile(
-    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{IDENTIFIER_PATTERN})|(?P<symbol>[-+*/^(){{}}=,:']))"
+#: Numerator of ``d^0.5 y/dt^0.5``, ``d2y/dt2`` or ``dy(t)/dt`` as tokens with spaces, and maximum tokens of a
+#: derivative.
+_LEIBNIZ_PATTERN = re.compile(
+    rf"d(?: \^ ([\d.]+|{IDENTIFIER_PATTERN})(?: ({IDENTIFIER_PATTERN}))?|(?:(\d+)?({IDENTIFIER_PATTERN}))?)"
+    r"(?: \( t \))?(?= /)"
 )
-#: Numerator of ``d^2 y/dt^2``, ``d2y/dt2`` or ``dy/dt`` as tokens with spaces, and maximum tokens of a derivative.
-_LEIBNIZ_PATTERN = re.compile(rf"d(?: \^ (\d+)(?: ({IDENTIFIER_PATTERN}))?|(?:(\d+)?({IDENTIFIER_PATTERN}))?)(?= /)")
-MAX_LEIBNIZ_TOKENS = 8
-#: Typographic minus and multiplication signs, mapped to the symbols of the grammar.
-_PRINTED_SIGNS = str.maketrans("−·⋅×", "-***")
-_SUPERSCRIPT_PATTERN = re.compile("[⁰¹²³⁴-⁹]+")
-#: A signal of one letter with optional combining dots above it, and its optional subscript.
-_DOTTED_PATTERN = re.compile(
-    r"(?<![\w\u0307\u0308\u20db])([^\W\d_][\u0307\u0308\u20db]*)((?:_\w*|\d+)?)(?![\w\u0307\u0308\u20db])"
-)
-#: Order of the derivative that a combining dot, two dots and three dots stand for.
-_DOT_ORDERS = {"\u0307": 1, "\u0308": 2, "\u20db": 3}
-#: Letters whose two dots belong to the alphabet and do not mean a derivative.
-_UMLAUT_LETTERS = "äëïöüÄËÏÖÜ"
-
-
-def _prime_notation(dotted: re.Match[str]) -> str:
-    """Return a one-letter signal with primes in place of dots, such as y'' for ÿ; return other names unchanged."""
-    name, rest = dotted.groups()
-    parts = unicodedata.normalize("NFD", name)
-    if name in _UMLAUT_LETTERS or not set(parts[1:]) <= set(_DOT_ORDERS):
-        return dotted.group()
-    return f"{parts[0]}{rest}{chr(39) * sum(_DOT_ORDERS[dot] for dot in parts[1:])}"
-
-
+MAX_LEIBNIZ_TOKENS = 11
 #: Tokens after the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
-#: Names that are parsed as functions before a parenthesis; for an unsupported one, the error message names it.
-FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
 #: Maximum nesting depth of parentheses and functions in a non-linear term.
 MAX_DEPTH = 30
 #: Maximum power of a polynomial in s that is multiplied out.
@@ -122,7 +100,7 @@ SymbolicPolynomial = list[tuple[float, str | None, Order]]
 UNIT_POLYNOMIAL: SymbolicPolynomial = [(1.0, None, Order())]
 
 
-class EquationParser:
+class EquationParser(TokenReader):
     """Parser of the text of one equation; :meth:`parse` sets its attributes.
 
     Parameters
@@ -151,11 +129,11 @@ class EquationParser:
     """
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
-        text = _SUPERSCRIPT_PATTERN.sub(lambda power: "^" + unicodedata.normalize("NFKC", power[0]), text)
-        text = _DOTTED_PATTERN.sub(_prime_notation, unicodedata.normalize("NFC", text))
-        self.text = text
+        super().__init__(text)
         self._signals = signals
         self._depth = 0
+        self._primes = 0
+        self._twice_delayed: str | None = None
         self.left: list[ParsedTerm] = []
         self.right: list[ParsedTerm] = []
         self.friction: tuple[Friction, str] | None = None
@@ -165,68 +143,6 @@ class EquationParser:
         self.plain: set[str] = set()
         self.delays: dict[str, Value] = {}
         self.is_transfer = False
-        self._tokens: list[tuple[str, str, int]] = []
-        self._position = 0
-        # Replacements have the length of the originals, so that positions in error messages stay valid.
-        readable = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
-        at = 0
-        while readable[at:].strip():
-            token = _TOKEN_PATTERN.match(readable, at)
-            if token is None:
-                start = at + len(readable[at:]) - len(readable[at:].lstrip())
-                at_character = f"{text[start]!r} at character {start + 1}"
-                raise ModelError(f"equation {text!r}: unexpected {at_character}; remove it")
-            kind = str(token.lastgroup)
-            self._tokens.append((kind, token[kind], token.start(kind)))
-            at = token.end()
-        self._readable = readable
-
-    # -------------------------------------------------------------------------------------------------- tokens
-
-    def _peek(self, offset: int = 0) -> tuple[str, str, int]:
-        index = self._position + offset
-        return self._tokens[index] if index < len(self._tokens) else ("end", "the end", len(self.text))
-
-    def _take(self) -> tuple[str, str, int]:
-        token = self._peek()
-        self._position += 1
-        return token
-
-    def _sees(self, *values: str) -> bool:
-        """Whether the next tokens are the given texts."""
-        return all(self._peek(k)[1] == value for k, value in enumerate(values))
-
-    def _accept(self, symbol: str) -> bool:
-        """Consume the next token if it is the given symbol, and return whether it was."""
-        is_match = self._peek()[:2] == ("symbol", symbol)
-        self._position += is_match
-        return is_match
-
-    def _expect(self, symbol: str, expectation: str | None = None) -> None:
-        if self._peek()[1] != symbol:
-            raise self._syntax_error(expectation or f"'{symbol}'")
-        self._take()
-
-    def _error(self, message: str) -> ModelError:
-        return ModelError(f"equation {self.text!r}: {message}")
-
-    def _syntax_error(self, expectation: str) -> ModelError:
-        kind, value, at = self._peek()
-        found = value if kind == "end" else repr(value)
-        if kind == "symbol" and value in ",:'":
-            return self._error(f"unexpected {value!r} at character {at + 1}; remove it")
-        if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
-            return self._error(
-                f"expected {expectation} at character {at + 1}, found {found}; D is the derivative in an equation: "
-                f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
-            )
-        remedy = "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
-        before = self._peek(-1) if self._position else ("", "", 0)
-        if before[0] == kind == "name":
-            remedy = f"a name has no blanks: write {f'{before[1]}_{value}'!r} for one signal"
-        elif before[0] == "name" and value == "(":
-            remedy = f"{before[1]!r} is no function{nearest(before[1], FUNCTION_NAMES)}"
-        return self._error(f"expected {expectation} at character {at + 1}, found {found}; {remedy}")
 
     # ------------------------------------------------------------------------------------------------ equation
 
@@ -244,7 +160,20 @@ class EquationParser:
             self.right = self._sum()
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
+        self._check_delayed_signals()
         return self
+
+    def _check_delayed_signals(self) -> None:
+        """Raise ModelError for a delayed output, a signal differentiated on the left-hand side, and for two delays."""
+        outputs = {item.signal for item in self.left if item.order.names or item.order.constant}
+        late = next((signal for signal in self.delays if self.delays[signal] != 0.0 and signal in outputs), None)
+        signal = self._twice_delayed if late is None else late
+        if signal is None:
+            return
+        reason = f"{signal} has two delays; give the input with the longer delay its own name"
+        if signal in outputs:
+            reason = f"the output {signal} is delayed, but only inputs have delays; give the delayed one its own name"
+        raise self._error(f"{reason}, and its own signal in the run")
 
     def parse_expression(self) -> Expression:
         """Parse the whole text as the expression of a non-linear term, and return it."""
@@ -262,15 +191,6 @@ class EquationParser:
             elif closed or not (self._take_printed_offset() or self._take_friction(-sign if is_lhs else sign)):
                 terms += self._item(sign)
         return terms
-
-    def _signs(self) -> Iterator[float]:
-        """Yield the sign of each term of a sum, up to the first token that cannot continue it."""
-        is_first = True
-        while is_first or self._sees("+") or self._sees("-"):
-            is_first, sign = False, 1.0
-            while self._sees("+") or self._sees("-"):
-                sign *= -1.0 if self._take()[1] == "-" else 1.0
-            yield sign
 
     def _item(self, sign: float) -> list[ParsedTerm]:
         """Parse a product, or a number times a sum in parentheses, and return its terms."""
@@ -323,18 +243,6 @@ class EquationParser:
             while self._sees("/") and self._peek(1)[0] == "number":
                 factor = self._divisors(factor)
             self._accept("*")
-        return factor
-
-    def _divisors(self, factor: float) -> float:
-        """Parse divisions by numbers at the end of a product, and return `factor` divided by them."""
-        while self._accept("/"):
-            kind, value, at = self._peek()
-            if kind != "number" or float(value) == 0.0:
-                raise self._error(
-                    f"{value!r} at character {at + 1} divides, but a divisor must be a number other than 0; "
-                    "write a coefficient instead, as in a y for y/T"
-                )
-            factor /= float(self._take()[1])
         return factor
 
     def _continues_after_name(self) -> bool:
@@ -565,11 +473,21 @@ class EquationParser:
         if derivative is not None and derivative[1]:
             self._position += derivative[2]
             return derivative[:2]
+        self._primes = 0
         order, signal = self._operator(), self._signal()
-        primes = 0
-        while order is None and self._accept("'"):
-            primes += 1
-        return Order(float(primes)) if primes else order, signal
+        if order is None:
+            primes = self._primes + self._count_primes()
+            return Order(float(primes)) if primes else None, signal
+        if self._primes:
+            raise self._error(f"{signal} has both D and primes; write one of them, as in D^2 {signal}")
+        return order, signal
+
+    def _count_primes(self) -> int:
+        """Parse primes after a signal, and return their number."""
+        begin = self._position
+        while self._accept("'"):
+            pass
+        return self._position - begin
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
         """Return (order, signal, number of tokens) of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
@@ -577,13 +495,13 @@ class EquationParser:
         top = _LEIBNIZ_PATTERN.match(text)
         if top is None:
             return None
-        order, signal = int(top[1] or top[3] or 1), top[2] or top[4] or ""
-        bottom = re.compile(rf" / dt( \^ {order}|{'' if order == 1 else order})(?= |$)").match(text, top.end())
+        order, signal = top[1] or top[3] or "1", top[2] or top[4] or ""
+        bottom = re.compile(rf" / dt( \^ {order}|{'' if order == '1' else order})(?= |$)").match(text, top.end())
         if bottom is None:
             return None
         if signal:
             self.plain.add(signal)
-        return Order(float(order)), signal, text.count(" ", 0, bottom.end()) + 1
+        return self._order_from(order, self._peek()[2]), signal, text.count(" ", 0, bottom.end()) + 1
 
     def _signal(self) -> str:
         """Parse a signal with its time argument, saturation or dead zone, and return its name."""
@@ -597,11 +515,14 @@ class EquationParser:
         self._take()
         if law is None:
             self.plain.add(value)
+            self._primes = self._count_primes()
             self._time_argument(value)
             return value
         self._take()
         plain_before = set(self.plain)
         signal = self._signal()
+        if self._primes:
+            raise self._error(f"{value}(…) limits a signal, not its derivative; write {value}({signal}, …)'")
         self.plain = plain_before | (self.plain - {signal})
         if law == "dead_zone" and (signal, "saturation") in self.limits:
             raise self._error(f"a dead zone acts before a saturation: write sat(dead({signal}, …), …)")
@@ -631,10 +552,7 @@ class EquationParser:
 
     def _check_delay(self, signal: str, delay: Value) -> None:
         if self.delays.setdefault(signal, delay) != delay:
-            raise self._error(
-                f"{signal} has two delays; give the input with the longer delay its own name, and its own signal in "
-                "the run"
-            )
+            self._twice_delayed = self._twice_delayed or signal
 
     def _delay(self, signal: str) -> Value:
         kind, value, _ = self._peek()
@@ -644,45 +562,6 @@ class EquationParser:
                 f"bounds in seconds, as in {signal}(t - 0:0.5)"
             )
         return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
-
-    def _value(self, expectation: str) -> Value:
-        """Parse a number or an interval ``low:high``, and return it; `expectation` is the text of the syntax error."""
-        ends = []
-        while True:
-            sign = -1.0 if self._accept("-") else 1.0
-            if self._peek()[0] != "number":
-                raise self._syntax_error(expectation)
-            ends.append(sign * float(self._take()[1]))
-            if len(ends) == 2 or not self._accept(":"):
-                return ends[0] if len(ends) == 1 else (ends[0], ends[1])
-
-    def _order(self) -> Order:
-        """Parse an order (a number, a name, or an expression in parentheses), and return it."""
-        kind, value, start = self._peek()
-        if value in "({" and kind == "symbol":
-            close = ")" if value == "(" else "}"
-            self._take()
-            depth, begin, at = 1, start + 1, start + 1
-            while depth:
-                kind, token, at = self._take()
-                if kind == "end":
-                    self._position -= 1
-                    raise self._syntax_error(f"'{close}'")
-                depth += token in "({" and kind == "symbol"
-                depth -= token in ")}" and kind == "symbol"
-            return self._order_from(self._readable[begin:at], begin)
-        sign = "-" if self._accept("-") else ""
-        kind, value, _ = self._peek()
-        if kind not in ("number", "name"):
-            raise self._syntax_error("an order: a number, a name or (…)")
-        self._take()
-        return self._order_from(sign + value, start)
-
-    def _order_from(self, text: str, at: int) -> Order:
-        try:
-            return Order.parse(text)
-        except ModelError as error:
-            raise self._error(f"at character {at + 1}: {error}") from error
 
     # ------------------------------------------------------------------------------------------------ friction
 
@@ -747,11 +626,13 @@ class EquationParser:
         return signal, float(value) if kind == "number" else value
 
     def _velocity(self, expectation: str) -> str:
-        """Parse ``D y``, and return the name of the signal; `expectation` is the text of the syntax error."""
-        if not self._sees("D") or self._peek(1)[0] != "name":
+        """Parse ``D y``, ``y'`` or ``dy/dt``, and return the signal; `expectation` is the text of the syntax error."""
+        if self._peek()[0] != "name":
             raise self._syntax_error(expectation)
-        self._take()
-        return self._take()[1]
+        order, signal = self._derivative()
+        if order != Order(1.0):
+            raise self._error(f"friction depends on the first derivative; write sign(D {signal}) for the velocity")
+        return signal
 
     # --------------------------------------------------------------------------------------- transfer functions
 
@@ -781,8 +662,8 @@ class EquationParser:
         self._expect("=")
         paths: list[tuple[SymbolicPolynomial, SymbolicPolynomial, str]] = []
         for sign in self._signs():
-            top, bottom, delay = self._ratio(common)
-            signal = common or self._transform()
+            top, bottom, delay, inner = self._ratio(common)
+            signal = common or inner or self._transform()
             self.delays[signal] = delay
             if any(signal == other for _, _, other in paths):
                 raise self._error(f"{signal} occurs twice; combine its terms into one transfer function")
@@ -814,22 +695,25 @@ class EquationParser:
         self.plain.add(value)
         return value
 
-    def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value]:
-        """Parse a transfer function; return numerator, denominator and delay. `common` is u in the form ``y/u = …``."""
-        top, bottom, divides = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False
+    def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value, str | None]:
+        """Parse a transfer function; return numerator, denominator, delay, and the input if it is a factor ``u(s)``.
+
+        `common` is u in the form ``y/u = …``.
+        """
+        top, bottom, divides, begin = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, self._position
         delay: Value = 0.0
+        signal: str | None = None
         while True:
             kind, value, _ = self._peek()
             symbols = [self._peek(k)[1] for k in (1, 2, 3)]
             if value in ("e", "exp") and symbols[0] in ("^", "("):
                 delay = self._exponential()
-            elif self._ends_ratio(kind, value, symbols, is_named=common is None):
-                return top, bottom, delay
-            elif kind == "end" and not divides:
-                raise self._error(
-                    "the transfer function has no input; write both signals, as in 'y = 2/(s + 3) u' or "
-                    "'y/u = 2/(s + 3)'"
-                )
+            elif not (common or signal or divides) and value != "sqrt" and symbols == ["(", "s", ")"]:
+                signal = self._transform()
+            elif not divides and self._ends_ratio(kind, value, symbols, is_named=common is None and signal is None):
+                return top, bottom, delay, signal
+            elif not divides and (kind == "end" or value in "+-"):
+                raise self._missing_input(begin)
             elif divides:
                 bottom = self._times(bottom, self._factor())
             else:
@@ -837,6 +721,18 @@ class EquationParser:
             divides = self._accept("/")
             if not divides:
                 self._accept("*")
+
+    def _missing_input(self, begin: int) -> ModelError:
+        """Return the error for a transfer function without an input at its end; `begin` is its first token."""
+        words = "the transfer function has no input at its end; write "
+        factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[begin : self._position])
+        names = [token for token in factors if token[0] == "name" and token[1] not in ("s", "e", "exp", "sqrt")]
+        if names:
+            _, name, at = names[-1]
+            before = self._readable[self._tokens[begin][2] : at].rstrip("* ") or "1"
+            after = self._readable[at + len(name) : self._peek()[2]].strip()
+            words += f"{f'{before}{after} {name}'!r} if {name} is the input, and otherwise "
+        return self._error(f"{words}both signals, as in 'y = 2/(s + 3) u' or 'y/u = 2/(s + 3)'")
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
@@ -871,9 +767,13 @@ class EquationParser:
         polynomial: SymbolicPolynomial = []
         for sign in self._signs():
             product = self._factor()
-            while self._peek()[0] in ("number", "name") or self._peek()[1] in ("(", "*"):
-                self._accept("*")
-                product = self._times(product, self._factor())
+            while self._peek()[0] in ("number", "name") or self._peek()[1] in ("(", "*", "/"):
+                if self._sees("/"):
+                    divisor = self._divisors(1.0)
+                    product = [(divisor * c, name, order) for c, name, order in product]
+                else:
+                    self._accept("*")
+                    product = self._times(product, self._factor())
             polynomial += [(sign * c, name, order) for c, name, order in product]
         return [term for term in _add_known(polynomial) if term[0] != 0.0] or UNIT_POLYNOMIAL
 
@@ -882,15 +782,15 @@ class EquationParser:
         kind, value, at = self._peek()
         if kind == "number":
             self._take()
-            return [(float(value), None, Order())]
-        if value == "sqrt" and self._sees("sqrt", "(", "s", ")"):
+            inner: SymbolicPolynomial = [(float(value), None, Order())]
+        elif value == "sqrt" and self._sees("sqrt", "(", "s", ")"):
             self._position += 4
             return [(1.0, None, Order(0.5))]
-        if kind == "name" and value not in FUNCTION_NAMES:
+        elif kind == "name" and value not in FUNCTION_NAMES:
             self._take()
             if value == "s":
                 return [(1.0, None, self._order() if self._accept("^") else Order(1.0))]
-            inner: SymbolicPolynomial = [(1.0, value, Order())]
+            inner = [(1.0, value, Order())]
         elif self._accept("("):
             inner = self._polynomial()
             self._expect(")")

@@ -53,8 +53,9 @@ def equation(
         Equations such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` is a free order, ``D^(alpha-mu)`` an
         order law, ``D y``, ``y'`` or ``dy/dt`` the first derivative. A coefficient is a name, a number (fixed) or a
         number times a name. Terms may stand on both sides, as in ``"y'' + 2 y' + y = u(t - 0.1)"`` with a delay [s] of
-        the input, and transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. The
-        equation is solved for the highest derivative of its output, the signal that is differentiated most on the
+        the input, and transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. An
+        input may have a higher order than its equation, and lead it as in ``u(t + 0.1)``: such an equation has a
+        frequency response, and :func:`identify` states which inputs of a run it requires. The equation is solved for the highest derivative of its output, the signal that is differentiated most on the
         left-hand side. Separate equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an
         offset, an unknown constant; write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is
         Coulomb friction of the simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds
