@@ -627,9 +627,10 @@ class EquationParser(TokenReader):
 
     def _velocity(self, expectation: str) -> str:
         """Parse ``D y``, ``y'`` or ``dy/dt``, and return the signal; `expectation` is the text of the syntax error."""
-        if self._peek()[0] != "name":
+        begin, (order, signal) = self._position, self._derivative() if self._peek()[0] == "name" else (None, "")
+        if order is None:
+            self._position = begin
             raise self._syntax_error(expectation)
-        order, signal = self._derivative()
         if order != Order(1.0):
             raise self._error(f"friction depends on the first derivative; write sign(D {signal}) for the velocity")
         return signal

@@ -55,14 +55,15 @@ def equation(
         number times a name. Terms may stand on both sides, as in ``"y'' + 2 y' + y = u(t - 0.1)"`` with a delay [s] of
         the input, and transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. An
         input may have a higher order than its equation, and lead it as in ``u(t + 0.1)``: such an equation has a
-        frequency response, and :func:`identify` states which inputs of a run it requires. The equation is solved for the highest derivative of its output, the signal that is differentiated most on the
-        left-hand side. Separate equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an
-        offset, an unknown constant; write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is
-        Coulomb friction of the simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds
-        Stribeck friction, with fs and vs > 0 each a name or a number; the breakaway force is then fc + fs. Non-linear
-        terms must be linear in their coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k
-        D^mu (y^3)``, with the functions sin, cos, exp, tanh, abs and sqrt. The first name in a product is its
-        coefficient, unless it denotes a signal elsewhere in the equations.
+        frequency response, and :func:`identify` states which inputs of a run it requires. The equation is solved for
+        the highest derivative of its output, the signal that is differentiated most on the left-hand side. Separate
+        equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an offset, an unknown constant;
+        write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is Coulomb friction of the
+        simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds Stribeck friction, with fs and
+        vs > 0 each a name or a number; the breakaway force is then fc + fs. Non-linear terms must be linear in their
+        coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k D^mu (y^3)``, with the functions
+        sin, cos, exp, tanh, abs and sqrt. The first name in a product is its coefficient, unless it denotes a signal
+        elsewhere in the equations.
     orders
         Values of the free orders by name: a number fixes the order, ``"0.5:1.5:0.05"`` or (low, high, step) is its
         grid.

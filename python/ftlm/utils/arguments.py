@@ -91,8 +91,8 @@ def check_arguments(decorated: Decorated) -> Decorated:
 
 def warn_caller(message: str) -> None:
     """Issue a UserWarning that shows the line of the user's code which called ftlm."""
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "ftlm":
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "ftlm":
         frame, level = frame.f_back, level + 1
     warnings.warn(message, UserWarning, stacklevel=level)
 
