@@ -1,6 +1,7 @@
 """Certificates over all orders of intervals: nothing between the values of a lattice does better than is proved."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -178,6 +179,13 @@ def test_given_tuples_are_scored_and_told_apart(run, equation, proved):
     assert "start 1: " in str(found)
     assert "may still be beaten" in str(found)
     assert found.to_dict()["beatable"] == [False, True]
+    both = ftlm.equation("D^alpha y = a D^beta y + b D^gamma y + c u", initial="rest")
+    grid = ftlm.OrderGrid(
+        increment=0.1, alpha=(1.4, 1.5, 0.1), orders={"beta": (0.2, 0.4, 0.1), "gamma": (0.2, 0.4, 0.1)}
+    )
+    dependent = {"alpha": 1.4, "beta": 0.3, "gamma": 0.3}
+    twice = ftlm.certify_orders(run, both, grid, tolerance=0.5, m=128, start=[dependent])
+    assert twice.start_errors == (math.inf,)
     for bad in ({"alpha": 1.0}, {**proved.orders, "alpha": 5.0}):
         with pytest.raises(ftlm.ModelError, match=r"start 1 of 2 is .*; give alpha from "):
             ftlm.certify_orders(run, equation, LATTICE, m=128, start=[proved.orders, bad])

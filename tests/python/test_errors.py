@@ -326,7 +326,9 @@ BAD = {
         "model is Structure, not a Model",
         lambda: ftlm.simulate(ftlm.equation("D y = a y"), run()),
     ),
-    "structure that is text": (MODEL, "structure is str", lambda: ftlm.identify(run(), WORDS)),
+    "structure that is a number": (MODEL, "structure is int", lambda: ftlm.identify(run(), 3)),
+    "number for a path": (DATA, "path is an int", lambda: ftlm.load(3)),
+    "unknown argument": (TypeError, "known: step, time", lambda: ftlm.Run.from_arrays(following=3)),
     "tolerance of 0": (MODEL, "tolerance = 0 is not positive", lambda: model().simulate(run(), tolerance=0)),
     "unstable model": (
         CONVERGENCE,

@@ -217,7 +217,7 @@ BAD_TEXT = {
     "blank": ("\n\n  \n", ["empty"]),
     "comments only": ("# a\n# b\n", ["empty"]),
     "header only": ("t,u,y\n", ["header and no rows"]),
-    "one row": ("t,u,y\n" + rows(1), ["1 rows", "3 are needed"]),
+    "one row": ("t,u,y\n" + rows(1), ["1 row,", "3 are needed"]),
     "zero byte": (b"t,u,y\n0,1,2\n0.01,1\0,2\n", ["zero byte", "line 3"]),
     "latin-1": ("t,u,y\n0,1,2\n1,°,2\n".encode("latin-1"), ["column 'u', line 3", "'°' is not a number"]),
     "late latin-1": (

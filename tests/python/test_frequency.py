@@ -239,6 +239,9 @@ def test_zeros_are_those_of_the_numerator():
 def test_stability_without_a_common_base_is_that_of_the_argument_principle():
     assert model("D^1.31 y = -2 D^0.4301 y - y + u").stability().method == "argument principle"
     assert model("D^1.3 y = -2 D^0.4 y - y + u").stability().base == pytest.approx(0.1)
+    # Two equations without coupling, with bases 0.5 and 0.3.
+    for text in ("D^1.5 y = -y + u; D^0.6 z = -2 D^0.3 z - z + u", "D^0.6 z = -2 D^0.3 z - z + u; D^1.5 y = -y + u"):
+        assert model(text).stability().base == pytest.approx(0.3)
 
 
 # ------------------------------------------------------------------------------------------------ steps

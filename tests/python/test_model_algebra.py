@@ -66,6 +66,41 @@ def test_lists_of_fomcon_give_its_transfer_function():
     model = ftlm.transfer_function(list(zip(b, nb, strict=True)), list(zip(a, na, strict=True)), delay=0.1)
     assert str(model.equations[0]) == "D^1.8 y = -0.5 D^0.9 y - 2.0 y + 4.0 u"
     assert model.structure.delay == {"u": 0.1}
+    assert ftlm.transfer_function((b, nb), (a, na), delay=0.1) == model
+    assert ftlm.transfer_function((np.array(b), np.array(nb)), (a, na), delay=0.1) == model
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_operators_have_the_meaning_of_python_control(seed):
+    num, den, late, model = drawn(seed)
+    other_lists = drawn(seed + 1000, delay=False)
+    other = other_lists[3]
+    g, h = exact(num, den, late), exact(*other_lists[:3])
+    close(model * other, g * h)
+    close(2 * model, 2 * g)
+    close(-model * 0.5, -0.5 * g)
+    close(model / 4, g / 4)
+    close(model * other / other, g)
+    one = drawn(seed, delay=False)
+    g = exact(*one[:3])
+    for found, expected in ((one[3] + other, g + h), (one[3] - other, g - h), (3 - one[3], 3 - g), (one[3] + 1, g + 1)):
+        scale = np.abs(g) + np.abs(h) + 3
+        assert np.max(np.abs(response(found) - expected) / scale) < 1e-12
+
+
+def test_operands_keep_the_names_of_their_signals():
+    first = ftlm.transfer_function([1], [1, 2], output="torque", input="volts")
+    second = ftlm.transfer_function([3], [1, 1], output="angle", input="torque")
+    both = second * first
+    assert (both.outputs, both.structure.signals) == (("angle",), ("angle", "volts"))
+    close(both, 3 / ((S + 1) * (S + 2)))
+    for call in (lambda: first * "x", lambda: "x" + first, lambda: first / None):
+        with pytest.raises(TypeError):
+            call()
+    with pytest.raises(ftlm.ModelError, match=r"the delays are 0\.1 s and 0 s"):
+        one_lag(0.1) + one_lag()
+    with pytest.raises(ftlm.ModelError, match=r"the divisor has a delay of 0\.1 s"):
+        one_lag() / one_lag(0.1)
 
 
 def test_an_inverse_undoes_its_model():
@@ -94,6 +129,9 @@ def one_lag(delay=0.0):
         (lambda: ftlm.transfer_function([], [1, 1]), "num has no coefficient"),
         (lambda: ftlm.transfer_function([1], [0, 0]), "den has no coefficient"),
         (lambda: ftlm.transfer_function([1], [1, float("nan")]), r"den\[1\] is nan"),
+        (lambda: ftlm.transfer_function(([1], [0]), ([1, 2], [1])), "den has 2 coefficients and 1 powers"),
+        (lambda: ftlm.transfer_function(zip([1], [0]), [1, 1]), "num is a zip, which omits entries"),  # noqa: B905
+        (lambda: ftlm.transfer_function([1], [1, 1], input="y"), "'y' is the name of the output and of the input"),
         (lambda: ftlm.transfer_function([(1, 2, 3)], [1, 1]), r"num\[0\] is \(1, 2, 3\)"),
         (lambda: one_lag(0.1).inverse(), "0.1 s in advance"),
         (lambda: one_lag().inverse(), "numerator is of order 1"),

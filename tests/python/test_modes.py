@@ -10,6 +10,7 @@ import pytest
 import ftlm
 from ftlm.analysis import dcgain, modes, steady_states
 from ftlm.analysis.poles import _mode, characteristic, right_zeros, zeros_of
+from ftlm.analysis.time_response import response
 from ftlm.report.html_report import behavior_tables
 from ftlm.report.text_summary import behavior_lines
 
@@ -192,9 +193,24 @@ def test_a_step_is_the_closed_form_and_so_is_its_band():
     assert found.deviation[0, 0] == pytest.approx(0.1 * np.abs(slope), abs=2e-5)
     theirs = control.step_response(control.tf([3.0], [1.0, 2.0]), t).outputs
     assert found.values[0, 0] == pytest.approx(theirs, abs=2e-5)
-    assert "final value 1.49" in str(found)
+    assert "final value 1.5 ± 0.075" in str(found)
     assert "<svg" in found._repr_html_()
     assert "95 % band" in found._repr_html_()
+
+
+def test_the_final_value_of_a_step_is_the_gain_of_a_stable_model():
+    slow = ftlm.Model(ftlm.equation("D^0.5 T = -0.02 T + 0.05 P"))
+    assert "T from P: final value 2.5, peak 1.96" in str(slow.step())
+    assert slow.step().final_values == {("T", "P"): (pytest.approx(2.5), None)}
+    washed_out = ftlm.Model(ftlm.equation("D y = -2 y + 3 D u"))
+    assert "final value 0, peak" in str(washed_out.step())
+    for text, time in {"D y = 2 u": (0, 3), "D y = 0.1 y + u": (0, 3), "D^2 y = -4 y + u": (0, 3)}.items():
+        found = ftlm.Model(ftlm.equation(text)).step(np.linspace(*time, 31))
+        assert "y from u: value at 3 s" in str(found)
+        assert found.final_values == {}
+    assert "value at" in str(slow.impulse())
+    with pytest.raises(ftlm.ModelError, match="'ramp' is not known; use 'step' or 'impulse'"):
+        response(slow, kind="ramp")
 
 
 def test_an_impulse_is_the_mean_of_the_closed_form_over_each_interval():

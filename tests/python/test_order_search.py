@@ -747,8 +747,8 @@ def test_nothing_or_too_much_to_search_is_refused(run, text, order_grid, message
 
 
 def test_what_is_no_structure_no_lattice_and_no_run_is_refused(run):
-    with pytest.raises(ftlm.ModelError, match="equation is str, not a structure; use"):
-        ftlm.search_orders(run, EQUATION)
+    with pytest.raises(ftlm.ModelError, match="equation is int; give the text of an equation"):
+        ftlm.search_orders(run, 3)
     with pytest.raises(ftlm.ModelError, match="order_grid is dict, not an OrderGrid"):
         ftlm.search_orders(run, ftlm.equation(EQUATION), GRID)
     with pytest.raises(ftlm.DataError, match="no run is given"):

@@ -59,7 +59,9 @@ def test_given_delay_is_fixed():
 
 def test_method_without_errors_has_free_parameters_without_errors():
     found = ftlm.identify(run(), ftlm.equation(STRUCTURE, delay={"u": DELAY}), method="least-squares")
-    assert found.covariance.shape == (0, 0)
+    assert found.names == ("a", "b")
+    assert found.covariance.shape == (2, 2)
+    assert np.isnan(found.covariance).all()
     assert not found.parameters["a"].fixed
     assert str(found.parameters["a"]) == f"a = {found.coefficients['a']:.6g} s^-1"
 
@@ -100,3 +102,57 @@ def test_search_and_selection_have_the_same_names():
     assert chosen.covariance.shape == (2, 2)
     assert chosen.validate(run(seed=2)).fit["y"] > 95
     assert chosen.summary() == str(chosen)
+    assert list(chosen.standard_errors) == list(chosen.intervals) == list(chosen.coefficients) == ["a", "b"]
+    assert chosen.orders == {}
+
+
+SHARED_NAMES = (
+    *("parameters", "values", "standard_errors", "intervals", "names", "covariance", "orders", "coefficients"),
+    *("model", "fit", "fit_percent", "findings", "warnings", "verdict"),
+)
+
+
+def shared_results(tmp_path):
+    text = "D^alpha y = a y + b u"
+    omega = np.geomspace(0.1, 100, 40)
+    data = ftlm.FrequencyData(omega, 3 / ((1j * omega) ** 0.9 + 2), output="y", input="u")
+    return {
+        "identify": ftlm.identify(run(), text),
+        "least squares": ftlm.identify(run(), "D y = a y + b u", method="least-squares"),
+        "search": ftlm.search_orders(run(), text, ftlm.OrderGrid(alpha=(0.5, 1.5, 0.5))),
+        "select": ftlm.select(run(), ["D y = a y + b u", "D^2 y = a y + b D y + c0 u"]),
+        "frequency": ftlm.identify_frequency(data, text),
+    }, data
+
+
+def test_all_results_have_the_shared_names_and_take_equations_as_text(tmp_path):
+    results, data = shared_results(tmp_path)
+    for kind, found in results.items():
+        for name in SHARED_NAMES:
+            getattr(found, name)
+        assert found.covariance.shape == (len(found.names), len(found.names)), kind
+        assert set(found.names) <= set(found.values), kind
+        assert found.fit["y"] == found.fit_percent["y"]
+        assert len(found.warnings) == len(found.findings)
+        assert str(found) in (found.summary(), str(found))
+        assert found.to_frame().shape[0] > 0
+        assert found.report(tmp_path / f"{kind}.html").exists()
+        checked = found.validate(data if kind == "frequency" else run(seed=2))
+        assert checked.verdict.level in ("trust", "with care", "do not use")
+        assert set(checked.fit) == {"y"}
+        assert isinstance(checked.findings, tuple)
+        assert checked.to_frame().shape[0] > 0
+    wrong = ftlm.FrequencyData(data.frequency, 3 * data.response, output="y", input="u")
+    missed = results["frequency"].validate(wrong)
+    assert missed.fit["y"] < 50
+    assert [f.code for f in missed.findings] == ["response_missed", "response_lost"]
+    assert len(missed.warnings) == 2
+
+
+def test_a_text_without_an_equation_is_refused_by_every_estimator():
+    for call in (ftlm.identify, ftlm.search_orders, ftlm.select):
+        with pytest.raises(ftlm.ModelError, match=r"'y'|equation"):
+            call(run(), "y")
+        with pytest.raises(ftlm.ModelError, match="is int"):
+            call(run(), [3] if call is ftlm.select else 3)
+    assert ftlm.identify_many([run()], STRUCTURE)[0].result.coefficients.keys() == {"a", "b"}

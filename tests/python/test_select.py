@@ -349,8 +349,8 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, second, validation="halves")
     with pytest.raises(ftlm.ModelError, match="there are no candidates"):
         ftlm.select(runs, [])
-    with pytest.raises(ftlm.ModelError, match="candidate 1 of 2 is str"):
-        ftlm.select(runs, [second, "D y = u"])
+    with pytest.raises(ftlm.ModelError, match="candidate 1 of 2 is int"):
+        ftlm.select(runs, [second, 3])
     with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
         name_candidates({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
     renamed = ftlm.equation("D^2 y = k y + c D y + g u")
@@ -360,7 +360,9 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, {"any": replace(second, offset="auto"), "constant": replace(second, offset="constant")})
     with pytest.raises(ftlm.ModelError, match=r"validation = \[\] has no run; give a run that is not"):
         ftlm.select(runs, second, validation=[])
-    with pytest.raises(ftlm.ModelError, match="candidates = 'D y = u'; use 'auto'"):
+    with pytest.raises(ftlm.ModelError, match="candidates = 'linear'; use 'auto'"):
+        ftlm.select(runs, "linear")
+    with pytest.raises(ftlm.ModelError, match="has no free parameter"):
         ftlm.select(runs, "D y = u")
     with pytest.raises(ftlm.ModelError, match="10001 candidates are more than 10000"):
         ftlm.select(runs, [second] * 10_001)

@@ -28,6 +28,7 @@ from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments, warn_caller
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats
@@ -532,7 +533,9 @@ def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
-            raise ModelError(f"{what}: {len(names)} names are given, but the system has {count}; give {count} names")
+            raise ModelError(
+                f"{what}: {plural(len(names), 'name')} given, but the system has {count}; give {count} names"
+            )
         return names
     names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
     plain = [_LABEL_PATTERN.fullmatch(n) for n in names]

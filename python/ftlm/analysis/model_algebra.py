@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
+from typing import Any
 
 from ftlm.analysis.frequency_response import (
     Polynomial,
@@ -22,6 +23,7 @@ from ftlm.structure.grammar import EquationParser
 from ftlm.structure.order import MAX_ORDER, Order
 from ftlm.structure.parser import equation
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_known, real_number
 
@@ -71,8 +73,8 @@ class Ratio:
 
 @check_arguments
 def transfer_function(
-    num: Sequence[float] | Sequence[Pair],
-    den: Sequence[float] | Sequence[Pair],
+    num: Sequence[float] | Sequence[Pair] | tuple[Sequence[float], Sequence[float]],
+    den: Sequence[float] | Sequence[Pair] | tuple[Sequence[float], Sequence[float]],
     delay: float = 0.0,
     *,
     output: str = "y",
@@ -83,9 +85,9 @@ def transfer_function(
     Parameters
     ----------
     num, den
-        Coefficients of s^n, …, s, 1 as in python-control and MATLAB; or pairs (coefficient, power) for fractional
-        powers. FOMCON's ``fotf(a, na, b, nb)`` has the numerator ``list(zip(b, nb))`` and the denominator ``list(zip(a,
-        na))``.
+        Coefficients of s^n, …, s, 1 as in python-control and MATLAB; or, for fractional powers, pairs (coefficient,
+        power) or a tuple of two lists, the coefficients and the powers. FOMCON's ``fotf(a, na, b, nb)`` is
+        ``transfer_function((b, nb), (a, na))``.
     delay
         Delay of the input [s], ≥ 0.
     output, input
@@ -100,7 +102,8 @@ def transfer_function(
     ------
     ModelError
         If the numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
-        a list is empty or of another form, a number is not finite, or the delay is negative.
+        a list is empty or of another form, coefficients and powers differ in number, a number is not finite, the delay
+        is negative, or output and input have the same name.
 
     Examples
     --------
@@ -109,15 +112,35 @@ def transfer_function(
     """
     if isinstance(delay, Real) and delay < 0:
         raise ModelError(f"the delay of {delay:g} s is below 0: the output would lead its input; give 0 or more")
+    if output == input:
+        raise ModelError(f"{output!r} is the name of the output and of the input; give two different names")
     return Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
 
 
-def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) -> Polynomial:
-    """Return a polynomial from coefficients in descending powers or from (coefficient, power) pairs.
+def _polynomial(name: str, values_argument: Any) -> Polynomial:
+    """Return a polynomial from coefficients in descending powers, (coefficient, power) pairs, or two lists of these.
 
     `name` names the argument in messages. Raise ModelError for other input.
     """
+    if isinstance(values_argument, zip):
+        raise ModelError(
+            f"{name} is a zip, which omits entries of the longer list; give ({name} coefficients, powers), a tuple of "
+            "two lists"
+        )
     values = list(values_argument)
+    if (
+        isinstance(values_argument, tuple)
+        and len(values) == 2
+        and not any(isinstance(v, (Real, tuple)) for v in values)
+    ):
+        coefficients, powers = (list(side) for side in values)
+        if len(coefficients) != len(powers):
+            raise ModelError(
+                f"{name} has {plural(len(coefficients), 'coefficient')} and {plural(len(powers), 'power')}; "
+                f"give one power for each "
+                "coefficient"
+            )
+        values = list(zip(coefficients, powers, strict=True))
     pairs = [v if isinstance(v, (tuple, list)) else (v, len(values) - 1.0 - k) for k, v in enumerate(values)]
     out: Polynomial = {}
     for k, pair in enumerate(pairs):
@@ -164,13 +187,47 @@ def parallel(first: Model, second: Model) -> Model:
     """Return the parallel connection, the sum of both outputs; see :meth:`ftlm.Model.parallel`."""
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
-        raise ModelError(
-            f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
-            "simulated outputs"
-        )
+        raise _unequal_delays(a, b)
     top = multiply_polynomials(a.top, b.bottom)
     add_polynomial(top, multiply_polynomials(b.top, a.bottom))
     return Ratio(top, multiply_polynomials(a.bottom, b.bottom), a.delay).model(output, signal)
+
+
+def combine(operator: str, left: Model | float, right: Model | float) -> Model:
+    """Return the product, sum, difference or quotient of two models, or of a model and a number, as one model.
+
+    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``. In a product, `right` acts first, as in python-control. Raise
+    ModelError in the cases of :func:`series`, :func:`parallel` and :func:`inverse`.
+    """
+    (a, output, _), (b, _, signal) = (_operand(side, f"the operator {operator}") for side in (left, right))
+    if operator in "+-" and a.delay != b.delay:
+        raise _unequal_delays(a, b)
+    if operator == "/" and b.delay:
+        raise ModelError(f"the divisor has a delay of {b.delay:g} s, so its inverse is not causal; leave the delay out")
+    if operator == "/":
+        b = Ratio(b.bottom, b.top, 0.0)
+    top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
+    delay = a.delay + b.delay
+    if operator in "+-":
+        top, delay = multiply_polynomials(a.top, b.bottom), a.delay
+        add_polynomial(top, multiply_polynomials(b.top, a.bottom), 1.0 if operator == "+" else -1.0)
+    if not isinstance(left, Model):
+        output = _operand(right, "")[1]
+    if not isinstance(right, Model) or operator != "*":
+        signal = _operand(left if isinstance(left, Model) else right, "")[2]
+    return Ratio(top, bottom, delay).model(_distinct_name(output, signal), signal)
+
+
+def _operand(side: Model | float, what: str) -> tuple[Ratio, str, str]:
+    """Return (transfer function, output name, input name) of a model; for a number, a gain without signals."""
+    return _ratio(side, what) if isinstance(side, Model) else (Ratio({0.0: float(side)}, {0.0: 1.0}, 0.0), "", "")
+
+
+def _unequal_delays(a: Ratio, b: Ratio) -> ModelError:
+    return ModelError(
+        f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
+        "simulated outputs"
+    )
 
 
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:

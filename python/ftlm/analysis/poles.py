@@ -65,7 +65,8 @@ class Stability:
     method
         Method used: ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
     base
-        Largest number of which all orders are multiples; None if the method is the argument principle.
+        Largest number of which all orders are multiples; None if there is none, or the method is the argument
+        principle.
     """
 
     stable: bool
@@ -277,12 +278,13 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     and p_min are the highest and lowest power of s in D. Delays of inputs do not affect stability.
     """
     coupled = is_coupled(coupling)
-    unstable, on_axis, method, base = 0.0, False, "poles", None
-    for polynomial in characteristic(model, coupled=coupled):
+    unstable, on_axis, method = 0.0, False, "poles"
+    polynomials = characteristic(model, coupled=coupled)
+    for polynomial in polynomials:
         roots = roots_in_base(polynomial)
         if roots is not None:
-            base, values = roots
-            margin = np.abs(np.angle(values)) - base * math.pi / 2
+            own_base, values = roots
+            margin = np.abs(np.angle(values)) - own_base * math.pi / 2
             # Companion matrices give simple roots to about 1e-9; roots within 1e-7 rad of the axis count as on it.
             on_axis |= bool(np.any(np.abs(margin) <= 1e-7))
             unstable += float(np.sum(margin < -1e-7))
@@ -296,8 +298,10 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
         for signal in transfer.inputs:
             top = [p for _, p in transfer.numerators[output, signal]]
             origin = max(origin, round(lowest - min(top), 9)) if top else origin
+    every_power = [p - min(polynomial) for polynomial in polynomials for p in polynomial]
+    base = common_base(every_power) if method == "poles" else None
     good = unstable == 0 and not on_axis and origin <= 0
-    return Stability(good, unstable, max(origin, 0.0), on_axis, method, base if method == "poles" else None)
+    return Stability(good, unstable, max(origin, 0.0), on_axis, method, base)
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:

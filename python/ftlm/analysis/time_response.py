@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +15,10 @@ from ftlm.analysis.frequency_response import (
     step_response,
     with_parameter_vector,
 )
-from ftlm.analysis.poles import settling_time
-from ftlm.errors import FtlmError
+from ftlm.analysis.poles import settling_time, stability, steady_states
+from ftlm.errors import FtlmError, ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, as_floats
 
 #: Number of time points if the user gives none.
@@ -45,6 +47,9 @@ class Response:
         Responses, shape (outputs, inputs, N), in SI units of output over input.
     deviation
         Standard deviation of the values from the covariance of the model, to first order; None if it is not available.
+    final_values
+        Limit of each step response for infinite time, by (output, input): value and standard error, None without a
+        covariance. Empty for an impulse, and for a model that is not stable or has no transfer function.
     """
 
     kind: str
@@ -53,6 +58,7 @@ class Response:
     time: Floats
     values: Floats
     deviation: Floats | None
+    final_values: Mapping[tuple[str, str], tuple[float, float | None]] = field(default_factory=dict)
 
 
 def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
@@ -77,11 +83,13 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     DataError
         If the time points are not uniform from 0.
     ModelError
-        If an input has a saturation or dead zone.
+        If an input has a saturation or dead zone, or `kind` is unknown.
     ConvergenceError
         If the response of an unstable model overflows.
     """
     check_model(model)
+    if kind not in ("step", "impulse"):
+        raise ModelError(f"{setting('kind')} {kind!r} is not known; use 'step' or 'impulse'")
     if time is None:
         # A non-linear model has no poles from which a settling time follows.
         span = settling_time(model) if model.structure.is_linear else 10.0
@@ -92,7 +100,16 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     if kind == "impulse":
         centre = np.diff(centre) / (instants[1] - instants[0])
         instants = (instants[1:] + instants[:-1]) / 2
-    return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, centre, deviation)
+    finals = _final_values(model) if kind == "step" else {}
+    return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, centre, deviation, finals)
+
+
+def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float | None]]:
+    """Return the limits of the step responses of a stable linear model; empty for other models."""
+    if not model.structure.is_linear or model.structure.has_friction or not stability(model).stable:
+        return {}
+    # A response that decays as a power of time has the limit 0.
+    return {(s.output, s.input): (s.gain, s.error if s.gain else 0.0) for s in steady_states(model)}
 
 
 def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:

@@ -14,6 +14,7 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.fractional_calculus import fractional_derivative
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.validation import Floats
 
 #: Range of the relaxation rates [1/s] whose sum approximates a force of fractional order: from the first factor divided
@@ -154,7 +155,7 @@ def energies(
     )
     step = run.step
     if run.length < MIN_SAMPLES:
-        raise DataError(f"run {run.name!r} has {run.length} rows; energies need at least {MIN_SAMPLES}")
+        raise DataError(f"run {run.name!r} has {plural(run.length, 'row')}; energies need at least {MIN_SAMPLES}")
     for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", bend)):
         _check_rest(run.name, name, angle)
 

@@ -31,6 +31,7 @@ from ftlm.model.serialization import load_model
 from ftlm.plot import matplotlib_figures as plots
 from ftlm.report.html_report import model_page
 from ftlm.utils.files import write_atomically
+from ftlm.utils.formatting import plural
 
 
 def _with_runs(
@@ -123,7 +124,7 @@ def simulate(
     loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
     free = loaded.simulate(runs[0], tolerance=tolerance)
     free.to_csv(out, force=force)
-    sentence = f"{free.length} rows of {', '.join(free.outputs)} written to {out}"
+    sentence = f"{plural(free.length, 'row')} of {', '.join(free.outputs)} written to {out}"
     print_outcome(sentence, as_json=as_json, written=out, rows=free.length, outputs=list(free.outputs))
 
 

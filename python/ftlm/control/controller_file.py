@@ -17,6 +17,7 @@ from ftlm.control.realization import MAX_POLES, Realization
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
+from ftlm.utils.parameters import type_name
 from ftlm.utils.validation import Floats, as_floats, error_text
 
 CONTROLLER_SCHEMA = 1
@@ -177,7 +178,7 @@ def save_controller(
     elif isinstance(controller, Lqg):
         record = _lqg(controller)
     else:
-        raise ModelError(f"controller is a {type(controller).__name__}; give a DiscretePid or an Lqg")
+        raise ModelError(f"controller is {type_name(controller)}; give a DiscretePid or an Lqg")
     kind = "pid" if isinstance(record, PidFile) else "lqg"
     file = ControllerFile(
         "ftlm-controller", CONTROLLER_SCHEMA, f"ftlm {__version__}", str(model), ALGORITHM_TEXTS[kind], record
@@ -273,7 +274,7 @@ class JointControllers:
         self._reads: list[list[int]] = []
         for j, loop in enumerate(self.loops):
             if not isinstance(loop, (DiscretePid, Lqg, type(None))):
-                raise ModelError(f"controller {j + 1} is a {type(loop).__name__}; give a DiscretePid, an Lqg or None")
+                raise ModelError(f"controller {j + 1} is {type_name(loop)}; give a DiscretePid, an Lqg or None")
             names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLE_NAMES[2 * j],)
             unknown = [n for n in names if n not in ANGLE_NAMES]
             if unknown:

@@ -23,7 +23,7 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.validation import (
     Complex,
     Floats,
@@ -153,8 +153,7 @@ class DiscretePid:
     ) -> None:
         if not isinstance(pid, FractionalPid):
             raise ModelError(
-                f"pid is a {type(pid).__name__}, not a FractionalPid; design one, or construct it from its five "
-                "parameters"
+                f"pid is {type_name(pid)}, not a FractionalPid; design one, or construct it from its five parameters"
             )
         for name, order_value in (("lam", pid.lam), ("mu", pid.mu)):
             if order_value > 1:

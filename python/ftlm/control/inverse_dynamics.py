@@ -15,7 +15,7 @@ from ftlm.control.stability_margins import LoopDesign, Plant
 from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import setting, type_name
 from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_repr
 
 #: Minimum length of the Fourier transform relative to the path, and exponent to which the weight exp(-a t) decays over
@@ -199,7 +199,7 @@ def inverse_dynamics(
     doi:10.1002/rob.4620040406).
     """
     if not isinstance(design, LoopDesign):
-        raise ModelError(f"design is a {type(design).__name__}, not a PidDesign or an LqgDesign; design a loop first")
+        raise ModelError(f"design is {type_name(design)}, not a PidDesign or an LqgDesign; design a loop first")
     rows = _path(path)
     count, start = check_samples(samples, seed)
     most = check_limit(limit)

@@ -37,6 +37,7 @@ from ftlm.data.sampling import (
 )
 from ftlm.data.units import TIME_UNITS, check_units
 from ftlm.errors import DataError
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, join_names
 
@@ -159,7 +160,8 @@ class RunArguments:
         if self.inputs and missing != "hold":
             row = first + int(np.flatnonzero(np.diff(places) > 1)[0]) + 1
             raise DataError(
-                f"{self.time_label}: {count} rows are missing in a regular grid of {step:.6g} s, the first before row "
+                f"{self.time_label}: {plural(count, 'row')} missing in a regular grid of {step:.6g} s, the "
+                f"first before row "
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
                 f"the inputs over them with {parameter('missing', 'hold')}"
             )
@@ -260,7 +262,7 @@ class RunArguments:
         if last - first < MIN_RUN_SAMPLES:
             thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(
-                f"{thing}: {last - first} rows{' in the window' if self.window is not None else ''}, "
+                f"{thing}: {plural(last - first, 'row')}{' in the window' if self.window is not None else ''}, "
                 f"{MIN_RUN_SAMPLES} are needed; use a longer record"
             )
         return first, last

@@ -22,6 +22,7 @@ from ftlm.data.sampling import as_seconds, as_vector, check_step_agrees, missing
 from ftlm.data.units import TIME_UNITS, is_time_name, parse_unit, split_time_header, time_unit_of
 from ftlm.errors import DataError
 from ftlm.utils.files import check_new, write_atomically
+from ftlm.utils.parameters import type_name
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
 
@@ -121,7 +122,7 @@ def _columns_of(frame: object) -> list[Hashable]:
         columns = getattr(getattr(frame, "dtype", None), "names", None)
     if columns is None or not hasattr(frame, "__getitem__"):
         raise DataError(
-            f"frame is a {type(frame).__name__}; pass a pandas or polars DataFrame (collect() a lazy one first), "
+            f"frame is {type_name(frame)}; pass a pandas or polars DataFrame (collect() a lazy one first), "
             "a dict of arrays or a structured array"
         )
     return list(columns)

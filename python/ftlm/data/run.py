@@ -40,6 +40,7 @@ from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import Figures
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
 
@@ -384,7 +385,9 @@ class Run:
         """
         first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "window")
         if last - first < MIN_RUN_SAMPLES:
-            raise DataError(f"window: {last - first} rows remain, {MIN_RUN_SAMPLES} are needed; widen the limits")
+            raise DataError(
+                f"window: {plural(last - first, 'row')} left, {MIN_RUN_SAMPLES} are needed; widen the limits"
+            )
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ftlm import _core
 from ftlm.errors import DataError
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.validation import Floats, as_array, as_mapping, bad_rows, join_names, nearest
 
@@ -181,7 +182,8 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
     if wrong:
         thing, count = wrong[0]
         raise DataError(
-            f"{thing}: {count} rows where {expected} are expected, {len(wrong)} of {len(lengths)} columns differ; "
+            f"{thing}: {plural(count, 'row')} where {expected} are expected, {len(wrong)} of {len(lengths)} "
+            f"columns differ; "
             "give every column one number per row of the same record"
         )
 
@@ -404,7 +406,8 @@ def check_rows(since: Floats, step: float) -> int:
     rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
     if rows < MIN_RUN_SAMPLES:
         raise DataError(
-            f"{parameter('resample', step)} leaves {rows} rows, {MIN_RUN_SAMPLES} are needed; use a smaller step"
+            f"{parameter('resample', step)} leaves {plural(rows, 'row')}, {MIN_RUN_SAMPLES} are needed; use a "
+            f"smaller step"
         )
     return rows
 

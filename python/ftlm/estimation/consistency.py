@@ -21,7 +21,7 @@ from ftlm.structure.structure import Offset, Structure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, finite, format_bound
+from ftlm.utils.formatting import Cell, finite, format_bound, plural
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95, chi_squared_99
 from ftlm.utils.validation import Floats, check_integer
@@ -397,7 +397,9 @@ def _shift_rows(samples: Floats, rows: int) -> Floats:
 def split_run(run: Run, parts: int) -> list[Run]:
     """Return consecutive segments of a run of nearly equal length; raise DataError if the run is too short."""
     if parts * MIN_RUN_SAMPLES > run.length:
-        raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer parts")
+        raise DataError(
+            f"{run.name} has {plural(run.length, 'row')}, too few to be cut into {parts} parts; use fewer parts"
+        )
     ends = [k * run.length // parts for k in range(parts + 1)]
     return [
         run.window(a * run.step if a else None, b * run.step if b < run.length else None)

@@ -31,6 +31,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 from ftlm.utils.statistics import NORMAL_95
@@ -223,15 +224,39 @@ class FrequencyValidation:
         Error of the model on each response.
     verdict
         Verdict on the model that takes this validation into account.
+    findings
+        Findings about the errors on the validation responses.
     """
 
     data: tuple[FrequencyData, ...]
     errors: tuple[ResponseError, ...]
     verdict: Verdict
+    findings: tuple[Finding, ...] = field(default=())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Findings as sentences."""
+        return texts(self.findings)
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """Fit in percent by output: 100 minus the root mean square error in percent of the measured response."""
+        return _fit_of(self.errors)
+
+    #: Same as `fit`, under a name that states the unit.
+    fit_percent = fit
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame with one row per validation response: signals and relative errors in percent."""
+        return to_frame([vars(e) for e in self.errors], ["name"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
-        return {"errors": [vars(e) for e in self.errors], "verdict": self.verdict.to_dict()}
+        return {
+            "errors": [vars(e) for e in self.errors],
+            **attributes(self, ("findings", "warnings")),
+            "verdict": self.verdict.to_dict(),
+        }
 
     def __str__(self) -> str:
         return "\n".join([*wrap_text(str(self.verdict)), *_errors_in_words(self.errors)])
@@ -356,7 +381,16 @@ class FrequencyIdentification:
         """
         others = tuple(assign_signals(self.system, record) for record in as_frequency_data(data))
         errors = tuple(error_of(self.system, record) for record in others)
-        return FrequencyValidation(others, errors, self._assess(errors, others))
+        return FrequencyValidation(others, errors, self._assess(errors, others), self._validation_findings(errors))
+
+    def _validation_findings(self, others: Sequence[ResponseError]) -> tuple[Finding, ...]:
+        """Return a finding on each missed response, and one on the first error far above the estimation error."""
+        findings = _missed_responses(others)
+        most = max(e.rms for e in self.errors)
+        failures = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
+        if failures:
+            findings.append(make_finding("response_lost", run=failures[0].name, own=most, rms=failures[0].rms))
+        return tuple(findings)
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -370,10 +404,7 @@ class FrequencyIdentification:
     @property
     def fit(self) -> dict[str, float]:
         """Fit in percent by output: 100 minus the root mean square error in percent of the measured response."""
-        squares: dict[str, list[float]] = {}
-        for error in self.errors:
-            squares.setdefault(error.output, []).append(error.rms**2)
-        return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
+        return _fit_of(self.errors)
 
     #: Same as `fit`, under a name that states the unit.
     fit_percent = fit
@@ -396,21 +427,9 @@ class FrequencyIdentification:
         return self._assess(None)
 
     def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
-        findings: list[Finding] = []
-        own = self.errors
-        for error in (*own, *(others or ())):
-            if not error.rms <= 100 * MAX_RELATIVE_ERROR:
-                subject = {"run": error.name, "output": error.output, "input": error.input}
-                findings.append(make_finding("response_missed", **subject, rms=error.rms))
-        findings += self._unstable_poles()
+        findings = [*_missed_responses(self.errors), *_missed_responses(others or ()), *self._unstable_poles()]
         findings += [group.first_finding for group in group_findings(self.findings)]
-        if others is not None:
-            most = max(e.rms for e in own)
-            failures = [
-                e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR
-            ]
-            if failures:
-                findings.append(make_finding("response_lost", run=failures[0].name, own=most, rms=failures[0].rms))
+        findings += [f for f in self._validation_findings(others or ()) if f not in findings]
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
             findings.append(make_finding("response_not_validated"))
@@ -622,6 +641,23 @@ def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     return ResponseError(
         record.name, record.output, record.input, rms, 100 * float(missed[at]), float(record.frequency[at])
     )
+
+
+def _missed_responses(errors: Sequence[ResponseError]) -> list[Finding]:
+    """Return a finding on each response of which the model misses more than `MAX_RELATIVE_ERROR`."""
+    return [
+        make_finding("response_missed", run=e.name, output=e.output, input=e.input, rms=e.rms)
+        for e in errors
+        if not e.rms <= 100 * MAX_RELATIVE_ERROR
+    ]
+
+
+def _fit_of(errors: Sequence[ResponseError]) -> dict[str, float]:
+    """Return 100 minus the root mean square of the relative errors in percent, by output."""
+    squares: dict[str, list[float]] = {}
+    for error in errors:
+        squares.setdefault(error.output, []).append(error.rms**2)
+    return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
 
 
 def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:

@@ -48,6 +48,7 @@ from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.progress import ShareTracker
 from ftlm.simulation.discretization import check_linear, default_m
+from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
@@ -82,7 +83,7 @@ INITIAL_CONDITIONS_SHARE = 0.7
 @check_arguments
 def identify(
     runs: Run | Sequence[Run],
-    structure: Structure,
+    structure: Structure | str,
     *,
     method: str | EstimationMethod = "output-error",
     initial: str | Iterable[float] | None = None,
@@ -104,7 +105,7 @@ def identify(
         One run, or several runs with the same names and units. All are fitted together, and each has its own initial
         terms.
     structure
-        Structure to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+        Structure to identify, or the text of its equations; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     method
         Method of estimation with its options: :class:`ftlm.OutputError`, :class:`ftlm.InstrumentalVariables`,
         :class:`ftlm.MultiInnovation`, :class:`ftlm.LeastSquares` or :class:`ftlm.GeneticAlgorithm`. A name selects the
@@ -156,8 +157,7 @@ def identify(
         estimator = method_with_options(estimator.name, {**vars(estimator), "bounds": bounds})
     if isinstance(structure, str) and structure == "auto":
         raise ModelError("structure = 'auto'; use ftlm.select(runs, 'auto').best, which chooses and identifies one")
-    if not isinstance(structure, Structure):
-        raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
+    structure = as_structure("structure", structure)
     check_threads(threads)
     if initial is not None:
         structure = replace(structure, initial=check_initial(initial))
@@ -519,7 +519,7 @@ class BatchResult:
 
 
 def identify_one(
-    runs: Run | Sequence[Run], structure: Structure, options: dict[str, Any]
+    runs: Run | Sequence[Run], structure: Structure | str, options: dict[str, Any]
 ) -> tuple[Identification | None, FtlmError | None]:
     """Identify one item of a batch, and return (result, None) or (None, error); other faults become InternalError."""
     try:
@@ -533,7 +533,7 @@ def identify_one(
 @check_arguments
 def identify_many(
     runs: Sequence[Run | Sequence[Run]],
-    structure: Structure,
+    structure: Structure | str,
     *,
     method: str | EstimationMethod = "output-error",
     offset: Offset | None = None,

@@ -22,6 +22,7 @@ from ftlm.findings import Finding, make_finding, unique
 from ftlm.order_search.options import Coefficients, Criterion, Norm, OrderGrid, RowBasis, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
+from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.statistics import chi_squared_99, is_constant, variance_inflation
@@ -32,7 +33,7 @@ from ftlm.validation.residual_tests import Residuals
 @check_arguments
 def search_orders(
     runs: Run | Sequence[Run],
-    equation: Structure,
+    equation: Structure | str,
     order_grid: OrderGrid | None = None,
     *,
     criterion: Criterion = "output-error",
@@ -60,7 +61,8 @@ def search_orders(
     runs
         One run, or several runs with the same names and units, whose scores are added.
     equation
-        Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+        Structure with free orders, or the text of its equations; see :func:`ftlm.equation` and
+        :func:`ftlm.flexible_link`.
     order_grid
         Intervals and increment of the orders; see :func:`ftlm.order_grid`.
     criterion
@@ -131,10 +133,10 @@ def search_orders(
         "top": top,
         "pruning": pruning,
     }
-    several = as_runs(runs)
+    several, structure = as_runs(runs), as_structure("equation", equation)
     result = rank_orders(
         several,
-        equation,
+        structure,
         order_grid,
         m=m,
         threads=threads,
@@ -143,7 +145,7 @@ def search_orders(
         executor=executor,
         **settings,
     )
-    return with_verdict(result, several, equation, SearchSettings(**settings), order_grid, m=m)
+    return with_verdict(result, several, structure, SearchSettings(**settings), order_grid, m=m)
 
 
 def with_verdict(
@@ -164,7 +166,8 @@ def with_verdict(
         failed = make_finding("rank_not_validated", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
     alike = [] if result.residuals is None else _alike_findings(search, result.residuals)
-    return replace(search, verdict=result.verdict, model_findings=unique([*alike, *result.findings]))
+    findings = unique([*alike, *result.findings])
+    return replace(search, verdict=result.verdict, model_findings=findings, best=result)
 
 
 def identification_of_searches(

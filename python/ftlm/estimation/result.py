@@ -248,7 +248,7 @@ class Identification:
         They are estimate ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have
         profile-likelihood intervals instead, which may be asymmetric or unbounded.
         """
-        values, errors = self._values, self.standard_errors
+        values, errors = self.values, self.standard_errors
         quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
         return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
 
@@ -275,7 +275,7 @@ class Identification:
         coefficients = model.coefficients if self.task is None else self.task.structure.coefficient_names
         free = {*model.orders, *coefficients, *self.standard_errors}
         values_by_name = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
-        values = self._values | {n: v for n, v in values_by_name.items() if n not in self._values}
+        values = self.values | {n: v for n, v in values_by_name.items() if n not in self.values}
         own = parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
         return {**own, **self.offsets}
 
@@ -286,7 +286,7 @@ class Identification:
         return offset_estimates(self.model, names, self.comparison.offsets, self.offset_errors)
 
     @property
-    def _values(self) -> dict[str, float]:
+    def values(self) -> dict[str, float]:
         """Values of orders, coefficients, and estimated delays, saturations and dead zones by name."""
         fit = {} if self.joint is None else self.joint.values_by_name
         return {**self.orders, **fit, **self.coefficients}
@@ -294,17 +294,22 @@ class Identification:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the rows and columns of ``covariance``."""
-        return () if self.joint is None else tuple(self.joint.names)
+        if self.joint is not None:
+            return tuple(self.joint.names)
+        return tuple(n for n, p in self.parameters.items() if not p.fixed and n in self.values)
 
     @property
     def covariance(self) -> Floats:
         """Covariance matrix of the parameters in ``names``, robust to colored residuals.
 
-        It has shape (0, 0) for methods other than output error.
-
-        Parameters that are not identifiable have infinite variances, and NaN covariances.
+        Parameters that are not identifiable have infinite variances, and NaN covariances. Methods other than output
+        error give no covariances: these are NaN, and the variances are the squares of the standard errors, if any.
         """
-        return np.zeros((0, 0)) if self.joint is None else self.joint.covariance
+        if self.joint is not None:
+            return self.joint.covariance
+        matrix = np.full((len(self.names), len(self.names)), math.nan)
+        np.fill_diagonal(matrix, [self.standard_errors.get(n, math.nan) ** 2 for n in self.names])
+        return matrix
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -556,7 +561,7 @@ class Identification:
         lines += [f"  {self.model.structure.equation_text(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
-        for name, value in self._values.items():
+        for name, value in self.values.items():
             spread = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
                 spread += f"   {self.profiles[name]}"

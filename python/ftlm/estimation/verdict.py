@@ -387,10 +387,11 @@ def _on(run: str) -> str:
 
 
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
-    """Yield a finding on the first run and output whose validation fit is far below the estimation fit, if any."""
+    """Yield a finding on the first run of each output whose validation fit is far below the estimation fit."""
+    found: set[str] = set()
     for run, errors in _each(validation):
         for output, figures in errors.items():
-            if output not in estimation_fits:
+            if output not in estimation_fits or output in found:
                 continue
             misfit, own = 100.0 - figures.fit, 100.0 - estimation_fits[output]
             if not (
@@ -399,7 +400,7 @@ def _validation_losses(estimation_fits: Mapping[str, float], validation: Compari
             ):
                 numbers = {"before": estimation_fits[output], "after": figures.fit, "where": _on(run)}
                 yield make_finding("fit_falls", run=run, output=output, **numbers)
-                return
+                found.add(output)
 
 
 def _residuals(result: Identification) -> Iterator[Finding]:

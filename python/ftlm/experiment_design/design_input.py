@@ -24,7 +24,7 @@ from ftlm.model.model import Model, check_model
 from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr
@@ -225,7 +225,7 @@ def design_input(
         If the reference run lacks an input of the model.
     """
     if progress is not None and not callable(progress):
-        raise ModelError(f"progress is a {type(progress).__name__}; give a function of (done, total)")
+        raise ModelError(f"progress is {type_name(progress)}; give a function of (done, total)")
     solved = model.model if isinstance(model, Identification) else model
     check_model(solved)
     check_linear(solved.equations, "a design of the next experiment")
@@ -466,7 +466,7 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
     if names is None:
         names = fit.problem.orders or fit.names
     if not isinstance(names, Iterable):
-        raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(fit.names)}")
+        raise ModelError(f"names is {type_name(names)}; give a list of names of {', '.join(fit.names)}")
     name_list = list(names)
     for k, name in enumerate(name_list):
         if not isinstance(name, str) or name not in fit.names:

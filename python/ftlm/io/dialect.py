@@ -20,7 +20,7 @@ from ftlm.io.cell_parsing import (
     unit_of,
 )
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter
+from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter, type_name
 from ftlm.utils.validation import join_names, nearest, whole_number
 
 #: Cell separators by name; None means any white space.
@@ -108,7 +108,7 @@ class Layout:
         if self.encoding is not None:
             object.__setattr__(self, "encoding", _encoding(self.encoding))
         if self.sheet is not None and not isinstance(self.sheet, str):
-            raise DataError(f"{layout_fields('sheet')} is a {type(self.sheet).__name__}; give the name of a sheet")
+            raise DataError(f"{layout_fields('sheet')} is {type_name(self.sheet)}; give the name of a sheet")
 
     @classmethod
     def of(cls, layout: object) -> Layout:
@@ -118,9 +118,7 @@ class Layout:
         if isinstance(layout, Layout):
             return layout
         if not isinstance(layout, Mapping):
-            raise DataError(
-                f"{parameter('layout')} is a {type(layout).__name__}; pass a dict, such as dict(decimal='comma')"
-            )
+            raise DataError(f"{parameter('layout')} is {type_name(layout)}; pass a dict, such as dict(decimal='comma')")
         keys = [f.name for f in fields(cls)]
         for key in layout:
             if key not in keys:

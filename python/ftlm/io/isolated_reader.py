@@ -24,6 +24,7 @@ from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable, dates_problem
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, layout_parameter
 from ftlm.utils.resources import python_child
 from ftlm.utils.validation import Floats
@@ -277,7 +278,7 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
     rows, count = matrix.shape
     if count > rows:
         problem = DataError(
-            f"{path.name}: the matrix {name!r} has {rows} rows and {count} columns; "
+            f"{path.name}: the matrix {name!r} has {plural(rows, 'row')} and {plural(count, 'column')}; "
             f"samples belong in rows: transpose it in MATLAB ({name} = {name}.';) and save it again"
         )
         return [Column(name, f"{name}.1", path, values[:, 0], problem, name)]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeAlias, cast
 
 import msgspec
+import numpy as np
 
 from ftlm.data.construction import RunArguments
 from ftlm.data.export import Header
@@ -25,7 +26,7 @@ from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER, nearest_file_hint, read_toml
-from ftlm.utils.parameters import NAMED_COLUMNS, parameter
+from ftlm.utils.parameters import NAMED_COLUMNS, parameter, type_name
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -273,7 +274,8 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
             if unused.timestamps is not None:
                 check_step_agrees(selection.step, unused.timestamps.seconds(label, selection.layout.dates), label)
             elif unit in TIME_UNITS:
-                check_step_agrees(selection.step, unused.numbers(blank=True) * TIME_UNITS[unit], label)
+                times = unused.numbers(blank=True).astype(np.float64) * TIME_UNITS[unit]
+                check_step_agrees(selection.step, times, label)
         return _TimeColumn()
     matrices = [column.matrix for column in columns if column.matrix is not None]
     column, assumed = pool.time(selection.time, matrices, {column.name for column in columns})
@@ -357,7 +359,7 @@ def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
     """
     entries = [argument] if isinstance(argument, (str, os.PathLike)) else argument
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
-        raise DataError(f"path is a {type(argument).__name__}; pass the path of a file, or a list of paths")
+        raise DataError(f"path is {type_name(argument)}; pass the path of a file, or a list of paths")
     if not entries:
         raise DataError("path: the list is empty; pass the path of at least one file")
     places = [_split_group(Path(entry)) for entry in entries]
@@ -480,7 +482,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
         read = msgspec.structs.asdict(read_toml(columns, "names of columns", remedy, _ColumnsFile))
         return {key: value for key, value in read.items() if value is not None}
     if not isinstance(columns, Mapping):
-        raise DataError(f"{parameter('columns')} is a {type(columns).__name__}; pass a dict or the path of a TOML file")
+        raise DataError(f"{parameter('columns')} is {type_name(columns)}; pass a dict or the path of a TOML file")
     keys = COLUMN_KEYS
     unknown = [key for key in columns if key not in keys]
     if unknown:

@@ -17,7 +17,7 @@ from ftlm.io.load import PathLike, base_name, read_tables
 from ftlm.io.table import Column, Pool
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
-from ftlm.utils.parameters import PART_COLUMNS, parameter
+from ftlm.utils.parameters import PART_COLUMNS, parameter, type_name
 from ftlm.utils.validation import Complex, Floats, join_names, nearest
 
 #: Words for each part of a response, alone or combined with the letter z, h or g, as in ``zreal`` and ``im(z)``.
@@ -224,7 +224,7 @@ def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
 
 def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _ResponseColumn]:
     if not isinstance(columns, Mapping):
-        raise DataError(f"columns is a {type(columns).__name__}; pass a dict of part: column")
+        raise DataError(f"columns is {type_name(columns)}; pass a dict of part: column")
     parts = {}
     for part, spec in columns.items():
         if part not in _PART_SYNONYMS:

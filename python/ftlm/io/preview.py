@@ -34,7 +34,7 @@ from ftlm.io.load_frequency import is_response
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import write_atomically
-from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, choose_text, flag_of, parameter
+from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, choose_text, flag_of, parameter, type_name
 from ftlm.utils.validation import CSV_TIME, join_names
 
 _MAX_LISTED_COLUMNS = 40
@@ -253,7 +253,7 @@ def open_file(
         result has a `problem`.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
+        raise DataError(f"path is {type_name(path)}; pass the path of one file")
     selection = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
     return preview_selection(path, selection, LoadOptions(window, resample, None, time_unit, missing))
 

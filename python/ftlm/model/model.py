@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -418,6 +419,46 @@ class Model:
         from ftlm.analysis.model_algebra import feedback
 
         return feedback(self, back, sign)
+
+    def __mul__(self, other: Model | float) -> Model:
+        """Return the series connection in which `other`, a model or a gain, acts first, as in python-control."""
+        return self._combine("*", self, other)
+
+    def __rmul__(self, other: float) -> Model:
+        return self._combine("*", other, self)
+
+    def __add__(self, other: Model | float) -> Model:
+        """Return the parallel connection with another model or a gain."""
+        return self._combine("+", self, other)
+
+    def __radd__(self, other: float) -> Model:
+        return self._combine("+", other, self)
+
+    def __sub__(self, other: Model | float) -> Model:
+        """Return the difference of the outputs of this model and another model or a gain, for the same input."""
+        return self._combine("-", self, other)
+
+    def __rsub__(self, other: float) -> Model:
+        return self._combine("-", other, self)
+
+    def __truediv__(self, other: Model | float) -> Model:
+        """Return this model times the inverse of another model or of a gain."""
+        return self._combine("/", self, other)
+
+    def __rtruediv__(self, other: float) -> Model:
+        return self._combine("/", other, self)
+
+    def __neg__(self) -> Model:
+        return self._combine("*", -1.0, self)
+
+    @staticmethod
+    def _combine(operator: str, left: Model | float, right: Model | float) -> Model:
+        """Return the result of an operator; NotImplemented for an operand that is neither a model nor a number."""
+        from ftlm.analysis.model_algebra import combine
+
+        if not all(isinstance(side, (Model, Real)) for side in (left, right)):
+            return NotImplemented  # type: ignore[no-any-return]
+        return combine(operator, left, right)
 
     def inverse(self) -> Model:
         """Return the exact inverse model, from the output to the input.

@@ -10,7 +10,7 @@ from typing import Any
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.errors import ConvergenceError, FtlmError, ModelError
+from ftlm.errors import FtlmError, ModelError
 from ftlm.order_search.options import DEFAULT_INCREMENT, OrderGrid, SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
@@ -96,8 +96,7 @@ def certify_orders(
         If runs lack a signal of the equation.
     ModelError
         If the structure is coupled under an order law, or has initial terms, nonlinear terms or known coefficients.
-        Also if an option is out of range, the intervals contain no orders or require too many boxes, or the terms are
-        linearly dependent at a point of `start`.
+        Also if an option is out of range, or the intervals contain no orders or require too many boxes.
     KeyboardInterrupt
         On Ctrl-C, within half a second.
     """
@@ -165,8 +164,8 @@ def certify_orders(
 def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
     """Return the minimum RMS equation error at given orders, over all coefficients.
 
-    It is infinite if the computation raises ConvergenceError. Raise ModelError if an order is missing or outside its
-    interval, or if the terms are linearly dependent. The message names the point by its `index` among `count` points.
+    It is infinite if the terms are linearly dependent. Raise ModelError if an order is missing or outside its interval.
+    The message names the point by its `index` among `count` points.
     """
     names = {name: (min(values), max(values)) for name, values in job.values.items()}
     numbers = {str(name): real_number("start", value) for name, value in orders.items()}
@@ -175,7 +174,8 @@ def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: in
         raise ModelError(f"start {index} of {count} is {short_repr(dict(orders))}; give {intervals}")
     try:
         return run_job(replace(job, values={n: (numbers[n],) for n in names}, progress=None)).score
-    except ConvergenceError:
+    except FtlmError:
+        # The terms are linearly dependent at these orders.
         return math.inf
 
 

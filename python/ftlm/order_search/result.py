@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, unique
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, texts, unique
 from ftlm.model.model import Model
+from ftlm.model.model_access import BestIdentification
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
@@ -16,6 +17,7 @@ from ftlm.utils.formatting import Cell, Exact, attributes, number, symbol, symbo
 from ftlm.utils.parameters import choose_text, parameter
 
 if TYPE_CHECKING:
+    from ftlm.estimation.result import Identification
     from ftlm.estimation.verdict import Verdict
 
 #: RMS simulation error over standard deviation of the output (NR) above which a simulation explains little of it.
@@ -59,7 +61,7 @@ class OrderCertificate:
     unstable_poles
         Number of poles of this model with a positive real part; NaN if unknown.
     start_errors
-        RMS equation error at each point of the argument `start`.
+        RMS equation error at each point of the argument `start`; infinite if the terms are linearly dependent there.
     """
 
     lower_bound: float
@@ -171,7 +173,7 @@ class SearchRow:
 
 
 @dataclass(frozen=True)
-class SearchResult:
+class SearchResult(BestIdentification):
     """Result of an order search: table of the best candidates, best model, and counts of excluded candidates.
 
     Parameters
@@ -203,6 +205,9 @@ class SearchResult:
     verdict, model_findings
         Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. They are None and empty for a search
         resumed from a checkpoint file, which does not contain the runs.
+    best
+        Identification at the orders of rank 1, from which fit, standard errors, intervals, covariance, report and
+        validation are taken. None for a resumed search, and if the identification failed.
     """
 
     table: list[SearchRow]
@@ -217,6 +222,7 @@ class SearchResult:
     free_runs: int = 0
     verdict: Verdict | None = field(default=None, compare=False)
     model_findings: tuple[Finding, ...] = field(default=(), compare=False)
+    best: Identification | None = field(default=None, compare=False, repr=False)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -230,9 +236,10 @@ class SearchResult:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters of the best model by name, without standard errors, because a search does not compute them."""
+        """Parameters of the best model by name, with standard errors if the estimator gives them."""
         values = {**self.orders, **self.coefficients}
-        return parameter_estimates(self.model, values, errors={}, intervals={}, free=values)
+        errors, intervals = ({}, {}) if self.best is None else (self.best.standard_errors, self.best.intervals)
+        return parameter_estimates(self.model, values, errors=errors, intervals=intervals, free=values)
 
     @property
     def score(self) -> float:
@@ -301,6 +308,11 @@ class SearchResult:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the table, followed by those on the model of rank 1, without duplicates."""
         return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "order_on_edge")])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Findings as sentences."""
+        return texts(self.findings)
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)

@@ -48,6 +48,7 @@ from ftlm.simulation.discretization import (
 )
 from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.simulation.output_samples import simulate_samples
+from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Structure
 from ftlm.svg.charts import Landscape
 from ftlm.svg.figure import SMALL_WIDTH_PX
@@ -425,8 +426,7 @@ def make_job(
     Raise ModelError or DataError if an argument is invalid.
     """
     checked, workers = as_runs(runs), check_threads(threads)
-    if not isinstance(equation, Structure):
-        raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
+    equation = as_structure("equation", equation)
     if not equation.order_names:
         raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
     check_frictionless(equation.equations, "an order search")

@@ -261,10 +261,10 @@ class TimeResponse(Response):
 
     Parameters
     ----------
-    kind, outputs, inputs, time, values, deviation
+    kind, outputs, inputs, time, values, deviation, final_values
         ``"step"`` or ``"impulse"``. Names of outputs and inputs. Sample times [s], shape (N,). Responses and their
         standard deviations (or None), shape (outputs, inputs, N). An impulse response is a mean over each sampling
-        interval, at the middle of the interval.
+        interval, at the middle of the interval. Limits of step responses by (output, input): value and standard error.
     units
         Units of the signals by name.
     """
@@ -279,12 +279,15 @@ class TimeResponse(Response):
         lines = [f"{self.kind} response, {self.time.size} samples to {self.time[-1]:.4g} s"]
         for i, output in enumerate(self.outputs):
             for j, signal in enumerate(self.inputs):
-                values, last = self.values[i, j], self.values[i, j, -1]
+                values = self.values[i, j]
                 at = int(np.argmax(np.abs(values)))
-                sure = "" if self.deviation is None else f" ± {self.deviation[i, j, -1]:.2g}"
+                last, error = values[-1], None if self.deviation is None else self.deviation[i, j, -1]
+                name = f"value at {self.time[-1]:.4g} s"
+                if (output, signal) in self.final_values:
+                    (last, error), name = self.final_values[output, signal], "final value"
+                sure = f" ± {error:.2g}" if error else ""
                 lines.append(
-                    f"  {output} from {signal}: final value {last:.5g}{sure}, peak {values[at]:.5g} at "
-                    f"{self.time[at]:.4g} s"
+                    f"  {output} from {signal}: {name} {last:.5g}{sure}, peak {values[at]:.5g} at {self.time[at]:.4g} s"
                 )
         return "\n".join(lines)
 

@@ -20,7 +20,7 @@ from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCAL
 from ftlm.simulation.discretization import equation_tuple
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import read_toml
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import setting, type_name
 from ftlm.utils.validation import join_names, nearest, short_repr
 
 #: Signals of the arm, in the order of their indices in the Rust core.
@@ -164,7 +164,7 @@ class ArmParameters:
             return PARAMETER_SETS[source]
         if not isinstance(source, (str, os.PathLike)):
             raise ModelError(
-                f"parameters is a {type(source).__name__}; use {join_names(PARAMETER_SETS)}, or a TOML file's path"
+                f"parameters is {type_name(source)}; use {join_names(PARAMETER_SETS)}, or a TOML file's path"
             )
         if not os.fspath(source).endswith(".toml"):
             raise ModelError(

@@ -26,7 +26,8 @@ from ftlm.rig.excitation import finite_number
 from ftlm.rig.recording import Experiment, RigSetup, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.formatting import plural
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.validation import Floats, as_array, check_seed, error_text
 
 #: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
@@ -119,7 +120,7 @@ def control(
     if not callable(controller):
         hint = "; a design is run by its controller" if isinstance(controller, LoopDesign) else ""
         raise ModelError(
-            f"controller is a {type(controller).__name__}; give a function controller(time, angles, reference) "
+            f"controller is {type_name(controller)}; give a function controller(time, angles, reference) "
             f"that returns two currents [A]{hint}"
         )
     controller = _of_both_joints(controller)
@@ -160,7 +161,7 @@ def _of_both_joints(controller: Controller) -> Controller:
         return JointControllers(None, controller) if second else JointControllers(controller)
     if isinstance(controller, (Lqg, DiscretePid)):
         raise ModelError(
-            f"controller is a {type(controller).__name__} of one joint; pass JointControllers(controller) for joint 1 "
+            f"controller is {type_name(controller)} of one joint; pass JointControllers(controller) for joint 1 "
             "or JointControllers(None, controller) for joint 2, of ftlm.control"
         )
     return controller
@@ -310,7 +311,8 @@ def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -
     reference = np.tile(values, (rows, 1)) if values.ndim == 1 else values
     if len(reference) != rows:
         raise DataError(
-            f"reference has {len(reference)} rows, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has {rows}; "
+            f"reference has {plural(len(reference), 'row')}, and a run of {(rows - 1) / rate:g} s at {rate:g} "
+            f"Hz has {rows}; "
             f"give as many, or leave {parameter('duration')} out"
         )
     for hub, most in enumerate(travel):

@@ -26,7 +26,7 @@ from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, ch
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import check_free
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
 
 COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COLUMNS}
@@ -401,7 +401,7 @@ class RigSetup:
             check_choice("rig", self.rig, ("virtual", "q8"))
             return QuanserBoard(card=self.board), {"card": self.board}
         if not hasattr(self.rig, "hardware"):
-            raise ModelError(f"rig is a {type(self.rig).__name__}; use 'virtual', 'q8' or a board of your own")
+            raise ModelError(f"rig is {type_name(self.rig)}; use 'virtual', 'q8' or a board of your own")
         own = getattr(self.rig, "parameters", None)
         return self.rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
@@ -432,7 +432,7 @@ class Experiment:
             if not isinstance(flag, bool):
                 raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
-            raise ModelError(f"progress is a {type(self.progress).__name__}; give a function of (done, total)")
+            raise ModelError(f"progress is {type_name(self.progress)}; give a function of (done, total)")
         if setup.sensor_filter is not None and not (
             isinstance(setup.sensor_filter, str) and setup.sensor_filter == "stock"
         ):

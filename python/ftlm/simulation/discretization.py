@@ -26,6 +26,7 @@ from ftlm.simulation.nonlinear_columns import append_columns, check_columns, non
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, choose_text, parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
@@ -393,7 +394,7 @@ def _check_missing(run: Run, structure: Structure) -> None:
     if lacking is not None:
         mask = missing[lacking]
         raise DataError(
-            f"signal {lacking!r} of run {run.name!r} has no value in {int(mask.sum())} rows, first row "
+            f"signal {lacking!r} of run {run.name!r} has no value in {plural(int(mask.sum()), 'row')}, first row "
             f"{int(np.flatnonzero(mask)[0])}, and enters the equation of {drivers[lacking]} as measured; fill these "
             f"rows yourself, avoid them with {parameter('window')}, or use {parameter('coupling', 'simulated')}"
         )
@@ -410,7 +411,8 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
     for run in runs:
         for name, is_missing in run.missing_samples.items():
             raise DataError(
-                f"output {name!r} of run {run.name!r} has no value in {int(is_missing.sum())} rows, first row "
+                f"output {name!r} of run {run.name!r} has no value in {plural(int(is_missing.sum()), 'row')}, "
+                f"first row "
                 f"{int(np.flatnonzero(is_missing)[0])}: {what} requires all samples; use "
                 f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )

@@ -137,6 +137,21 @@ def equation(
     return structure.with_limits(saturation=saturation, dead_zone=dead_zone)
 
 
+def as_structure(argument: str, value: Structure | str) -> Structure:
+    """Return a structure, or the structure that the text of its equations describes.
+
+    `argument` is the name of the argument in messages. Raise ModelError for another object or an invalid text.
+    """
+    if isinstance(value, str):
+        return equation(value)
+    if not isinstance(value, Structure):
+        raise ModelError(
+            f"{argument} is {type(value).__name__}; give the text of an equation, ftlm.equation(…) or "
+            "ftlm.flexible_link(…)"
+        )
+    return value
+
+
 def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
     """Return one parser per equation text, with the text parsed.
 

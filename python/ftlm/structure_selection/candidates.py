@@ -11,6 +11,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import input_name
+from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Structure, restrict_structure
 
 #: Integer values that replace a free order.
@@ -349,7 +350,7 @@ def signature(structure: Structure) -> str:
     return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
 
 
-def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
+def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structure | str]) -> dict[str, Structure]:
     """Return candidates by name; the default name of a candidate is its equation.
 
     A structure with ``offset="auto"`` gives two candidates, with and without an offset.
@@ -359,19 +360,12 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
     ModelError
         If there is no candidate, an object is not a structure, or two candidates differ only in parameter names.
     """
-    items = (
-        list(structures.items())
-        if isinstance(structures, Mapping)
-        else [(describe_structure(s) if isinstance(s, Structure) else "", s) for s in structures]
-    )
-    if not items:
+    given = list(structures.values() if isinstance(structures, Mapping) else structures)
+    if not given:
         raise ModelError("there are no candidates; give structures, or one structure whose terms are selected")
-    for place, (_, structure) in enumerate(items):
-        if not isinstance(structure, Structure):
-            raise ModelError(
-                f"candidate {place} of {len(items)} is {type(structure).__name__}; use ftlm.equation(…) or "
-                "ftlm.flexible_link(…)"
-            )
+    every = [as_structure(f"candidate {place} of {len(given)}", s) for place, s in enumerate(given)]
+    names = list(structures) if isinstance(structures, Mapping) else [describe_structure(s) for s in every]
+    items = list(zip(names, every, strict=True))
     if len({n for n, _ in items}) < len(items):
         # Structures with equal texts may differ in other properties. Numbers distinguish their names.
         items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]

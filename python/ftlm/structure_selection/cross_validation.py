@@ -19,6 +19,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
+from ftlm.utils.formatting import plural
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import variance_inflation, white_noise
@@ -232,7 +233,7 @@ def block_ranges(run: Run) -> list[tuple[int, int]]:
     """Return (start, stop) of consecutive blocks of nearly equal length; raise DataError if the run is too short."""
     if run.length < MIN_BLOCK_SAMPLES * BLOCKS_PER_RUN:
         raise DataError(
-            f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give "
+            f"{run.name} has {plural(run.length, 'row')}, too few to be cut into {BLOCKS_PER_RUN} blocks; give "
             f"{parameter('validation')} another run"
         )
     return list(itertools.pairwise(np.linspace(0, run.length, BLOCKS_PER_RUN + 1).astype(int).tolist()))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ftlm.data.run import Run
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation, Verdict
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, texts
 from ftlm.model.model import Model
+from ftlm.model.model_access import BestIdentification
 from ftlm.model.parameter_estimates import Parameter
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
@@ -21,7 +20,6 @@ from ftlm.svg.html_page import Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, attributes, json_value
-from ftlm.utils.validation import Floats
 
 #: Maximum number of printed rows, and lower limit of printed fits [%].
 MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0
@@ -30,7 +28,7 @@ UNSTABLE_NOTE = " (grows without bound)"
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(BestIdentification):
     """Result of a structure selection: validated candidates, the chosen one, and the reason.
 
     Parameters
@@ -79,30 +77,19 @@ class Selection:
         return self.best.parameters
 
     @property
-    def covariance(self) -> Floats:
-        """Covariance matrix of the estimated parameters; see :attr:`ftlm.Identification.covariance`."""
-        return self.best.covariance
+    def orders(self) -> dict[str, float]:
+        """Values of the free orders of the model by name."""
+        return self.best.orders
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Values of the coefficients of the model by name."""
+        return self.best.coefficients
 
     @property
     def verdict(self) -> Verdict:
         """Verdict on the model, with separate validation runs if there were any; see also :meth:`validate`."""
         return self.best.verdict if self.validated is None else self.validated.verdict
-
-    @property
-    def fit(self) -> dict[str, float]:
-        """Fit of the simulation on the estimation runs in percent, by output."""
-        return self.best.fit
-
-    #: Alias of :attr:`fit`, whose name states the unit.
-    fit_percent = fit
-
-    def validate(self, runs: Run | Sequence[Run]) -> Validation:
-        """Compare the model with runs that took no part in the selection; see :meth:`ftlm.Identification.validate`."""
-        return self.best.validate(runs)
-
-    def summary(self) -> str:
-        """Return text with the summary of the model, the candidates, and the reason for the choice."""
-        return str(self)
 
     @property
     def winner(self) -> Trial:
@@ -177,7 +164,7 @@ class Selection:
             caption=f"The best candidate with each number of parameters; the chosen one has {self.winner.parameters}.",
         )
 
-    def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
         """Write the choice and the model to an HTML file, as :meth:`ftlm.Identification.report` does."""
         doubts = [f for f in self.findings if f.level in (LEVEL_WITH_CARE, LEVEL_DO_NOT_USE)]
         facts = [f"{text}." for text in texts(f for f in self.findings if f not in doubts)]
@@ -190,7 +177,9 @@ class Selection:
             # Fits of different outputs are not compared.
             figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
         )
-        return self.best._write_page(path, sections=[choice], validated=self.validated, force=force)
+        return self.best._write_page(
+            path, sections=[choice], validation=validation, validated=self.validated, force=force
+        )
 
     def to_frame(self) -> Any:
         """Return the candidates as a pandas DataFrame, one row per candidate, by rank."""

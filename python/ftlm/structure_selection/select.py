@@ -20,6 +20,7 @@ from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degene
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import has_memory
+from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.automatic import (
     MAX_ORDER,
@@ -100,7 +101,7 @@ MAX_CANDIDATES = 10_000
 @check_arguments
 def select(
     runs: Run | Sequence[Run],
-    candidates: str | Structure | Sequence[Structure] | Mapping[str, Structure],
+    candidates: str | Structure | Sequence[Structure | str] | Mapping[str, Structure | str],
     *,
     validation: str | Run | Sequence[Run] | None = None,
     delay: Delays | None = None,
@@ -191,6 +192,8 @@ def select(
             f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
             "or 'auto'"
         )
+    if isinstance(candidates, str) and "=" in candidates:
+        candidates = as_structure("candidates", candidates)
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MAX_CANDIDATES:
         raise ModelError(
             f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, from which "

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_o
 import numpy as np
 
 from ftlm.errors import FtlmError, ModelError
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import setting, type_name
 from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, whole_number
 
 #: Exceptions that an argument of a wrong type can cause.
@@ -125,7 +125,9 @@ def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, An
     unknown = next((name for name in kwargs if name not in names), None)
     if unknown is not None and not takes_any:
         near = difflib.get_close_matches(unknown, names, 1)
-        known = f"did you mean {near[0]}=?" if near else f"known: {', '.join(n for n in names if n != 'self')}"
+        known = (
+            f"did you mean {near[0]}=?" if near else f"known: {', '.join(n for n in names if n not in ('self', 'cls'))}"
+        )
         raise TypeError(f"{error}; {known}") from None
 
 
@@ -146,9 +148,7 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
         )
         if is_single and not _fits(value, annotation):
             words = " or ".join(dict.fromkeys(_describe_type(kind) for kind in _alternatives(annotation)))
-            raise ModelError(
-                f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
-            ) from error
+            raise ModelError(f"{setting(name)} {short_repr(value)} is {type_name(value)}; give {words}") from error
 
 
 class _UnknownType:

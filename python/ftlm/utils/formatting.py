@@ -82,6 +82,11 @@ def format_bound(value: float, spec: str = ".3g") -> str:
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
+def plural(count: int, noun: str) -> str:
+    """Return a count with its noun, such as ``1 row`` or ``3 rows``."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def truncate_text(text: str, most: int) -> str:
     """Return a text, truncated with an ellipsis if it has more than `most` characters."""
     return text if len(text) <= most else text[: most - 1] + "…"

@@ -31,6 +31,12 @@ class Placeholder(str):
         return str(self)
 
 
+def type_name(value: object) -> str:
+    """Return the name of the type of a value with its article, such as ``a dict`` or ``an int``."""
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
+
+
 #: Placeholder mappings in messages: columns of a file by signal name, and by part of a frequency response.
 NAMED_COLUMNS = {Placeholder("name"): Placeholder("column")}
 PART_COLUMNS = {Placeholder("part"): Placeholder("column")}

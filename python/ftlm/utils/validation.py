@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.errors import DataError, ModelError
-from ftlm.utils.parameters import parameter, setting
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.resources import available_memory
 
 #: Environment variable with the default number of threads.
@@ -164,7 +164,7 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
         return dict(column_names)
     if not isinstance(column_names, Iterable):
         raise DataError(
-            f"{parameter(argument)} is a {type(column_names).__name__}; pass a dict of name: column, or a list of names"
+            f"{parameter(argument)} is {type_name(column_names)}; pass a dict of name: column, or a list of names"
         )
     names = list(column_names)
     for index, name in enumerate(names):
@@ -180,7 +180,7 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
 def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
     """Return a mapping unchanged; raise DataError for any other value of the argument."""
     if not isinstance(value, Mapping):
-        raise DataError(f"{parameter(argument)} is a {type(value).__name__}; pass a dict of name: {of}")
+        raise DataError(f"{parameter(argument)} is {type_name(value)}; pass a dict of name: {of}")
     return value
 
 

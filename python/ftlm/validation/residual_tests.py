@@ -22,7 +22,7 @@ from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.output_samples import OutputSamples, measured_samples
 from ftlm.svg.html_page import Table
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import Cell, attributes, json_value, symbol_html
+from ftlm.utils.formatting import Cell, attributes, json_value, plural, symbol_html
 from ftlm.utils.linalg import dot, minimum_norm_solution
 from ftlm.utils.statistics import (
     NORMAL_99,
@@ -346,7 +346,8 @@ def check_run_lengths(runs: Runs, lags: int) -> None:
     for run in runs:
         if run.length < 2 * lags + 3:
             raise DataError(
-                f"run {run.name!r} has {run.length} rows, correlations up to {lags} lags need {2 * lags + 3}; "
+                f"run {run.name!r} has {plural(run.length, 'row')}, correlations up to {lags} lags need "
+                f"{2 * lags + 3}; "
                 "give a longer run or fewer lags"
             )
 

@@ -1,0 +1,83 @@
+"""Members that results of a search or a selection take from the identification of their best model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ftlm.errors import ModelError
+
+if TYPE_CHECKING:
+    import os
+    from pathlib import Path
+
+    from ftlm.utils.validation import Floats
+
+
+class BestIdentification:
+    """Base class of results with a best model, whose identification is the attribute `best`.
+
+    Members have the meaning that they have in :class:`ftlm.Identification`. They raise ModelError if `best` is None.
+    """
+
+    best: Any
+
+    @property
+    def _found(self) -> Any:
+        if self.best is None:
+            raise ModelError(
+                "this result has no identification of its best model; call search_orders with the runs and the store, "
+                "or identify the structure"
+            )
+        return self.best
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """Fit of the simulation on the estimation runs in percent, by output."""
+        fit: dict[str, float] = self._found.fit
+        return fit
+
+    #: Alias of :attr:`fit`, whose name states the unit.
+    fit_percent = fit
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Estimates of the parameters of the best model by name."""
+        values: dict[str, float] = self._found.values
+        return values
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors of the parameters of the best model by name; {} for methods that give none."""
+        errors: dict[str, float] = self._found.standard_errors
+        return errors
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % confidence intervals (low, high) of the parameters of the best model by name."""
+        intervals: dict[str, tuple[float, float]] = self._found.intervals
+        return intervals
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the rows and columns of ``covariance``."""
+        names: tuple[str, ...] = self._found.names
+        return names
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance matrix of the parameters in ``names``; see :attr:`ftlm.Identification.covariance`."""
+        covariance: Floats = self._found.covariance
+        return covariance
+
+    def validate(self, runs: Any) -> Any:
+        """Compare the best model with other runs; see :meth:`ftlm.Identification.validate`."""
+        return self._found.validate(runs)
+
+    def summary(self) -> str:
+        """Return the text that is printed for the result."""
+        return str(self)
+
+    def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
+        """Write an HTML page about the best model; see :meth:`ftlm.Identification.report`."""
+        page: Path = self._found.report(path, validation=validation, force=force)
+        return page
