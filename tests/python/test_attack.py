@@ -85,7 +85,7 @@ def test_the_examples_of_odd_arguments_are_refused_by_name():
     model = ftlm.Model(ftlm.equation("D y = -3 y + 5 u"))
     for call, words in (
         (lambda: ftlm.equation("D y = a y + b u", delay="u"), "delay = 'u' is a str; give a mapping of names"),
-        (lambda: ftlm.energies(3), "run = 3 is a int; give Run"),
+        (lambda: ftlm.energies(3), "run = 3 is an int; give Run"),
         (lambda: model.step(10**400), "time"),
         (lambda: ftlm.equation("D y = a y + b u", initial=range(10**12)), "initial"),
     ):

@@ -306,7 +306,7 @@ def test_bad_paths_are_refused(tmp_path, monkeypatch):
     messages(["sqare.csv", "does not exist", "did you mean 'square.csv'"], lambda: load(tmp_path / "sqare.csv"))
     messages(["not a file"], lambda: load(tmp_path))
     messages(["list is empty"], lambda: load([]))
-    messages(["path is a int"], lambda: load(3))
+    messages(["path is an int"], lambda: load(3))
     messages(["path is a list"], lambda: load([3]))
     messages(["given twice"], lambda: load([path, str(path)]))
     messages(["cannot be opened"], lambda: load("a\0b"))

@@ -645,7 +645,7 @@ def test_what_is_said_of_a_file_is_checked(tmp_path):
             r"'frequncy' is not part of a frequency response \(did you mean 'freq",
         ),
         ({"columns": {"frequency": "g"}}, r"column 'g' \(frequency\) is not in 'x.csv'"),
-        ({"columns": 3}, r"columns is a int; pass a dict of part: column"),
+        ({"columns": 3}, r"columns is an int; pass a dict of part: column"),
         ({"magnitude_unit": "dB", "negated": 1}, r"negated=1 is neither True nor False"),
     ):
         with pytest.raises(ftlm.DataError, match=words):

@@ -432,8 +432,8 @@ BAD = {
     "tiny slew": ({"slew": 1e-45}, None, "slew of u = 1e-45 per second needs"),
     "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is not between"),
     "criteria": ({"criterion": np.array(["D", "E"])}, None, "criterion = array"),
-    "progress": ({"progress": 5}, None, "progress is a int"),
-    "no list": ({"parameters": 5}, None, "names is a int"),
+    "progress": ({"progress": 5}, None, "progress is an int"),
+    "no list": ({"parameters": 5}, None, "names is an int"),
     "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is not a free parameter"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
@@ -516,7 +516,7 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     assert document["predicted_extremes"]["y"]["limit"] == 0.9
     figure = ftlm.plot.design(designed)
     assert [a.get_xlabel() for a in figure.axes] == ["time [s]", "time [s]", "frequency [Hz]"]
-    with pytest.raises(ftlm.ModelError, match="is a int; give DesignedInput"):
+    with pytest.raises(ftlm.ModelError, match="is an int; give DesignedInput"):
         ftlm.plot.design(3)
 
 

@@ -103,7 +103,7 @@ BAD_LAYOUTS = {
     "encoding": ({"encoding": "utf-9"}, ["'utf-9'"]),
     "no encoding of text": ({"encoding": "base64"}, ["'base64'"]),
     "sheet": ({"sheet": "a"}, ["layout=: sheet is not used with text"]),
-    "sheet number": ({"sheet": 1}, ["sheet is a int"]),
+    "sheet number": ({"sheet": 1}, ["sheet is an int"]),
     "wrong encoding": ({"encoding": "ascii"}, ["line 1 is not ASCII", "0xc3"]),
 }
 

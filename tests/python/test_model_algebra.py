@@ -129,7 +129,7 @@ def one_lag(delay=0.0):
         (lambda: ftlm.transfer_function([], [1, 1]), "num has no coefficient"),
         (lambda: ftlm.transfer_function([1], [0, 0]), "den has no coefficient"),
         (lambda: ftlm.transfer_function([1], [1, float("nan")]), r"den\[1\] is nan"),
-        (lambda: ftlm.transfer_function(([1], [0]), ([1, 2], [1])), "den has 2 coefficients and 1 powers"),
+        (lambda: ftlm.transfer_function(([1], [0]), ([1, 2], [1])), "den has 2 coefficients and 1 power;"),
         (lambda: ftlm.transfer_function(zip([1], [0]), [1, 1]), "num is a zip, which omits entries"),  # noqa: B905
         (lambda: ftlm.transfer_function([1], [1, 1], input="y"), "'y' is the name of the output and of the input"),
         (lambda: ftlm.transfer_function([(1, 2, 3)], [1, 1]), r"num\[0\] is \(1, 2, 3\)"),

@@ -84,7 +84,7 @@ def test_what_cannot_be_drawn_is_said(found, small_model):
         (lambda: ftlm.plot.fit(small_model), "give runs"),
         (lambda: ftlm.plot.fit("x"), "is a str; give Identification or Model"),
         (lambda: ftlm.plot.residuals(replace(found, residuals=None)), "too short"),
-        (lambda: ftlm.plot.residuals(3), "tests = 3 is a int; give Residuals"),
+        (lambda: ftlm.plot.residuals(3), "tests = 3 is an int; give Residuals"),
         (lambda: ftlm.plot.landscape(replace(found, searches={})), "has no order search"),
         (lambda: ftlm.plot.landscape(found, "z"), "there is no order search 'z'; the searches are y"),
         (lambda: ftlm.plot.landscape(found.model), "is a Model; give Identification or Landscape"),

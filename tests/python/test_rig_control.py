@@ -264,7 +264,7 @@ def test_a_controller_is_reset_and_told_of():
 
 
 REFUSED = [
-    ({"controller": 3, "reference": HOLD}, ftlm.ModelError, "controller is a int"),
+    ({"controller": 3, "reference": HOLD}, ftlm.ModelError, "controller is an int"),
     ({"reference": "text"}, ftlm.DataError, "not an array of hub angles"),
     ({"reference": None}, ftlm.DataError, "not an array of hub angles"),
     ({"reference": []}, ftlm.DataError, "not an array of hub angles"),
@@ -281,7 +281,7 @@ REFUSED = [
     ({"reference": np.zeros((200, 2)), "watchdog": 0.0}, ftlm.ModelError, "watchdog = 0"),
     ({"reference": np.zeros((200, 2)), "rig": "q9"}, ftlm.ModelError, "'q9' is not known"),
     ({"reference": range(1 << 40)}, ftlm.ModelError, "has more than 50000000 values"),
-    ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is a int"),
+    ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is an int"),
     ({"reference": np.zeros((200, 2)), "rate": 10**5000}, ftlm.ModelError, "rate = an integer of"),
     ({"reference": np.zeros((200, 2)), "watchdog": "0.1"}, ftlm.ModelError, "watchdog = '0.1' is not a number"),
     (
@@ -290,7 +290,7 @@ REFUSED = [
         "real_time = None is neither True nor False",
     ),
     ({"reference": np.zeros((200, 2)), "arm": "no"}, ftlm.ModelError, "arm = 'no' is neither True nor False"),
-    ({"reference": np.zeros((200, 2)), "progress": 5}, ftlm.ModelError, "progress is a int"),
+    ({"reference": np.zeros((200, 2)), "progress": 5}, ftlm.ModelError, "progress is an int"),
     ({"reference": np.zeros((200, 2)), "offset": "ab"}, ftlm.ModelError, "offset = 'ab' is not a pair"),
     ({"reference": np.zeros((200, 2)), "offset": 0.1}, ftlm.ModelError, "offset = 0.1 is not a pair"),
     ({"reference": np.zeros((200, 2)), "parameters": np.zeros(2)}, ftlm.ModelError, "parameters is a ndarray"),

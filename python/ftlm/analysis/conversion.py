@@ -534,7 +534,8 @@ def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
             raise ModelError(
-                f"{what}: {plural(len(names), 'name')} given, but the system has {count}; give {count} names"
+                f"{what}: {plural(len(names), 'name', 'are')} given, but the system has {count}; give "
+                f"{plural(count, 'name')}"
             )
         return names
     names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]

@@ -323,11 +323,11 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             name: kind(**{f.name: arguments.pop(f.name) for f in fields(kind)}) for name, kind in records.items()
         }
         try:
+            if outputs:
+                check_free(*(arguments[name] for name in outputs), force=arguments["force"])
             for name, ending in outputs.items():
                 if ending and arguments[name] is not None:
                     check_ending(arguments[name], ending)
-            if outputs:
-                check_free(*(arguments[name] for name in outputs), force=arguments["force"])
             work(**arguments, **option_records)
             sys.stdout.flush()
         except KeyboardInterrupt:

@@ -160,7 +160,7 @@ class RunArguments:
         if self.inputs and missing != "hold":
             row = first + int(np.flatnonzero(np.diff(places) > 1)[0]) + 1
             raise DataError(
-                f"{self.time_label}: {plural(count, 'row')} missing in a regular grid of {step:.6g} s, the "
+                f"{self.time_label}: {plural(count, 'row', 'are')} missing in a regular grid of {step:.6g} s, the "
                 f"first before row "
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
                 f"the inputs over them with {parameter('missing', 'hold')}"

@@ -386,7 +386,7 @@ class Run:
         first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "window")
         if last - first < MIN_RUN_SAMPLES:
             raise DataError(
-                f"window: {plural(last - first, 'row')} left, {MIN_RUN_SAMPLES} are needed; widen the limits"
+                f"window: {plural(last - first, 'row', 'remain')}, {MIN_RUN_SAMPLES} are needed; widen the limits"
             )
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.

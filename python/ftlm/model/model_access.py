@@ -22,7 +22,7 @@ class BestIdentification:
     best: Any
 
     @property
-    def _found(self) -> Any:
+    def _identification(self) -> Any:
         if self.best is None:
             raise ModelError(
                 "this result has no identification of its best model; call search_orders with the runs and the store, "
@@ -33,7 +33,7 @@ class BestIdentification:
     @property
     def fit(self) -> dict[str, float]:
         """Fit of the simulation on the estimation runs in percent, by output."""
-        fit: dict[str, float] = self._found.fit
+        fit: dict[str, float] = self._identification.fit
         return fit
 
     #: Alias of :attr:`fit`, whose name states the unit.
@@ -42,36 +42,36 @@ class BestIdentification:
     @property
     def values(self) -> dict[str, float]:
         """Estimates of the parameters of the best model by name."""
-        values: dict[str, float] = self._found.values
+        values: dict[str, float] = self._identification.values
         return values
 
     @property
     def standard_errors(self) -> dict[str, float]:
         """Standard errors of the parameters of the best model by name; {} for methods that give none."""
-        errors: dict[str, float] = self._found.standard_errors
+        errors: dict[str, float] = self._identification.standard_errors
         return errors
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % confidence intervals (low, high) of the parameters of the best model by name."""
-        intervals: dict[str, tuple[float, float]] = self._found.intervals
+        intervals: dict[str, tuple[float, float]] = self._identification.intervals
         return intervals
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the rows and columns of ``covariance``."""
-        names: tuple[str, ...] = self._found.names
+        names: tuple[str, ...] = self._identification.names
         return names
 
     @property
     def covariance(self) -> Floats:
         """Covariance matrix of the parameters in ``names``; see :attr:`ftlm.Identification.covariance`."""
-        covariance: Floats = self._found.covariance
+        covariance: Floats = self._identification.covariance
         return covariance
 
     def validate(self, runs: Any) -> Any:
         """Compare the best model with other runs; see :meth:`ftlm.Identification.validate`."""
-        return self._found.validate(runs)
+        return self._identification.validate(runs)
 
     def summary(self) -> str:
         """Return the text that is printed for the result."""
@@ -79,5 +79,5 @@ class BestIdentification:
 
     def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
         """Write an HTML page about the best model; see :meth:`ftlm.Identification.report`."""
-        page: Path = self._found.report(path, validation=validation, force=force)
+        page: Path = self._identification.report(path, validation=validation, force=force)
         return page

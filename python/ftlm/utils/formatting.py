@@ -82,9 +82,10 @@ def format_bound(value: float, spec: str = ".3g") -> str:
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
-def plural(count: int, noun: str) -> str:
-    """Return a count with its noun, such as ``1 row`` or ``3 rows``."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+def plural(count: int, noun: str, verb: str = "") -> str:
+    """Return a count with its noun and a verb in its plural form, such as ``3 rows remain`` or ``1 row is``."""
+    singular = {"": "", "are": " is"}.get(verb, f" {verb}s")
+    return f"{count} {noun}{singular if count == 1 else f's {verb}'.rstrip()}"
 
 
 def truncate_text(text: str, most: int) -> str:
