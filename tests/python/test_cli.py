@@ -247,6 +247,7 @@ BAD = [
     (("simulate", "none.json", "square.csv"), 2, "Missing"),
     (("demo", "-o", "square.csv"), 3, "square.csv"),
     (("demo", "--noise", "-1", "-o", "quiet"), 2, "noise"),
+    (("identify", "square.csv", *SEARCH, "-o", "model.txt"), 2, "model.txt does not end in .json; use this extension"),
     (("frobnicate",), 2, "frobnicate"),
     (("validate", "x.json", "square.csv"), 2, "ftlm compare MODEL FILE"),
     (("identify", "square.csv", *SEARCH[:2], "--step", "0,05"), 2, "'0,05' is not a number; write '0.05'"),
