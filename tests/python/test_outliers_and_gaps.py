@@ -92,7 +92,7 @@ def test_missing_samples_are_refused_with_the_way_out() -> None:
     first[0] = np.nan
     with pytest.raises(ftlm.DataError, match=r"no value, and there is no earlier value to hold"):
         run_of(first, y, missing="hold")
-    with pytest.raises(ftlm.DataError, match=r"2 values, 3 are needed"):
+    with pytest.raises(ftlm.DataError, match=r"2 values, but 3 are needed"):
         run_of(u, np.where(np.arange(y.size) < 2, y, np.nan), missing="weight")
 
 

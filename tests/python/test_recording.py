@@ -222,7 +222,7 @@ def test_the_core_refuses_runs_that_are_none():
     for every, decimation in ((0, 1), (1, 0), (1 << 40, 1), (1, 1 << 40)):
         with pytest.raises(ftlm.ModelError, match=r"pulses per sampling interval|decimation factor"):
             run.experiment(every, decimation, [1.0])
-    with pytest.raises(ftlm.DataError, match="window: 1 row remains"):
+    with pytest.raises(ftlm.DataError, match="window: 1 rows remain"):
         run.experiment(1, 5, [1.0])
     with pytest.raises(ftlm.DataError, match="length 2"):
         run.experiment(1, 1, [1.0, 1.0])
