@@ -146,3 +146,58 @@ def test_an_optimum_of_the_first_rows_that_grows_later_is_not_returned() -> None
 def test_sixty_long_records_are_fitted_no_worse_than_by_the_truth() -> None:
     costs = {seed: long_record_cost(seed, 50_000) for seed in range(100, 160)}
     assert {seed: cost for seed, cost in costs.items() if cost**2 > 1.001} == {}
+
+
+#: Text of a plant with two modes and two zeros, and its coefficients; each is multiplied by a sign that may be written.
+MODES = {"a3": 2.218, "a2": 1161.4, "a1": 1390.6, "a0": 10360.7, "b2": 60.0, "b1": 46.75, "b0": 22763.0}
+
+
+def two_modes(signs: str) -> str:
+    """The plant's equation with the given signs before the coefficients of y."""
+    own = " ".join(f"{sign} a{k} D^{k} y" for sign, k in zip(signs, (3, 2, 1, 0), strict=True))
+    return f"D^4 y = {own} + b2 D^2 u + b1 D u + b0 u"
+
+
+def two_modes_run(seed: int, level: float, trend: float = 0.0) -> ftlm.Run:
+    """A run of the plant with 2 % noise, an output level, and a trend [1/s]; its inputs move from the first sample."""
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.uniform(-2.0, 2.0, 100), 25)
+    y = held([MODES[n] for n in ("b2", "b1", "b0")], [1.0, *(MODES[n] for n in ("a3", "a2", "a1", "a0"))], u, 0.01)
+    y = y + 0.02 * np.std(y) * g.standard_normal(y.size) + level + trend * 0.01 * np.arange(y.size)
+    return ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+@pytest.mark.parametrize("offset", ["none", "ramp"])
+def test_the_sign_before_a_coefficient_does_not_change_the_optimum(seed: int, offset: str) -> None:
+    run = two_modes_run(seed, 0.0, 0.02 if offset == "ramp" else 0.0)
+    fits = [
+        ftlm.identify(
+            run, ftlm.equation(two_modes(signs), offset=offset), method=ftlm.OutputError(intervals="quadratic")
+        )
+        for signs in ("++++", "----", "+-+-")
+    ]
+    assert fits[0].fit["y"] > 97.5
+    for other in fits[1:]:
+        assert other.fit["y"] == pytest.approx(fits[0].fit["y"], abs=1e-3)
+        for name, value in fits[0].coefficients.items():
+            assert abs(other.coefficients[name]) == pytest.approx(abs(value), rel=1e-3, abs=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("level", [0.03, 0.3, 3.0])
+def test_an_output_level_is_found_by_default(seed: int, level: float) -> None:
+    # The smallest level is below the noise of one sample.
+    result = ftlm.identify(two_modes_run(seed, level), ftlm.equation(two_modes("----")))
+    assert [finding.code for finding in result.findings] == ["level_estimated"]
+    assert result.settings["initial"] == "rest"
+    for name, truth in MODES.items():
+        assert abs(result.coefficients[name] - truth) < 4.5 * result.standard_errors[name]
+    assert abs(result.parameters["level_y"].value - level) < 4.5 * result.parameters["level_y"].standard_error
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_no_level_is_found_where_there_is_none(seed: int) -> None:
+    result = ftlm.identify(two_modes_run(seed, 0.0), ftlm.equation(two_modes("----")))
+    assert not result.findings
+    assert "level_y" not in result.parameters
