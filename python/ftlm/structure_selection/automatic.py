@@ -355,9 +355,11 @@ class AutomaticSelection:
         """
         delayed = bool(fits and fits[0].form and fits[0].form.delayed)
         speed = IntegerOrderForm(1, 0, delayed=delayed, offset=offset, friction="output")
+        # Without friction, further poles and zeros may have replaced a delay.
+        speeds = [speed] if delayed else [speed, replace(speed, delayed=True)]
         changes_sign = math.isfinite(self.problem.tanh_slope)
         position = replace(speed, order=2, friction="derivative")
-        for form in ([speed] if changes_sign else []) + [position, replace(position, integrator=True)]:
+        for form in (speeds if changes_sign else []) + [position, replace(position, integrator=True)]:
             if fits and not has_white_residuals(fits[0].joint):
                 # Negative friction would add energy, so it is not physical.
                 friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
