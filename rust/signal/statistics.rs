@@ -141,7 +141,7 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
 /// The window has 4 N^(1/3) lags. The series has no missing samples.
 ///
 /// ```
-/// let slow: Vec<f64> = (0..1000).map(|t| f64::from(t / 10 % 2)).collect();
+/// let slow: Vec<f64> = (0..1000).map(|t| f64::from(t / 100 % 2)).collect();
 /// assert_eq!(ftlm::signal::statistics::variance_inflation(&[1.0]), 1.0);
 /// assert!(ftlm::signal::statistics::variance_inflation(&slow) > 1.5);
 /// ```

@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 from typer.testing import CliRunner
 
+import friction
 import ftlm
 from ftlm.cli.main import app
 
@@ -306,3 +307,19 @@ def test_auto_finds_dry_friction_behind_a_dead_time() -> None:
     found = ftlm.select(run, "auto", threads=1).best
     values = {n: found.parameters[n].value for n in ("a0", "b0", "fc", "delay_u")}
     assert values == pytest.approx({"a0": -0.8, "b0": 1.0, "fc": 0.25, "delay_u": 0.6}, rel=0.05)
+
+
+def test_friction_is_found_beside_a_delay_that_further_poles_replace():
+    # Without friction, four poles and three zeros fit better than a delay of 7.4 samples. The encoder is coarse.
+    t = np.arange(3000) * 0.005
+    tones = zip((0.23, 0.61, 1.3, 2.7), (0.1, 2.0, 4.0, 1.0), strict=True)
+    u = 2.0 * sum(np.sin(2 * np.pi * f * t + phase) for f, phase in tones) + 4.0 * np.sign(np.sin(2 * np.pi * t / 3.1))
+    u[t < 0.5] = 0.0
+    _, speed = friction.delayed_motor(u, 0.005, 0.037, 25 / 3, 9.5 * 25 / 3, 50.0)
+    speed = np.round((speed + 0.1 * np.random.default_rng(1).standard_normal(t.size)) / 0.25) * 0.25
+    run = ftlm.Run.from_arrays(step=0.005, inputs={"u": u}, outputs={"w": speed})
+    best = ftlm.select(run, "auto", threads=1).best
+    (item,) = best.model.structure.equations
+    assert item.order.constant == 1.0
+    assert any("tanh" in str(term) for term in item.terms)
+    assert best.delays["u"] == pytest.approx(0.037, abs=5e-4)

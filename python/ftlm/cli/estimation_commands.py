@@ -82,7 +82,8 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
     options = replace(shape, delay=None, only=None).given_options()
     if options:
         raise ModelError(
-            f"{', '.join(options)}: options of a given structure, not used with --structure auto; leave them out"
+            f"{', '.join(options)}: options of a given structure, not used with --structure auto; "
+            "leave them out, or give the equation that auto selects as --structure"
         )
     return None
 
