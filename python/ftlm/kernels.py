@@ -375,7 +375,7 @@ class Candidates:
         self._output = int(output)
         self._step = real_number("step", step)
         self._columns = dict[tuple[int, float], int]()
-        self._bank: dict[str, NDArray[np.float64]] = {}
+        self._cache: dict[str, NDArray[np.float64]] = {}
 
     @check_arguments
     def coefficients(
@@ -427,7 +427,7 @@ class Candidates:
                 f"prior_covariance is not positive, or has a wrong shape; give one positive number, or "
                 f"{len(self._terms)}, one per term"
             )
-        places = self._places(table)
+        places = self._integral_rows(table)
         gram = self._gram(length, rows)
         normal = gram[places[:, :, None], places[:, None, :]]
         normal[:, range(len(self._terms)), range(len(self._terms))] += 1.0 / np.broadcast_to(prior, len(self._terms))
@@ -532,17 +532,19 @@ class Candidates:
         """
         table = self._orders(orders)
         numbers = self._check_shape(finite_floats("coefficients", coefficients), len(table))
-        m, own = self._signals.shape[1], self._terms == self._output
+        m, output_terms = self._signals.shape[1], self._terms == self._output
         divisor = np.zeros((len(table), m))
         divisor[:, 0] = 1.0
         forced = np.zeros((len(table), m))
-        gaps = table[:, :1] - table[:, 1:]
-        for k, is_own in enumerate(own):
+        order_differences = table[:, :1] - table[:, 1:]
+        for k, is_own in enumerate(output_terms):
             if is_own:
-                divisor -= numbers[:, [k]] * block_pulse_kernel(gaps[:, k], m, step=self._step)
+                divisor -= numbers[:, [k]] * block_pulse_kernel(order_differences[:, k], m, step=self._step)
             else:
-                forced += numbers[:, [k]] * integrate(self._signals[self._terms[k]], gaps[:, k], step=self._step)
-        return toeplitz_solve(divisor, forced) if own.any() else forced
+                forced += numbers[:, [k]] * integrate(
+                    self._signals[self._terms[k]], order_differences[:, k], step=self._step
+                )
+        return toeplitz_solve(divisor, forced) if output_terms.any() else forced
 
     @cached_property
     def _points(self) -> dict[str, _core.Points]:
@@ -579,28 +581,28 @@ class Candidates:
             )
         return table
 
-    def _places(self, orders: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return the row of each term's fractional integral in the cache ``_bank["time"]``, shape (N, k).
+    def _integral_rows(self, orders: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return the row of each term's fractional integral in the cache ``_cache["time"]``, shape (N, k).
 
         Missing integrals are computed and appended to the cache. Row 0 is the output.
         """
-        gaps = np.round(orders[:, :1] - orders[:, 1:], 9)
+        order_differences = np.round(orders[:, :1] - orders[:, 1:], 9)
         # A pair (signal, order) is encoded as a complex number: NumPy sorts these faster than rows of an array.
-        distinct, inverse = np.unique((self._terms + 1j * gaps).ravel(), return_inverse=True)
+        distinct, inverse = np.unique((self._terms + 1j * order_differences).ravel(), return_inverse=True)
         keys = [(int(pair.real), float(pair.imag)) for pair in distinct]
         new = [key for key in keys if key not in self._columns]
-        if new or not self._bank:
+        if new or not self._cache:
             rows, etas = [row for row, _ in new], [gap for _, gap in new]
-            signals_before = self._bank.get("time", self._signals[[self._output]])
+            signals_before = self._cache.get("time", self._signals[[self._output]])
             whole = (
                 np.vstack([signals_before, integrate(self._signals[rows], etas, step=self._step)])
                 if new
                 else signals_before
             )
             self._columns |= {key: len(signals_before) + k for k, key in enumerate(new)}
-            self._bank = {"time": whole}
+            self._cache = {"time": whole}
         at = np.array([self._columns[key] for key in keys], dtype=np.intp)
-        return at[inverse.ravel()].reshape(gaps.shape)
+        return at[inverse.ravel()].reshape(order_differences.shape)
 
     def _gram(self, p: int, rows: str) -> NDArray[np.float64]:
         """Return the matrix of inner products of the output and all cached integrals.
@@ -608,13 +610,13 @@ class Candidates:
         Pulse i of M has the weight min(p, M - i + 1); for p = 0 all weights are 1.
         """
         key = f"{rows} {p}" if p else "least squares"
-        if key not in self._bank:
-            bank = self._bank["time"]
+        if key not in self._cache:
+            integrals = self._cache["time"]
             if p:
-                weights = np.minimum(p, np.arange(bank.shape[1], 0, -1.0))
-                bank = np.sqrt(weights) * (haar(bank) if rows == "haar" else bank)
-            self._bank[key] = bank @ bank.T
-        return self._bank[key]
+                weights = np.minimum(p, np.arange(integrals.shape[1], 0, -1.0))
+                integrals = np.sqrt(weights) * (haar(integrals) if rows == "haar" else integrals)
+            self._cache[key] = integrals @ integrals.T
+        return self._cache[key]
 
 
 class Recursion:

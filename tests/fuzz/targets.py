@@ -59,7 +59,7 @@ def _read(kind, suffix):
     def read(data):
         path = str(_file(suffix, data))
         with open(os.devnull, "wb") as out:
-            reader.answer(kind, path, out, reader.SIZE_LIMIT, None)
+            reader.write_result(kind, path, out, reader.SIZE_LIMIT, None)
 
     return read
 

@@ -184,12 +184,12 @@ def hub_and_link(
     speed: float = 1.0,
     start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
     low_pass: tuple[float, float] | None = None,
-    held: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    filter_state: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """A hub on dry friction that carries an elastic link, between its events: angles, and the hub's velocity.
 
     With a low pass of second order (corner [rad/s], damping ratio) two more rows are both angles behind it, each with
-    two states of its own that start at `held`.
+    two states of its own that start at `filter_state`.
 
     D^2 x = a q + d Dq + b Dx + F - (f + fs exp(-(Dx/vs)^2)) sgn(Dx), D^2 q = - D^2 x - k q - c Dq, with (a, d, b) of
     the hub and (k, c) of the link; the start is (x, Dx, q, Dq). Angles have shape (2, times). While the hub rests
@@ -197,7 +197,7 @@ def hub_and_link(
     """
     (a, d, b), (k, c) = hub, link
     most, now, end = friction + more, 0.0, float(times[-1])
-    state = np.array([*start, *held] if low_pass else start, dtype=float)
+    state = np.array([*start, *filter_state] if low_pass else start, dtype=float)
     columns = [0, 2, 4, 6] if low_pass else [0, 2]
     angles, rate = np.zeros((len(columns), times.size)), np.zeros(times.size)
     angles[:, 0], rate[0] = state[columns], state[1]

@@ -46,7 +46,7 @@ class Line:
 
     times: np.ndarray
     values: np.ndarray
-    held: bool
+    is_zero_order_hold: bool
 
     @classmethod
     def of(cls, run, structure, name, before):
@@ -57,13 +57,13 @@ class Line:
         return cls(times, values, run.intersample.get(name) == "zoh")
 
     def means(self, m, step):
-        return (hold_means if self.held else linear_means)(self.times, self.values, m, step)
+        return (hold_means if self.is_zero_order_hold else linear_means)(self.times, self.values, m, step)
 
     def jumps(self):
         return self.times, np.diff(self.values, prepend=0.0)
 
     def at(self, times):
-        if not self.held:
+        if not self.is_zero_order_hold:
             return np.interp(times, self.times, self.values)
         slack = 1e-12 * max(float(self.times[-1]), 1e-300)
         return self.values[np.maximum(np.searchsorted(self.times, times + slack, side="right") - 1, 0)]
@@ -136,7 +136,7 @@ def filter_transient(samples, step, sensor, states):
 
 def impulse_responses(sensor, states, m, step):
     """Pulse means of a filter's responses to an impulse and its derivatives; None where it has none of these."""
-    if not sensor.holds_answers or not states or fastest_pole(sensor) * step > 1e3:
+    if not sensor.has_impulse_transient or not states or fastest_pole(sensor) * step > 1e3:
         return None
     system, gain = filter_states(sensor)
     size = system.shape[0]
@@ -159,7 +159,7 @@ def enters_as_input(run, structure, name):
 def acting(run, structure):
     """The run behind its limits, without the transients of its sensor filter."""
     run, sensor = apply_input_nonlinearity(run, structure), structure.sensor_filter
-    if sensor is None or not structure.all_filtered or not sensor.holds_answers:
+    if sensor is None or not structure.all_filtered or not sensor.has_impulse_transient:
         return run
     states = structure.filter_states(resolve_initial_conditions(run, structure))
     names = [n for n in structure.signals if n in run and enters_as_input(run, structure, n)]
@@ -244,7 +244,7 @@ def experiment(run, structure, *, every=1, decimation=1):
                 line = Line.of(limited, structure, name, 0.0 if at_rest else float(limited.sample_times.data[name][0]))
             values = None if line is None else line.at(times[sample_rows])
             signals.append((None if values is None or np.isnan(values).any() else values, False))
-            jump_pair = None if line is None or not line.held else line.jumps()
+            jump_pair = None if line is None or not line.is_zero_order_hold else line.jumps()
             jumps.append(None if jump_pair is None else (jump_pair[0] / step, jump_pair[1]))
         places = np.minimum(times[sample_rows] / step, float(m)), jumps
     else:

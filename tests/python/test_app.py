@@ -84,9 +84,9 @@ class Page:
         self.loop(self.door(scope, receive, send))
         start, end = sent
         text = end["body"].decode()
-        told = {n.decode(): v.decode("latin-1") for n, v in start["headers"]}
+        headers = {n.decode(): v.decode("latin-1") for n, v in start["headers"]}
         self.all.append(text)
-        return start["status"], told, text
+        return start["status"], headers, text
 
     def own(self, method, path, said=None, **more):
         """As the page itself asks."""
@@ -119,7 +119,7 @@ def used(tmp_path_factory, loop, content, patience):
     status, _, _ = made.upload("lag.csv", content)
     assert status == 200
     (key,) = made.desk.files
-    wanted = {"estimation": key, "share": 0.3, "way": "fit", "structure": ["D y = a0 y + b0 u"]}
+    wanted = {"estimation": key, "share": 0.3, "selection_mode": "fit", "structure": ["D y = a0 y + b0 u"]}
     status, _, text = made.own("POST", "models", wanted)
     assert status == 200, text
     (model,) = made.desk.models.values()
@@ -140,7 +140,7 @@ async def settled(desk):
     await until(lambda: not any(m.is_busy for m in desk.models.values()))
 
 
-def told(text):
+def error_message(text):
     return json.loads(text)["error"]
 
 
@@ -171,7 +171,7 @@ def told(text):
 def test_strangers_are_refused_before_a_byte_of_a_body_is_read(page, method, path, headers, status):
     answer, sent, text = page.ask(method, path, b"x" * 100, headers)
     assert answer == status
-    assert told(text)
+    assert error_message(text)
     assert sent["content-security-policy"].startswith("default-src 'none'")
     assert page.pieces == 0
 
@@ -194,7 +194,7 @@ def test_the_first_address_is_good_once_and_leads_to_the_lasting_one(page):
     assert (status, headers["location"]) == (303, f"/{TOKEN}/")
     status, _, text = page.ask("GET", "/open/once")
     assert status == 404
-    assert "terminal" in told(text)
+    assert "terminal" in error_message(text)
     assert page.ask("GET", f"/{TOKEN}")[1]["location"] == f"/{TOKEN}/"
     without = WebApplication(page.desk, TOKEN, (HOST,))
     page.door = without
@@ -295,7 +295,7 @@ def test_two_gigabytes_are_refused_by_their_length_alone(page):
         "POST", "files", headers={"content-type": RAW, "content-length": str(2 << 30)}, query="name=big2.csv"
     )
     assert status == 413
-    assert "256 MB" in told(text)
+    assert "256 MB" in error_message(text)
     assert headers["connection"] == "close"
     assert page.pieces == 0
 
@@ -333,7 +333,7 @@ def test_all_files_together_have_a_limit(page, monkeypatch):
         "POST", "files", headers={"content-type": RAW}, query="name=b.csv", chunks=(b"x" * 100 for _ in range(10))
     )
     assert status == 413
-    assert "remove one" in told(text)
+    assert "remove one" in error_message(text)
     assert [p.name for p in page.desk.folder.iterdir()] == ["key-a.csv"]
 
 
@@ -349,7 +349,7 @@ def test_more_files_than_there_may_be_are_refused(page):
         page.loop(put_beside(page.desk, f"{k}.csv", 1))
     status, _, text = page.upload("one.csv", b"x")
     assert status == 413
-    assert "20 files" in told(text)
+    assert "20 files" in error_message(text)
 
 
 def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
@@ -357,14 +357,14 @@ def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
     wanted = {"estimation": "key-large", "structure": "D y = a y + b u"}
     for path in ("models", "check"):
         text = page.own("POST", path, wanted)[2]
-        assert "'large.csv' is still being read; wait until its columns are shown" in told(text)
+        assert "'large.csv' is still being read; wait until its columns are shown" in error_message(text)
     # What was read before is no longer meant once it is read anew.
     page.desk.files["key-large"].preview = {"problem": "", "options": {}}
     page.desk.files["key-large"].task = Task({}, lambda _: None)
-    assert "still being read" in told(page.own("POST", "models", wanted)[2])
+    assert "still being read" in error_message(page.own("POST", "models", wanted)[2])
     page.desk.files["key-large"].task = None
     page.desk.files["key-large"].preview["problem"] = "no output is named"
-    assert "is not a run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
+    assert "is not a run yet: no output is named" in error_message(page.own("POST", "models", wanted)[2])
     assert page.desk.models == {}
 
 
@@ -373,7 +373,7 @@ def test_an_upload_that_is_cut_off_leaves_nothing(page):
         "POST", "files", headers={"content-type": RAW}, query="name=cut.csv", chunks=[b"t,u,y\n"], cut=True
     )
     assert status == 400
-    assert "cut off" in told(text)
+    assert "cut off" in error_message(text)
     assert page.desk.files == {}
     assert list(page.desk.folder.iterdir()) == []
 
@@ -383,7 +383,7 @@ def test_forms_are_no_files(page, kind):
     body = b'--x\r\nContent-Disposition: form-data; name="f"; filename="../../x"\r\n\r\nhi\r\n--y'
     status, _, text = page.own("POST", "files", headers={"content-type": kind}, query="name=x", chunks=[body])
     assert status == 415
-    assert "octet-stream" in told(text)
+    assert "octet-stream" in error_message(text)
     assert page.desk.files == {}
     assert page.pieces == 0
 
@@ -401,7 +401,7 @@ BODIES = [
     b'{"share": ' + b"9" * 4000 + b"}",
     b'{"structure": {}}',
     b'{"structure": [[]]}',
-    b'{"way": []}',
+    b'{"selection_mode": []}',
 ]
 
 
@@ -412,7 +412,7 @@ def test_words_that_are_none_are_refused_in_words(used, body):
     for path in ("models", "check"):
         status, _, text = used.ask("POST", f"/{TOKEN}/{path}", body)
         assert status in (400, 413) or (status == 200 and path == "check")
-        assert told(text)
+        assert error_message(text)
     status, _, text = used.ask("POST", f"/{TOKEN}/files/{key}", body if body[:1] != b"{" else b'{"columns": 3}')
     assert status in (400, 413)
     assert len(used.desk.models) == before
@@ -426,7 +426,7 @@ def test_a_fault_is_told_without_a_traceback(page, monkeypatch):
     monkeypatch.setattr(view, "state", lambda desk: 1 / 0)
     status, _, text = page.own("GET", "state")
     assert status == 500
-    assert told(text) == "a fault in ftlm itself (ZeroDivisionError)"
+    assert error_message(text) == "a fault in ftlm itself (ZeroDivisionError)"
 
 
 NAMES = [
@@ -519,7 +519,7 @@ def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
 def test_an_equation_with_a_power_a_delay_or_friction_is_fitted_on_the_page(page, content, loop, structure):
     assert page.upload("lag.csv", content)[0] == 200
     (key,) = page.desk.files
-    wanted = {"estimation": key, "share": 0.3, "way": "fit", "structure": [structure]}
+    wanted = {"estimation": key, "share": 0.3, "selection_mode": "fit", "structure": [structure]}
     assert page.own("POST", "models", wanted)[0] == 200
     loop(settled(page.desk))
     (model,) = page.desk.models.values()
@@ -531,7 +531,12 @@ def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, conte
     """What is chosen on a run from rest is validated on the part behind it, which starts in motion."""
     page.upload("lag.csv", content)
     (key,) = page.desk.files
-    wanted = {"estimation": key, "share": 0.25, "way": "offered", "structure": ["D y = a0 y + b0 u", "D y = b0 u"]}
+    wanted = {
+        "estimation": key,
+        "share": 0.25,
+        "selection_mode": "offered",
+        "structure": ["D y = a0 y + b0 u", "D y = b0 u"],
+    }
     status, _, text = page.own("POST", "models", wanted)
     assert status == 200, text
     page.loop(settled(page.desk))
@@ -570,7 +575,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
     worse = desks.Model(
         "other",
         2,
-        first.recipe,
+        first.fit_request,
         state="made",
         description={
             **first.description,
@@ -580,7 +585,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
     best = desks.Model(
         "best",
         3,
-        first.recipe,
+        first.fit_request,
         state="made",
         description={
             **first.description,
@@ -604,9 +609,12 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         ({"structure": []}, "no structure is given"),
         ({"structure": ["flexible_link(stage=1)"]}, "no signal"),
         ({"structure": ["__import__('os').system('id')"]}, None),
-        ({"way": "guess"}, "way = 'guess' is not known"),
-        ({"way": "offered", "structure": ["D y = a y + b u"]}, "a comparison needs at least two structures"),
-        ({"way": "auto", "structure": [], "method": "least-squares"}, "a structure selection uses output error"),
+        ({"selection_mode": "guess"}, "selection_mode = 'guess' is not known"),
+        ({"selection_mode": "offered", "structure": ["D y = a y + b u"]}, "a comparison needs at least two structures"),
+        (
+            {"selection_mode": "auto", "structure": [], "method": "least-squares"},
+            "a structure selection uses output error",
+        ),
         ({"method": "magic"}, "method = 'magic'"),
         ({"offset": "much"}, "offset = 'much'"),
         ({"loss": "none"}, "loss = 'none'"),
@@ -621,18 +629,18 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
 )
 def test_what_is_asked_wrongly_is_said_in_ftlm_s_words(used, wanted, words):
     (key,) = used.desk.files
-    usual = {"estimation": key, "share": 0.3, "way": "fit", "structure": ["D y = a0 y + b0 u"]}
+    usual = {"estimation": key, "share": 0.3, "selection_mode": "fit", "structure": ["D y = a0 y + b0 u"]}
     assert used.own("POST", "check", usual)[2] == '{"error": ""}'
     asked = used.own("POST", "check", {**usual, **wanted})[2]
     status, _, text = used.own("POST", "models", {**usual, **wanted})
     assert status == 400
-    assert told(asked) == told(text)
+    assert error_message(asked) == error_message(text)
     if words is not None:
-        assert words in told(text)
+        assert words in error_message(text)
     else:
         with pytest.raises(ModelError) as error:
             ftlm.equation(wanted["structure"][0])
-        assert told(text) == view.page_words(str(error.value))
+        assert error_message(text) == view.page_words(str(error.value))
     assert len(used.desk.models) == 1
 
 
@@ -664,8 +672,8 @@ def test_names_with_scripts_in_them_are_text(used, loop):
             "offers": [{"name": HOSTILE, "why": HOSTILE, "structure": HOSTILE, "output": HOSTILE}],
         },
     )
-    recipe = FitRequest(RunSource(f"{HOSTILE}.csv"), structure=(HOSTILE,))
-    failed = desks.Model("m", 1, recipe, state="failed", error=HOSTILE)
+    fit_request = FitRequest(RunSource(f"{HOSTILE}.csv"), structure=(HOSTILE,))
+    failed = desks.Model("m", 1, fit_request, state="failed", error=HOSTILE)
     broken = desks.File("b", f"{HOSTILE}.csv", 1, error=HOSTILE, version=1)
     for shown in (view.file(file), view.file(broken), view.model(failed)):
         assert "<script" not in shown
@@ -680,8 +688,8 @@ def test_names_with_scripts_in_them_are_text(used, loop):
 )
 def test_a_script_is_python_whatever_names_are_in_it(name, text):
     options = {"time": name, "inputs": {name: text}, "units": {name: "V"}, "window": [0.5, None], "step": 0.1}
-    recipe = FitRequest(RunSource(name, options), RunSource(name), structure=(text,), method="least-squares")
-    script = recipe._script(None)
+    fit_request = FitRequest(RunSource(name, options), RunSource(name), structure=(text,), method="least-squares")
+    script = fit_request._script(None)
     tree = ast.parse(script.encode())
     calls = [ast.unparse(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)]
     own = ("ftlm.load", "ftlm.equation", "ftlm.flexible_link", "ftlm.identify", "print", "result.summary")
@@ -769,9 +777,9 @@ def test_a_share_is_cut_where_rows_are():
 
 
 def test_recipes_survive_json():
-    recipe = FitRequest(RunSource("a", {"step": 0.1}), RunSource("b"), 0.0, ("D y = a y + b u",), "inside")
-    assert FitRequest.of(json.loads(json.dumps(recipe.to_dict()))) == recipe
-    assert [s.name for s in parse_structures(recipe)] == ["equation"]
+    fit_request = FitRequest(RunSource("a", {"step": 0.1}), RunSource("b"), 0.0, ("D y = a y + b u",), "inside")
+    assert FitRequest.of(json.loads(json.dumps(fit_request.to_dict()))) == fit_request
+    assert [s.name for s in parse_structures(fit_request)] == ["equation"]
     assert [parse_structures(FitRequest(RunSource("a"), structure=(n,)))[0].name for n in NAMED_STRUCTURES]
 
 
@@ -832,21 +840,21 @@ def test_a_choice_that_was_stopped_goes_on_where_it_was(tmp_path, content, monke
     Path("lag.csv").write_bytes(content)
     options = json.loads(json.dumps(ftlm.open_file("lag.csv").to_dict()["options"]))
     words = tuple(f"D y = a0 y + b0 u{more}" for more in ("", " + c", " + b1 D^0.5 u"))
-    recipe = FitRequest(RunSource("lag.csv", options), share=0.25, structure=words, way="offered")
-    plain, store = recipe.fit_model(Quiet()), Path("choice.ftlm")
-    recipe.fit_model(Quiet(), str(store))
+    fit_request = FitRequest(RunSource("lag.csv", options), share=0.25, structure=words, selection_mode="offered")
+    plain, store = fit_request.fit_model(Quiet()), Path("choice.ftlm")
+    fit_request.fit_model(Quiet(), str(store))
     # As a kill in the middle leaves it.
     with contextlib.closing(sqlite3.connect(store)) as file, file:
         (count,) = file.execute("SELECT count(*) FROM selection").fetchone()
         file.execute("DELETE FROM selection WHERE number > ?", (count // 2,))
-    went_on = recipe.fit_model(Quiet(), str(store))
+    went_on = fit_request.fit_model(Quiet(), str(store))
     with contextlib.closing(sqlite3.connect(store)) as file:
         assert file.execute("SELECT count(*) FROM selection").fetchone() == (count,)
     assert went_on.choice.reason == plain.choice.reason
     assert went_on.result.coefficients == plain.result.coefficients
     # Nothing is left to be fitted, so nothing is kept once more.
     again = store.read_bytes()
-    recipe.fit_model(Quiet(), str(store))
+    fit_request.fit_model(Quiet(), str(store))
     assert store.read_bytes() == again
 
 
@@ -858,7 +866,7 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
         await asleep(self)
 
     monkeypatch.setattr(Task, "answer", noted)
-    choice = FitRequest(RunSource("a.csv"), structure=("D y = a y + b u",), way="inside")
+    choice = FitRequest(RunSource("a.csv"), structure=("D y = a y + b u",), selection_mode="inside")
 
     async def course():
         desk = page.desk

@@ -146,8 +146,8 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
         initial="caputo",
     )
     found = ftlm.identify(runs["lqr"], made, method=ftlm.OutputError(intervals="quadratic"))
-    ours = {n: found.model.compare(r).fit[output] for n, r in runs.items()}
-    assert ours == pytest.approx(scipy, abs=0.3)
+    fits = {n: found.model.compare(r).fit[output] for n, r in runs.items()}
+    assert fits == pytest.approx(scipy, abs=0.3)
 
 
 @pytest.mark.slow

@@ -40,8 +40,8 @@ def check(case, kind, folder, page):
             assert np.array_equal(run[name], np.asarray(data[column], float))
     assert verdict in ("said", "taken")
     dated = data["t"].dtype.kind == "U"
-    told = np.asarray(data["t"].astype("datetime64[s]").astype(float) if dated else data["t"], float)
-    assert np.allclose(run.time, told - told[0], rtol=1e-9, atol=0.02 * run.step)
+    times = np.asarray(data["t"].astype("datetime64[s]").astype(float) if dated else data["t"], float)
+    assert np.allclose(run.time, times - times[0], rtol=1e-9, atol=0.02 * run.step)
 
 
 def test_there_are_forty_cases_in_four_formats(page):

@@ -90,17 +90,17 @@ def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
     candidates = ftlm.search_orders(
         small_run, ftlm.equation(EQUATION), lattice, coefficients="least-squares"
     ).candidates
-    told = []
+    reports = []
     structure = ftlm.equation(EQUATION)
     found = genetic_search(
         prepare([small_run], structure, 256, power_of_two=True),
         structure,
         GeneticAlgorithm(order_grid=lattice, seeds=(0,), population=8, bounds=BOUNDS),
-        progress=lambda done, total: told.append((done, total)),
+        progress=lambda done, total: reports.append((done, total)),
     )
     assert candidates <= found.evaluations[0] <= candidates + 8
-    assert told[-1] == (candidates, candidates)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert reports[-1] == (candidates, candidates)
+    assert [done for done, _ in reports] == sorted(done for done, _ in reports)
 
 
 def test_all_equations_of_a_stage_under_their_order_law(clean_a):

@@ -201,8 +201,8 @@ def test_zoom_by_dragging_shows_what_was_dragged_over(browser, folder):
 def read(page, k=0):
     """What the slider of a chart reads out, by its words."""
     said = page.locator(".slide .reads").nth(k).locator("span")
-    told = [part.inner_text().replace("−", "-").replace("\u00a0", " ").rsplit(" ", 2) for part in said.all()]
-    return {words[0]: float(words[1]) for words in told}
+    texts = [part.inner_text().replace("−", "-").replace("\u00a0", " ").rsplit(" ", 2) for part in said.all()]
+    return {words[0]: float(words[1]) for words in texts}
 
 
 @pytest.mark.parametrize("width", [WIDTHS[0], WIDTHS[2]])
@@ -218,17 +218,17 @@ def test_a_slider_reads_out_measured_and_simulated(browser, folder, width):
         # It begins where the two are farthest apart.
         apart = np.abs(kept["measured"] - kept["simulated"])
         far = int(np.argmax(apart))
-        told = read(page, own)
-        assert told["time"] == pytest.approx(kept["time"][far], rel=1e-3)
-        assert told["largest difference"] == pytest.approx(apart[far], rel=2e-3)
+        texts = read(page, own)
+        assert texts["time"] == pytest.approx(kept["time"][far], rel=1e-3)
+        assert texts["largest difference"] == pytest.approx(apart[far], rel=2e-3)
         handle = slide.locator("input")
         for key, at in (("Home", 0), ("ArrowRight", 1), ("End", -1)):
             handle.press(key)
-            told = read(page, own)
-            assert told["time"] == pytest.approx(kept["time"][at], abs=1e-3)
+            texts = read(page, own)
+            assert texts["time"] == pytest.approx(kept["time"][at], abs=1e-3)
             for name in ("measured", "simulated"):
-                assert told[name] == pytest.approx(kept[name][at], rel=1e-3, abs=1e-5)
-            assert told["difference"] == pytest.approx(apart[at], rel=2e-3, abs=1e-4)
+                assert texts[name] == pytest.approx(kept[name][at], rel=1e-3, abs=1e-5)
+            assert texts["difference"] == pytest.approx(apart[at], rel=2e-3, abs=1e-4)
         assert handle.get_attribute("aria-valuetext").startswith("time ")
         # Where the chart is zoomed into, its window follows.
         kind = "narrow" if width < 620 else "wide"

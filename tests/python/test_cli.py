@@ -24,7 +24,7 @@ from command_line import run_command
 from ftlm import progress
 from ftlm.app.server import DEFAULT_PORT
 from ftlm.cli import framework
-from ftlm.cli.framework import broken_line, print_text
+from ftlm.cli.framework import print_text, wrap_line
 from ftlm.cli.main import COMMAND_HELP, CommandTable, app
 from ftlm.order_search.search import score_profiles
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
@@ -471,7 +471,7 @@ LONG = {
 @pytest.mark.parametrize("line", LONG)
 def test_lines_break_between_words_and_equations_between_terms(monkeypatch, line):
     monkeypatch.setenv("COLUMNS", "60")
-    parts = broken_line(line)
+    parts = wrap_line(line)
     assert parts == (LONG[line] or [line])
     assert " ".join(p.strip() for p in parts) == line.strip()
     # Who reads a pipe gets each line whole.

@@ -88,9 +88,9 @@ def test_a_part_begins_as_its_own_fit_found():
     y = y + 0.02 * np.random.default_rng(0).standard_normal(y.size)
     y[first] = 0.0
     run = ftlm.Run.from_arrays(step=step, inputs={"u": u[first:]}, outputs={"y": y[first:]})
-    told = ftlm.consistency(run, ftlm.equation("D^alpha y = a y + b u"))
-    assert told.results[0].model.structure.initial == "history"
-    assert min(fit["y"] for row in told.cross_validation for fit in row) > 90
+    consistency = ftlm.consistency(run, ftlm.equation("D^alpha y = a y + b u"))
+    assert consistency.results[0].model.structure.initial == "history"
+    assert min(fit["y"] for row in consistency.cross_validation for fit in row) > 90
 
 
 def test_several_runs_are_parts_by_themselves():
@@ -128,9 +128,9 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     blind = replace(second.joint, covariance=np.where(np.eye(3) * [1, 0, 0] > 0, np.inf, second.joint.covariance))
     place = second.joint.names[0]
     half = [first, replace(second, joint=blind)]
-    told = {d.name: d for d in differences(half)}
-    assert math.isnan(told[place].difference_in_errors)
-    assert not told[place].disjoint
+    consistency = {d.name: d for d in differences(half)}
+    assert math.isnan(consistency[place].difference_in_errors)
+    assert not consistency[place].disjoint
     assert joint_distance(half)[1] == 2
     found = replace(same, results=tuple(half), differences=tuple(differences(half)))
     assert found.not_identifiable == (place,)
@@ -182,10 +182,10 @@ def test_a_page_a_frame_and_json(changed, tmp_path):
     assert "motor 6 to 12 s" in page
     with pytest.raises(ftlm.DataError, match="exists"):
         changed.report(tmp_path / "parts.html")
-    told = json.loads(json.dumps(changed.to_dict()))
-    assert told["consistent"] is False
-    assert told["segments"] == list(changed.names)
-    assert told["differences"][0]["parameter"] == "a"
+    consistency = json.loads(json.dumps(changed.to_dict()))
+    assert consistency["consistent"] is False
+    assert consistency["segments"] == list(changed.names)
+    assert consistency["differences"][0]["parameter"] == "a"
     frame = changed.to_frame()
     assert len(frame) == 6
     assert frame.loc[("a", "motor 0 to 6 s"), "value"] == changed.results[0].coefficients["a"]

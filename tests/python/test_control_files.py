@@ -66,20 +66,21 @@ def test_a_pid_runs_from_the_numbers_of_its_file_alone(tmp_path):
     """As the file says it, in plain Python."""
     made = control.DiscretePid(PID, 250.0, order=4)
     control.save_controller(made, tmp_path / "c.json")
-    told = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["controller"]
+    settings = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["controller"]
     assert "every lag becomes" in json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["meaning"]
     states, last = None, 0.0
     for e in np.sin(np.arange(100) * 0.05) + 0.2:
         if states is None:
             states = [
-                0.0 if g["of"] == "integral" else e * (g["now"] + g["before"]) / (1 - g["keep"]) for g in told["lags"]
+                0.0 if g["of"] == "integral" else e * (g["now"] + g["before"]) / (1 - g["keep"])
+                for g in settings["lags"]
             ]
         else:
             states = [
-                g["keep"] * x + g["now"] * e + g["before"] * last for g, x in zip(told["lags"], states, strict=True)
+                g["keep"] * x + g["now"] * e + g["before"] * last for g, x in zip(settings["lags"], states, strict=True)
             ]
-        output = (told["kp"] + told["direct"]) * e
-        output += sum(g["weight"] * x for g, x in zip(told["lags"], states, strict=True))
+        output = (settings["kp"] + settings["direct"]) * e
+        output += sum(g["weight"] * x for g, x in zip(settings["lags"], states, strict=True))
         assert made(float(e)) == pytest.approx(output, rel=1e-9)
         last = e
 
@@ -88,17 +89,17 @@ def test_an_lqg_runs_from_the_numbers_of_its_file_alone(saved, tmp_path):
     out = tmp_path / "c.json"
     assert run(*WORDS, saved, "--limit", 0.9, "-o", out).exit_code == 0
     made = control.load_controller(out)
-    told = json.loads(out.read_text(encoding="utf-8"))["controller"]
-    a, b, c, correction, feedback = (np.array(told[n]) for n in ("a", "b", "c", "correction", "feedback"))
+    settings = json.loads(out.read_text(encoding="utf-8"))["controller"]
+    a, b, c, correction, feedback = (np.array(settings[n]) for n in ("a", "b", "c", "correction", "feedback"))
     size = len(a)
     whole = np.block([[a, b], [np.zeros((1, size)), np.eye(1)]])
     x, u = np.zeros(size + 1), 0.0
-    rows = [told["outputs"].index(n) for n in told["measured"]]
+    rows = [settings["outputs"].index(n) for n in settings["measured"]]
     for k in range(50):
         y = np.array([0.01 * np.sin(0.1 * k), 0.002 * np.cos(0.3 * k) if k else 0.0])
         x = x + correction @ (y - c[rows] @ x[:-1])
         x = whole @ x + np.append(b[:, 0], 0.0) * u
-        u = float(np.clip(told["ahead"] * 0.3 - np.append(feedback[0], 1.0) @ x, -0.9, 0.9))
+        u = float(np.clip(settings["ahead"] * 0.3 - np.append(feedback[0], 1.0) @ x, -0.9, 0.9))
         assert made(y, 0.3) == pytest.approx(u, abs=1e-9)
 
 
@@ -162,8 +163,8 @@ def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
         ("b", [1.0], "Expected `array`"),
         ("feedback", [[1e999] * len(whole["controller"]["a"])], "is not an ftlm controller|not finite"),
     ):
-        told = whole | {"controller": whole["controller"] | {key: value}}
-        (tmp_path / "c.json").write_text(json.dumps(told), encoding="utf-8")
+        content = whole | {"controller": whole["controller"] | {key: value}}
+        (tmp_path / "c.json").write_text(json.dumps(content), encoding="utf-8")
         with pytest.raises(ftlm.DataError, match=words):
             control.load_controller(tmp_path / "c.json")
 

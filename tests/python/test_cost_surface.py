@@ -89,7 +89,7 @@ def test_the_pair_least_told_apart_is_named(fit):
 def test_the_report_shows_it_and_says_what_it_is(fit, tmp_path):
     text = fit.report(tmp_path / "fit.html").read_text()
     assert "Order landscape" in text
-    assert "these runs tell apart least are α and" in text
+    assert "orders with the most correlated estimates are α and" in text
 
 
 def test_without_two_orders_or_errors_there_is_none(fit, small_run, with_noise):

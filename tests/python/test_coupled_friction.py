@@ -56,9 +56,13 @@ def started(x: float, dx: float, q: float, dq: float) -> list[list[tuple[float, 
     return [list(p.items()) for p in (hub, link)]
 
 
-def run_of(u, x, q, step, name="run", *, held=False):
+def run_of(u, x, q, step, name="run", *, is_constant=False):
     return ftlm.Run.from_arrays(
-        step=step, inputs={"u": u}, outputs={"x": x, "q": q}, intersample={"u": "zoh" if held else "foh"}, name=name
+        step=step,
+        inputs={"u": u},
+        outputs={"x": x, "q": q},
+        intersample={"u": "zoh" if is_constant else "foh"},
+        name=name,
     )
 
 

@@ -22,14 +22,14 @@ pytestmark = pytest.mark.usefixtures("no_extension_tests")
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 
 
-def late_run(delay: float, snr: float, seed: int, *, held: bool = True) -> ftlm.Run:
+def late_run(delay: float, snr: float, seed: int, *, is_constant: bool = True) -> ftlm.Run:
     """The three-term plant behind a delay: the truth is simulated on a grid that the delay is a multiple of."""
     clean = plants.clean_run("3T")
     fine = 8
     step, rows = clean.step / fine, (clean.length - 1) * fine + 1
     steps = round(delay / step)
     assert steps == pytest.approx(delay / step, abs=1e-9)
-    if held:
+    if is_constant:
         given = np.repeat(clean["u"], fine)[:rows]
     else:
         # Linear between the samples, as the record says.
@@ -38,7 +38,7 @@ def late_run(delay: float, snr: float, seed: int, *, held: bool = True) -> ftlm.
         given = np.interp(np.arange(rows) * step, coarse, drive)
     arrived = np.concatenate([np.zeros(steps), given])[:rows]
     truth = ftlm.Model(ftlm.equation("D^2.2 y = -0.625 D^0.9 y - 1.25 y + 1.25 u"))
-    between = {"u": "zoh" if held else "foh"}
+    between = {"u": "zoh" if is_constant else "foh"}
     blank = ftlm.Run.from_arrays(step=step, inputs={"u": arrived}, outputs={"y": 0 * arrived}, intersample=between)
     y = truth.simulate(blank, tolerance=1e-7)["y"][::fine]
     noise = np.std(y) * 10 ** (-snr / 20) * np.random.default_rng([seed, 77]).standard_normal(y.size)
@@ -93,7 +93,7 @@ def test_an_input_that_is_linear_in_between_is_delayed_to_second_order():
     errors = []
     for every in (1, 2, 4):
         problem = FreeProblem.of(structure())
-        run = late_run(DELAY, 200, 0, held=False)
+        run = late_run(DELAY, 200, 0, is_constant=False)
         prepared = [sample_run(run, problem, [1.0], every=every)]
         start = Iterate([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
         end = minimize_cost(problem, prepared, start, evaluations=40, plain=True)

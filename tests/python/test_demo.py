@@ -2,7 +2,7 @@
 
 import pytest
 
-from ftlm.cli.framework import broken_line
+from ftlm.cli.framework import wrap_line
 from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 
 
@@ -27,7 +27,7 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, m
     assert not any(line.startswith("warning") for line in lines)
     # The same on a terminal of 80 columns, as the command line breaks its lines.
     monkeypatch.setenv("COLUMNS", "80")
-    broken = [part for line in demo_text(demo).splitlines() for part in broken_line(line)]
+    broken = [part for line in demo_text(demo).splitlines() for part in wrap_line(line)]
     assert len(broken) + 4 <= 42
     assert max(map(len, broken)) <= 80
     assert sum(line.startswith("! ") for line in lines) <= 3

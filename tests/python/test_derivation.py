@@ -258,8 +258,8 @@ def test_coefficient_law(stage):
         - d * r * deriv(arm.mu, arm.link)
         - g * deriv(arm.input_order, arm.current)
     )
-    for ours, theirs in zip(arm.solved(), (hub, link), strict=True):
-        assert vanishes(ours - theirs)
+    for solved_equation, expected_equation in zip(arm.solved(), (hub, link), strict=True):
+        assert vanishes(solved_equation - expected_equation)
 
 
 # a of the hub's row and of the link's row, as printed for p = 1, 3, 5, 7 and for the genetic algorithm.

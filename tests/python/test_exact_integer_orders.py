@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("no_extension_tests")
 H = 0.05
 
 
-def held(numerator: list[float], denominator: list[float], u: Floats, step: float = H) -> Floats:
+def hold_response(numerator: list[float], denominator: list[float], u: Floats, step: float = H) -> Floats:
     b, a, _ = cont2discrete((numerator, denominator), step)[:3]
     y: Floats = lfilter(np.ravel(b), a, u)
     return y
@@ -31,7 +31,9 @@ def test_a_start_at_the_truth_has_no_residual_whatever_the_sampling() -> None:
     # 3.3 samples a period: the pulse grid at this step is off by percents.
     u = telegraph(1)
     truth = {"a1": -8.0, "a0": -1600.0, "b1": 30.0, "b0": 800.0}
-    run = ftlm.Run.from_arrays(step=H, inputs={"u": u}, outputs={"y": held([30.0, 800.0], [1.0, 8.0, 1600.0], u)})
+    run = ftlm.Run.from_arrays(
+        step=H, inputs={"u": u}, outputs={"y": hold_response([30.0, 800.0], [1.0, 8.0, 1600.0], u)}
+    )
     equation = ftlm.equation("D^2 y = a1 D y + a0 y + b1 D u + b0 u", initial="rest")
     found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic", start=truth))
     assert found.coefficients == pytest.approx(truth, rel=1e-8)
@@ -52,7 +54,7 @@ def test_a_linear_input_and_an_initial_state_are_exact() -> None:
 
 def test_a_delay_between_samples_is_exact() -> None:
     u = telegraph(3)
-    fine = held([8.0], [1.0, 4.0], np.r_[np.zeros(3), np.repeat(u, 10)][: 10 * len(u)], H / 10)
+    fine = hold_response([8.0], [1.0, 4.0], np.r_[np.zeros(3), np.repeat(u, 10)][: 10 * len(u)], H / 10)
     run = ftlm.Run.from_arrays(step=H, inputs={"u": u}, outputs={"y": fine[::10]})
     equation = ftlm.equation("D y = a y + b u", delay={"u": (0.0, 0.2)}, initial="rest")
     found = ftlm.identify(run, equation, method=ftlm.OutputError(intervals="quadratic"))
@@ -80,7 +82,7 @@ def random_plant(seed: int) -> tuple[list[float], list[float], Floats, float]:
 def fit_and_truth(seed: int, more: int = 0) -> tuple[float, float]:
     """Return the cost of a fit with `more` orders than a random plant, and that of the truth."""
     numerator, denominator, u, step = random_plant(seed)
-    y = held(numerator, denominator, u, step)
+    y = hold_response(numerator, denominator, u, step)
     noisy = y + 0.03 * y.std() * np.random.default_rng(1000 + seed).standard_normal(y.size)
     n, m = len(denominator) - 1 + more, len(numerator) - 1 + more
     terms = [f"a{i} D^{i} y" for i in range(n)] + [f"b{i} D^{i} u" for i in range(m + 1)]
@@ -123,7 +125,7 @@ def long_record_cost(seed: int, rows: int) -> float:
     for mode in modes:
         # Parallel modes of similar static gains.
         denominator = list(np.poly(mode).real)
-        y += held([g.choice([-1.0, 1.0]) * np.exp(g.normal(0.0, 0.7)) * denominator[-1]], denominator, u, 1.0)
+        y += hold_response([g.choice([-1.0, 1.0]) * np.exp(g.normal(0.0, 0.7)) * denominator[-1]], denominator, u, 1.0)
     e = np.exp(g.uniform(np.log(0.01), np.log(0.1))) * np.std(y) * g.standard_normal(rows)
     run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": y + e})
     terms = [f"a{k} D^{k} y + b{k} D^{k} u" for k in range(n)]

@@ -82,11 +82,11 @@ def cluster(folder):
 
 def test_threads_give_the_same_bytes(run, expected):
     with ThreadPoolExecutor(3) as pool:
-        told = []
-        found = search(run, pool, progress=lambda done, total: told.append((done, total)))
+        reports = []
+        found = search(run, pool, progress=lambda done, total: reports.append((done, total)))
         assert bytes_of(found) == expected
-        assert told[-1] == (found.candidates, found.candidates)
-        assert [d for d, _ in told] == sorted(d for d, _ in told)
+        assert reports[-1] == (found.candidates, found.candidates)
+        assert [d for d, _ in reports] == sorted(d for d, _ in reports)
         assert bytes_of(search(run, pool, threads=2)) == expected
 
 
@@ -209,13 +209,13 @@ def stage_expected(stage_run):
 
 
 def test_threads_give_the_same_bytes_of_a_stage(stage_run, stage_expected):
-    told = []
+    reports = []
     with ThreadPoolExecutor(3) as pool:
-        found = search_stage(stage_run, pool, progress=lambda *done: told.append(done))
+        found = search_stage(stage_run, pool, progress=lambda *done: reports.append(done))
         assert bytes_of(search_stage(stage_run, pool, threads=2)) == stage_expected
     assert bytes_of(found) == stage_expected
-    assert told[-1][0] == told[-1][1]
-    assert [d for d, _ in told] == sorted(d for d, _ in told)
+    assert reports[-1][0] == reports[-1][1]
+    assert [d for d, _ in reports] == sorted(d for d, _ in reports)
 
 
 def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, stage_expected, tmp_path):
@@ -262,7 +262,7 @@ def killed_half_way(run, folder, **options):
     with cluster(folder) as (client, workers):
         times = {}
 
-        def told(done, total):
+        def report_progress(done, total):
             now = time.monotonic()
             times.setdefault("first", now)
             if "killed" in times:
@@ -272,7 +272,7 @@ def killed_half_way(run, folder, **options):
                 times["killed"] = time.monotonic()
             times["last"] = now
 
-        found = search(run, client.get_executor(), progress=told, **options)
+        found = search(run, client.get_executor(), progress=report_progress, **options)
         assert workers[1].wait(timeout=60) == -signal.SIGKILL
     return times, found
 
@@ -321,16 +321,16 @@ def test_many_runs_are_identified_and_one_that_fails_does_not_stop_the_rest(smal
     other = ftlm.Run.from_arrays(step=0.02, inputs={"v": runs[0]["u"]}, outputs={"y": runs[0]["y"]}, name="other")
     items = [runs[0], other, [runs[1], runs[2]]]
     options = {"method": "least-squares", "m": 256}
-    told = []
-    here = ftlm.identify_many(items, structure, progress=lambda *done: told.append(done), **options)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    reports = []
+    here = ftlm.identify_many(items, structure, progress=lambda *done: reports.append(done), **options)
+    assert reports == [(1, 3), (2, 3), (3, 3)]
     assert [i.error is None for i in here] == [True, False, True]
     assert isinstance(here[1].error, DataError)
     assert "'u'" in str(here[1])
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        told.clear()
-        there = ftlm.identify_many(items, structure, executor=pool, progress=lambda *d: told.append(d), **options)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+        reports.clear()
+        there = ftlm.identify_many(items, structure, executor=pool, progress=lambda *d: reports.append(d), **options)
+    assert reports == [(1, 3), (2, 3), (3, 3)]
     assert [str(i) for i in there] == [str(i) for i in here]
     assert there[0].result.model.coefficients == ftlm.identify(runs[0], structure, **options).model.coefficients
     assert here[2].name == ", ".join(r.name for r in runs[1:])

@@ -26,11 +26,11 @@ def force(t, first: float = 0.0, second: float = 0.4):
     return 6.0 * np.sin(2.1 * t + first) + 3.0 * np.sin(5.3 * t + second)
 
 
-def hub_run(names: str, *, start=(0.0,) * 4, held=(0.0,) * 4, seed: int | None = None) -> ftlm.Run:
+def hub_run(names: str, *, start=(0.0,) * 4, filter_state=(0.0,) * 4, seed: int | None = None) -> ftlm.Run:
     """The hub and its link between events, the angles that are named behind the filter."""
     t = np.arange(ROWS) * 0.01
     angles, v = friction.hub_and_link(
-        force, t, HUB, LINK, TRUTH["fc"], start=start, low_pass=(CORNER, DAMPING), held=held
+        force, t, HUB, LINK, TRUTH["fc"], start=start, low_pass=(CORNER, DAMPING), filter_state=filter_state
     )
     assert 0.1 < np.mean(v == 0.0) < 0.9
     x, q = (angles[k + 2 * (name in names)] for k, name in enumerate("xq"))
@@ -42,7 +42,7 @@ def hub_run(names: str, *, start=(0.0,) * 4, held=(0.0,) * 4, seed: int | None =
     )
 
 
-def cart_run(level: float, rate: float, held: tuple[float, float], seed: int) -> ftlm.Run:
+def cart_run(level: float, rate: float, filter_state: tuple[float, float], seed: int) -> ftlm.Run:
     """A cart with v = 1, g = 1, fc = 0.8 under held values in closed form, its position behind the filter, with noise.
 
     The filter is driven by straight lines between hundredths of a sample interval.
@@ -56,7 +56,7 @@ def cart_run(level: float, rate: float, held: tuple[float, float], seed: int) ->
         ([[0.0, 1.0], [-(CORNER**2), -2.0 * DAMPING * CORNER]], [[0.0], [CORNER**2]], [[1.0, 0.0]], [[0.0]]),
         fine[: (ROWS - 1) * parts + 1],
         np.arange((ROWS - 1) * parts + 1) * STEP / parts,
-        X0=held,
+        X0=filter_state,
     )
     read = read[::parts]
     read += 0.005 * np.std(read) * rng.standard_normal(ROWS)
@@ -80,7 +80,7 @@ def test_the_free_run_is_that_between_events_with_the_filter_s_states(names: str
 
 @pytest.mark.parametrize("names", ["q", "xq"])
 def test_a_filter_in_motion_is_found_with_the_start(names: str) -> None:
-    run = hub_run(names, start=(0.3, 1.0, 0.05, -0.4), held=(0.25, 0.8, 0.07, 0.2))
+    run = hub_run(names, start=(0.3, 1.0, 0.05, -0.4), filter_state=(0.25, 0.8, 0.07, 0.2))
     model = solved(WORDS, TRUTH, behind(*names), initial="caputo")
     found = model.compare(run)
     assert min(found.fit.values()) > 99.7
@@ -96,10 +96,10 @@ def test_a_filter_in_motion_is_found_with_the_start(names: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("level", "rate", "held"), [(0.0, 0.0, (0.0, 0.0)), (0.3, 0.8, (0.25, 0.5))], ids=["rest", "motion"]
+    ("level", "rate", "filter_state"), [(0.0, 0.0, (0.0, 0.0)), (0.3, 0.8, (0.25, 0.5))], ids=["rest", "motion"]
 )
-def test_a_cart_is_recovered_behind_its_filter(level: float, rate: float, held: tuple[float, float]) -> None:
-    run = cart_run(level, rate, held, 3)
+def test_a_cart_is_recovered_behind_its_filter(level: float, rate: float, filter_state: tuple[float, float]) -> None:
+    run = cart_run(level, rate, filter_state, 3)
     initial = "rest" if rate == 0 else "caputo"
     found = ftlm.identify(run, ftlm.equation(CART, sensor_filter=behind("y"), initial=initial), threads=1)
     for name, value in {"v": 1.0, "g": 1.0, "fc": 0.8}.items():

@@ -257,7 +257,7 @@ HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
 CARRIED = "D^2 x = a q + d D q - b D x + g u; D^2 q = - D^2 x - k q - e D q"
 CARRIED_TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "k": 90.0, "e": 1.2}
 #: Where they are when the run begins, how fast, and what each one's filter holds then.
-MOVING, HELD = (0.3, 1.0, 0.05, -0.4), (0.25, 0.8, 0.07, 0.2)
+MOVING, FILTER_STATE = (0.3, 1.0, 0.05, -0.4), (0.25, 0.8, 0.07, 0.2)
 
 
 def carried_run(names: str, *, own_times: bool = False) -> ftlm.Run:
@@ -269,7 +269,9 @@ def carried_run(names: str, *, own_times: bool = False) -> ftlm.Run:
     t = np.arange(401) * 0.01
     if own_times:
         t[1:-1] += np.random.default_rng(0).uniform(-0.003, 0.003, t.size - 2)
-    angles, _ = friction.hub_and_link(pulled, t, HUB, LINK, 0.0, start=MOVING, low_pass=(OMEGA, ZETA), held=HELD)
+    angles, _ = friction.hub_and_link(
+        pulled, t, HUB, LINK, 0.0, start=MOVING, low_pass=(OMEGA, ZETA), filter_state=FILTER_STATE
+    )
     outputs = {name: angles[k + 2 * (name in names)] for k, name in enumerate("xq")}
     times = {"time": t, "resample": 0.01} if own_times else {"step": 0.01}
     return ftlm.Run.from_arrays(inputs={"u": pulled(t)}, outputs=outputs, intersample={"u": "foh"}, **times)
@@ -290,7 +292,7 @@ def test_equations_that_follow_together_start_with_their_filters_in_motion(names
     start = compared.initial[0]
     assert {n for n in "xq" if {-1.0, -2.0} <= set(start[n])} == set(names)
     for name in names:
-        level, rate = HELD["xq".index(name) * 2 :][:2]
+        level, rate = FILTER_STATE["xq".index(name) * 2 :][:2]
         # A free motion of the filter is its answer to these; of an impulse's derivative it makes a jump.
         assert OMEGA**2 * start[name][-2.0] == pytest.approx(level, abs=3e-4)
         slope = OMEGA**2 * (start[name][-1.0] - 2 * ZETA * OMEGA * start[name][-2.0])

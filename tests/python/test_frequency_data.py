@@ -336,17 +336,17 @@ def scipys(response):
 
 def test_the_automatic_start_finds_what_curve_fit_misses_from_its_own():
     rng = np.random.default_rng(0)
-    ours = theirs = 0
+    identified_count = scipy_count = 0
     for _ in range(8):
         r0, r1, time = 10 ** rng.uniform([-2, -2, -4], [1, 1, 1])
         alpha = rng.uniform(0.5, 0.95)
         response = circuits.zarc(W, r0, r1, time, alpha)
         truth = np.array([alpha, -(time**-alpha), r0, (r0 + r1) * time**-alpha])
         found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(W, response), ARC)
-        ours += np.allclose([found.values[n] for n in ("alpha", "a", "r", "b")], truth, rtol=1e-5)
-        theirs += np.allclose(scipys(response), truth, rtol=1e-5)
-    assert ours == 8
-    assert theirs <= 4, theirs
+        identified_count += np.allclose([found.values[n] for n in ("alpha", "a", "r", "b")], truth, rtol=1e-5)
+        scipy_count += np.allclose(scipys(response), truth, rtol=1e-5)
+    assert identified_count == 8
+    assert scipy_count <= 4, scipy_count
 
 
 def test_a_lattice_of_any_length_and_many_orders_is_searched():

@@ -188,12 +188,12 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
     settings = {"criterion": criterion, "norm": norm, "top": 3}
     options = {"threads": 1, "m": 128}
     order_grid = ftlm.order_grid(increment=0.2, alpha=(1.2, 2.0))
-    told = []
+    reports = []
     found = ftlm.identify(
         small_run,
         words,
         method=ftlm.MultiInnovation(innovation_length=3, prior_covariance=50.0, order_grid=order_grid, **settings),
-        progress=lambda done, total: told.append((done, total)),
+        progress=lambda done, total: reports.append((done, total)),
         **options,
     )
     same = ftlm.search_orders(
@@ -208,7 +208,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
     )
     assert found.searches["y"].table == same.table
     assert len(same.table) == 3
-    assert told[-1] == (same.candidates, same.candidates)
+    assert reports[-1] == (same.candidates, same.candidates)
 
 
 def test_equations_without_a_law_are_searched_one_by_one(clean_a):
@@ -292,9 +292,11 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
     for again in (found.model.compare(runs), ftlm.compare(found.model, runs), saved.compare(runs)):
         assert again.m == 128
         for kind in ("output_error", "equation_error"):
-            ours, theirs = getattr(found, kind)["y"], getattr(again, kind)["y"]
+            first_statistics, repeated_statistics = getattr(found, kind)["y"], getattr(again, kind)["y"]
             for figure in ("error", "rmse", "nr", "fit"):
-                assert getattr(theirs, figure) == pytest.approx(getattr(ours, figure), rel=1e-12), figure
+                assert getattr(repeated_statistics, figure) == pytest.approx(
+                    getattr(first_statistics, figure), rel=1e-12
+                ), figure
         assert again.fit == pytest.approx(found.fit, rel=1e-12)
     if initial == "caputo":
         return  # each run's free run then fits its own initial terms, which a search does not

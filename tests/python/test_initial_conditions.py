@@ -75,8 +75,10 @@ def test_intervals_of_a_run_cut_out_of_a_motion_hold_the_truth(name, seeds):
 def test_halves_of_a_motion_agree(halves):
     _, (first, second) = halves
     for name in ("alpha", "a", "b"):
-        ours, theirs = ({**f.orders, **f.coefficients}[name] for f in (first, second))
-        assert abs(ours - theirs) < 3.5 * np.hypot(first.standard_errors[name], second.standard_errors[name])
+        first_value, second_value = ({**f.orders, **f.coefficients}[name] for f in (first, second))
+        assert abs(first_value - second_value) < 3.5 * np.hypot(
+            first.standard_errors[name], second.standard_errors[name]
+        )
 
 
 @pytest.mark.slow
@@ -88,8 +90,8 @@ def test_intervals_cover_in_motion_as_from_rest():
             both = [ftlm.identify(run, ftlm.equation(plant.words)) for run in motion.pieces(plant, seed)]
             held.append([abs(z) < 1.96 for z in motion.scores(both[1], plant).values()])
             for n in plant.truth:
-                ours, theirs = ({**f.orders, **f.coefficients}[n] for f in both)
-                agree.append(abs(ours - theirs) < 1.96 * np.hypot(*(f.standard_errors[n] for f in both)))
+                first_value, second_value = ({**f.orders, **f.coefficients}[n] for f in both)
+                agree.append(abs(first_value - second_value) < 1.96 * np.hypot(*(f.standard_errors[n] for f in both)))
     covered = np.concatenate(held)
     assert 0.90 <= np.mean(covered) <= 0.99
     assert np.mean(agree) >= 0.90
@@ -130,9 +132,9 @@ def test_the_command_line_asks_for_a_history(halves, tmp_path):
     rows = zip(run.time, run["u"], run["y"], strict=True)
     table.write_text("t,u,y\n" + "".join(f"{t!r},{u!r},{y!r}\n" for t, u, y in np.array(list(rows)).tolist()))
     words = ["identify", str(table), "--structure", WORDS, "--time", "t", "-u", "u", "-y", "y", "--json"]
-    told = CliRunner().invoke(cli.app, [*words, "--initial", "history"])
-    assert told.exit_code == 0, told.output
-    document = json.loads(told.stdout)
+    result = CliRunner().invoke(cli.app, [*words, "--initial", "history"])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
     assert document["settings"]["initial"] == found.settings["initial"]
     refused = CliRunner().invoke(cli.app, [*words, "--initial", "tails"])
     assert refused.exit_code == 2

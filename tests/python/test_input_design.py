@@ -91,8 +91,8 @@ def test_of_whole_orders_it_is_what_scipy_differenced_says() -> None:
 
     def answer(v: dict[str, float], u: np.ndarray) -> np.ndarray:
         system = np.array([[0.0, 1.0], [v["a0"], v["a1"]]]), np.array([[0.0], [v["b0"]]])
-        held = cont2discrete((*system, np.array([[1.0, 0.0]]), np.zeros((1, 1))), STEP, "zoh")
-        return np.asarray(dlsim(held, u[:, None])[1][:, 0])
+        discrete = cont2discrete((*system, np.array([[1.0, 0.0]]), np.zeros((1, 1))), STEP, "zoh")
+        return np.asarray(dlsim(discrete, u[:, None])[1][:, 0])
 
     errors = by_differences(answer, made, 1e-4)
     assert [made.errors["designed"][n] for n in made.values] == pytest.approx(errors, rel=2e-3)
@@ -148,12 +148,12 @@ def test_any_input_follows_from_what_one_sample_does(laid: ModelFit) -> None:
         run = laid.run(known.rig_commands(commands), STEP, "any")
         for name, row in zip(laid.outputs, known.outputs(commands), strict=True):
             assert row == pytest.approx(run[name][:-1], abs=1e-5 * np.max(np.abs(run[name])))
-        told = known.information(known.derivatives(commands))
+        expected_information = known.information(known.derivatives(commands))
         # The core compares neither the first sample nor the last, and projects offsets out by itself.
         exact = laid.jacobian(run)
         exact = exact @ exact.T
         size = np.sqrt(np.diag(exact))
-        assert told / np.outer(size, size) == pytest.approx(exact / np.outer(size, size), abs=2e-4)
+        assert expected_information / np.outer(size, size) == pytest.approx(exact / np.outer(size, size), abs=2e-4)
 
 
 def test_lines_are_what_a_period_says_that_was_there_long_before(laid: ModelFit) -> None:
@@ -170,9 +170,9 @@ def test_lines_are_what_a_period_says_that_was_there_long_before(laid: ModelFit)
         wave[k] = 0.7 * np.sqrt(2) * np.sin(2 * np.pi * lines.frequencies[at] * t)
         known = Sensitivities.of(laid, STEP, rows * periods, 1)
         last = known.derivatives(wave)[..., -rows:].reshape(len(laid.names), -1)
-        told = last @ last.T
-        size = np.sqrt(np.maximum(np.diag(told), 1e-12 * np.max(np.diag(told))))
-        close = pytest.approx(told / np.outer(size, size), abs=0.03)
+        expected_information = last @ last.T
+        size = np.sqrt(np.maximum(np.diag(expected_information), 1e-12 * np.max(np.diag(expected_information))))
+        close = pytest.approx(expected_information / np.outer(size, size), abs=0.03)
         assert lines.information[at] / np.outer(size, size) == close
         swings = known.outputs(wave)[:, -rows:]
         assert lines.costs[count:, at] == pytest.approx(np.mean(swings**2, axis=1), rel=0.03, abs=1e-4)
@@ -197,16 +197,16 @@ def test_fits_of_the_designed_run_scatter_as_foretold(designed: ftlm.DesignedInp
     clean = truth.simulate(designed.run)
     structure = replace(ftlm.equation(FREE), initial="rest")
     true = {"alpha": 1.6, "a1": -0.8, "a0": -4.0, "b0": 3.0}
-    off, told = [], []
+    off, expected_information = [], []
     for seed in range(12):
         noisy = clean["y"] + NOISE * np.random.default_rng([11, seed]).standard_normal(clean.length)
         run = ftlm.Run.from_arrays(step=STEP, inputs={"u": clean["u"]}, outputs={"y": noisy}, name="second")
         fit = fit_output_error([run], structure, start=true)
         off.append([fit.values[fit.names.index(n)] - true[n] for n in true])
-        told.append([fit.standard_errors[n] for n in true])
+        expected_information.append([fit.standard_errors[n] for n in true])
     foretold = np.array([designed.errors["designed"][n] for n in true])
     # One model's noise is known to 5 % of so few samples.
-    assert np.sqrt(np.mean(np.array(told) ** 2, axis=0)) == pytest.approx(foretold, rel=0.2)
+    assert np.sqrt(np.mean(np.array(expected_information) ** 2, axis=0)) == pytest.approx(foretold, rel=0.2)
     assert 0.7 < float(np.sqrt(np.mean((np.array(off) / foretold) ** 2))) < 1.3
 
 
@@ -354,12 +354,12 @@ def test_the_widest_axis_is_shorter_by_its_own_criterion(found: ftlm.Identificat
     both = {c: ftlm.design_input(found, criterion=c, **options) for c in ("D", "E")}
     laid = ModelFit.of(found.model, parameter_set_of(found.model).noise)
     widest, all_of_it = Criterion("E", (0, 1), (1.0, abs(laid.values[1]))), Criterion("D", (0, 1), (1.0, 1.0))
-    told = {}
+    expected_information = {}
     for kind, made in both.items():
         rows = laid.jacobian(made.run)
-        told[kind] = rows @ rows.T
-    assert widest.score(told["E"]) > widest.score(told["D"]) - 0.02
-    assert all_of_it.score(told["D"]) > all_of_it.score(told["E"]) - 0.02
+        expected_information[kind] = rows @ rows.T
+    assert widest.score(expected_information["E"]) > widest.score(expected_information["D"]) - 0.02
+    assert all_of_it.score(expected_information["D"]) > all_of_it.score(expected_information["E"]) - 0.02
 
 
 def test_the_same_is_designed_from_a_result_and_from_its_file(

@@ -35,8 +35,8 @@ def jittered(seed: int, jitter: float = 0.3) -> ftlm.Run:
     # Some 30 switches: at every one the linear interpolation of the output cuts a corner of its own.
     command = np.where(np.cumsum(rng.random(ROWS) < 0.05) % 2, -1.0, 1.0)
     fine = np.arange(ticks[-1] + 1)
-    held = command[np.searchsorted(ticks, fine, side="right") - 1]
-    there = ftlm.Run.from_arrays(inputs={"u": held}, outputs={"y": np.zeros(fine.size)}, step=STEP / FINE)
+    samples = command[np.searchsorted(ticks, fine, side="right") - 1]
+    there = ftlm.Run.from_arrays(inputs={"u": samples}, outputs={"y": np.zeros(fine.size)}, step=STEP / FINE)
     y = ftlm.Model(ftlm.equation(PLANT)).simulate(there)["y"][ticks]
     return ftlm.Run.from_arrays(
         time=ticks * STEP / FINE,

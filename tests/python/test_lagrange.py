@@ -218,8 +218,8 @@ def derived(stage: int) -> ftlm.Model:
 @STAGES
 def test_frequency_responses_are_those_of_the_derived_form(stage: int) -> None:
     w = np.geomspace(0.1, 300.0, 40)
-    ours, theirs = (m.frequency_response(w) for m in (model(stage), derived(stage)))
-    assert np.max(np.abs(ours - theirs) / np.abs(theirs)) < 1e-11
+    direct, from_lagrangian = (m.frequency_response(w) for m in (model(stage), derived(stage)))
+    assert np.max(np.abs(direct - from_lagrangian) / np.abs(from_lagrangian)) < 1e-11
 
 
 @STAGES
@@ -231,9 +231,9 @@ def test_free_runs_are_those_of_the_derived_form(stage: int) -> None:
         intersample={f"I{stage}": "foh"},
         outputs={f"theta{stage}{k}": np.zeros(t.size) for k in (1, 2)},
     )
-    ours, theirs = (m.simulate(run, tolerance=2e-10) for m in (model(stage), derived(stage)))
-    for name in ours.outputs:
-        assert np.max(np.abs(ours[name] - theirs[name])) < 1e-9 * np.max(np.abs(theirs[name])), name
+    direct, from_lagrangian = (m.simulate(run, tolerance=2e-10) for m in (model(stage), derived(stage)))
+    for name in direct.outputs:
+        assert np.max(np.abs(direct[name] - from_lagrangian[name])) < 1e-9 * np.max(np.abs(from_lagrangian[name])), name
 
 
 @STAGES

@@ -340,7 +340,7 @@ def test_a_workbook_that_is_none_or_too_large_is_refused(tmp_path):
         # A flipped bit is refused, or is none of the sheet's.
         path = write(tmp_path, whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :], "flipped.xlsx")
         out = io.BytesIO()
-        reader.answer("sheet", str(path), out, 1 << 20, None)
+        reader.write_result("sheet", str(path), out, 1 << 20, None)
         refused += b'"error"' in out.getvalue()
         assert b'"error"' in out.getvalue() or out.getvalue().endswith(good[1])
     assert refused > 200

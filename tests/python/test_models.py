@@ -586,9 +586,9 @@ def test_a_model_file_gives_back_every_bit(tmp_path):
     loaded = ftlm.load_model(path)
     # What is only of use before identification is not stored.
     assert loaded.structure.order_values == {}
-    for ours, theirs in zip(model.equations, loaded.equations, strict=True):
-        assert ours == theirs
-        for a, b in zip(ours.terms, theirs.terms, strict=True):
+    for original, restored in zip(model.equations, loaded.equations, strict=True):
+        assert original == restored
+        for a, b in zip(original.terms, restored.terms, strict=True):
             assert same_bits(a.coefficient, b.coefficient)
             assert same_bits(a.fixed, b.fixed)
             assert same_bits(a.order.constant, b.order.constant)

@@ -29,15 +29,15 @@ def model(words, covariance=None, **options):
 
 @pytest.mark.parametrize("words", ["D^2 y = -0.6 D y - 9 y + 4 u", "D^3 y = -12 D^2 y - 30 D y - 20 y + 3 D u + 7 u"])
 def test_whole_orders_are_as_python_control_has_them(words):
-    ours = model(words)
+    fitted = model(words)
     num, den = ([7.0, 3.0][::-1], [1.0, 12.0, 30.0, 20.0]) if "D^3" in words else ([4.0], [1.0, 0.6, 9.0])
-    theirs = control.tf(num, den)
-    natural, damping, poles = control.damp(theirs, doprint=False)
+    reference = control.tf(num, den)
+    natural, damping, poles = control.damp(reference, doprint=False)
     upper = poles.imag >= 0
     order = np.argsort(natural[upper])
-    assert [m.frequency for m in modes(ours)] == pytest.approx(natural[upper][order].tolist(), rel=1e-9)
-    assert [m.damping for m in modes(ours)] == pytest.approx(damping[upper][order].tolist(), abs=1e-9)
-    assert ours.dcgain()[0, 0] == pytest.approx(theirs.dcgain(), rel=1e-12)
+    assert [m.frequency for m in modes(fitted)] == pytest.approx(natural[upper][order].tolist(), rel=1e-9)
+    assert [m.damping for m in modes(fitted)] == pytest.approx(damping[upper][order].tolist(), abs=1e-9)
+    assert fitted.dcgain()[0, 0] == pytest.approx(reference.dcgain(), rel=1e-12)
 
 
 def test_one_order_alone_has_its_time_constant_in_closed_form():
@@ -191,8 +191,8 @@ def test_a_step_is_the_closed_form_and_so_is_its_band():
     assert found.values[0, 0] == pytest.approx(1.5 * (1 - np.exp(-2 * t)), abs=2e-5)
     slope = -3 / 4 * (1 - np.exp(-2 * t)) + 1.5 * t * np.exp(-2 * t)
     assert found.deviation[0, 0] == pytest.approx(0.1 * np.abs(slope), abs=2e-5)
-    theirs = control.step_response(control.tf([3.0], [1.0, 2.0]), t).outputs
-    assert found.values[0, 0] == pytest.approx(theirs, abs=2e-5)
+    reference = control.step_response(control.tf([3.0], [1.0, 2.0]), t).outputs
+    assert found.values[0, 0] == pytest.approx(reference, abs=2e-5)
     assert "final value 1.5 ± 0.075" in str(found)
     assert "<svg" in found._repr_html_()
     assert "95 % band" in found._repr_html_()

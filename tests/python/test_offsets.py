@@ -261,8 +261,8 @@ def test_a_model_keeps_its_offset_and_one_without_is_as_it_was(tmp_path):
     for offset in ("none", "constant"):
         model = ftlm.identify(run, ftlm.equation("D^0.8 y = -a y + b u", offset=offset)).model
         file = model.save(tmp_path / f"{offset}.json")
-        held = json.loads(file.read_text())
-        assert held["offset"] == offset
+        content = json.loads(file.read_text())
+        assert content["offset"] == offset
         again = ftlm.load_model(file)
         assert again.structure.offset == offset
         assert ftlm.compare(again, run).output_error == ftlm.compare(model, run).output_error
@@ -277,11 +277,11 @@ def test_the_command_line_and_the_report_tell_the_offset(tmp_path):
         said = CliRunner().invoke(cli.app, [*words, *more, "--json", "--report", str(tmp_path / "r.html"), "--force"])
         assert said.exit_code == 0, said.output
         page = (tmp_path / "r.html").read_text()
-        told = json.loads(said.stdout)
-        assert ("offsets" in told) == ("offset: constant" in page) == bool(more)
+        output = json.loads(said.stdout)
+        assert ("offsets" in output) == ("offset: constant" in page) == bool(more)
         if more:
-            assert told["offsets"][0]["y"]["constant"] == pytest.approx(0.5, rel=0.05)
-            assert told["equations"]["y"].endswith(" + c")
+            assert output["offsets"][0]["y"]["constant"] == pytest.approx(0.5, rel=0.05)
+            assert output["equations"]["y"].endswith(" + c")
     wrong = CliRunner().invoke(cli.app, [*words, "--offset", "sometimes"])
     assert wrong.exit_code == 2
 
@@ -359,9 +359,9 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
     words = ["identify", str(tmp_path / "cell.csv"), "--structure", "D^alpha v = -a v + b i", "--offset", "auto"]
     said = CliRunner().invoke(cli.app, [*words, "--json", "--report", str(tmp_path / "r.html")])
     assert said.exit_code == 0, said.output
-    told = json.loads(said.stdout)
-    assert told["settings"]["offset"] == "constant"
-    assert told["settings"]["offset_test"].startswith("constant")
+    output = json.loads(said.stdout)
+    assert output["settings"]["offset"] == "constant"
+    assert output["settings"]["offset_test"].startswith("constant")
     assert "because the test is significant" in (tmp_path / "r.html").read_text()
 
 

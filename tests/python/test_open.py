@@ -149,12 +149,12 @@ def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):
     assert "-u NAME=COLUMN and -y NAME=COLUMN" in shown.stdout
     assert "no numbers (line 2: 'a' is not a number)" in shown.stdout
     answered = command("open", path, "-u", "CH1", "-y", "y=CH2", "--units", "y=mm", "--window", "0.02:", "--json")
-    told = json.loads(answered.stdout)
-    assert (told["step"], told["problem"]) == (0.01, "")
-    words = shlex.split(told["commands"][1])
+    output = json.loads(answered.stdout)
+    assert (output["step"], output["problem"]) == (0.01, "")
+    words = shlex.split(output["commands"][1])
     assert words[:3] == ["ftlm", "identify", str(path)]
     assert words[3:-2] == ["--time", "Time", "--window", "0.02:", "-u", "CH1", "-y", "y=CH2", "--units", "y=mm"]
-    assert json.loads(command(*shlex.split(told["commands"][0])[1:], "--json").stdout)[0]["rows"] == 10
+    assert json.loads(command(*shlex.split(output["commands"][0])[1:], "--json").stdout)[0]["rows"] == 10
 
 
 @pytest.mark.parametrize("names", ["Frequency (Hz),Z' (Ohm),-Z'' (Ohm)", "f,Magnitude [dB],Phase [deg]"])
@@ -230,8 +230,8 @@ def test_typos_are_refused_in_words(tmp_path, monkeypatch, case):
 def test_a_file_whose_name_looks_like_an_option_is_named_so_that_it_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path, "t,u,y\n" + rows(), "-u.csv")
-    told = shlex.split(ftlm.open_file("-u.csv").command("inspect"))
-    assert command(*told[1:]).exit_code == 0
+    arguments = shlex.split(ftlm.open_file("-u.csv").command("inspect"))
+    assert command(*arguments[1:]).exit_code == 0
 
 
 def test_what_is_opened_is_a_record(tmp_path):

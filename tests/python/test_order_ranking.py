@@ -92,8 +92,8 @@ def test_the_command_prints_verdict_and_next_step(tmp_path, capsys):
     assert "rank 1: " in text
     assert "next: " in text
     run_command(*words, "--json")
-    told = json.loads(capsys.readouterr().out)["y"]
-    assert told["verdict"]["level"] in ("do not use", "with care", "trust")
+    output = json.loads(capsys.readouterr().out)["y"]
+    assert output["verdict"]["level"] in ("do not use", "with care", "trust")
     # A store keeps no runs, so a resumed search says how its rank 1 is judged.
     run_command("resume", store)
     text = capsys.readouterr().out

@@ -340,9 +340,9 @@ def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
     assert "99.8 % pruned" in text
     assert "/s" in text
     # Somebody else's function is told two numbers, as ever.
-    told = []
-    search(run, progress=lambda done, total: told.append((done, total)))
-    assert told[-1] == (36, 36)
+    reports = []
+    search(run, progress=lambda done, total: reports.append((done, total)))
+    assert reports[-1] == (36, 36)
 
 
 def test_one_equation_under_a_law_is_searched_too(run):
@@ -553,10 +553,10 @@ def test_the_table_prints_and_is_json(run):
 
 
 def test_progress_is_told_to_the_end(run):
-    told = []
-    found = search(run, progress=lambda done, total: told.append((done, total)))
-    assert told[-1] == (found.candidates, found.candidates)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    reports = []
+    found = search(run, progress=lambda done, total: reports.append((done, total)))
+    assert reports[-1] == (found.candidates, found.candidates)
+    assert [done for done, _ in reports] == sorted(done for done, _ in reports)
 
 
 def test_an_error_in_progress_is_the_callers(run):
@@ -569,16 +569,16 @@ def test_an_error_in_progress_is_the_callers(run):
 
 
 def test_an_error_in_progress_ends_a_long_search(clean_a):
-    told = []
+    reports = []
 
     def fail(done, total):
-        told.append((done, total))
+        reports.append((done, total))
         if total:
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         long_search(clean_a, progress=fail)
-    done, total = told[-1]
+    done, total = reports[-1]
     assert total == 313_845
     assert done < total
 

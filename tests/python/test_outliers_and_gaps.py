@@ -47,8 +47,8 @@ def record(seed: int, jitter: float = 0.0, rows: int = ROWS) -> tuple[np.ndarray
     ticks = np.arange(rows) * FINE + np.round(rng.uniform(-jitter, jitter, rows) * FINE).astype(int)
     ticks[0] = 0
     command = np.where(np.cumsum(rng.random(rows) < 0.08) % 2, -1.0, 1.0)
-    held = command[np.searchsorted(ticks, np.arange(ticks[-1] + 1), side="right") - 1]
-    return ticks * STEP / FINE, command, answer(held, STEP / FINE)[ticks]
+    samples = command[np.searchsorted(ticks, np.arange(ticks[-1] + 1), side="right") - 1]
+    return ticks * STEP / FINE, command, answer(samples, STEP / FINE)[ticks]
 
 
 def run_of(u: np.ndarray, y: np.ndarray, **options: object) -> ftlm.Run:
@@ -323,8 +323,8 @@ def test_corners_are_those_of_the_definition() -> None:
     sizes = np.array([1.0, -2.0, 0.5])
     places = np.linspace(0.0, 12.0, 97)
     edges = np.arange(m + 1)
-    held = np.array([np.sum(sizes * np.clip(e - jumps, 0, None)) for e in edges])
-    means = np.diff(held)
+    integrals = np.array([np.sum(sizes * np.clip(e - jumps, 0, None)) for e in edges])
+    means = np.diff(integrals)
     response = (
         h**eta
         * np.array(
@@ -426,7 +426,7 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     plain = ftlm.identify(run, ftlm.equation(FREE))
     (said,) = [w for w in plain.warnings if "huber" in w]
     assert said.startswith(
-        "4 of 398 residuals of y lie beyond 5 times the usual deviation and hold 99 % of the sum of squares, "
+        "4 of 398 residuals of y lie beyond 5 times the usual deviation and contribute 99 % of the sum of squares, "
     )
     assert "first at row " in said
     robust = ftlm.identify(run, ftlm.equation(FREE), method=ftlm.OutputError(loss="huber"))
@@ -451,7 +451,7 @@ def test_one_outlier_that_holds_most_of_the_squares_is_named() -> None:
     y[150] += 30 * np.std(y)
     (said,) = [w for w in ftlm.identify(run_of(u, y), ftlm.equation(FREE)).warnings if "huber" in w]
     assert said.startswith(
-        "1 of 398 residuals of y lies beyond 5 times the usual deviation and holds 100 % of the sum of squares"
+        "1 of 398 residuals of y lies beyond 5 times the usual deviation and contributes 100 % of the sum of squares"
     )
     # One of four deviations more is not worth a word.
     u, y = noisy(3)

@@ -95,12 +95,12 @@ def test_the_optimum_is_scipys() -> None:
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.asarray(residuals_at(problem, prepared, x)["residuals"])
 
-    theirs = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    ours = problem.core.minimize(prepared, (start.tolist(), []), False, [], 100, 1e-12, False)
-    assert ours["status"] == "converged"
-    assert ours["cost"] == pytest.approx(theirs.cost, rel=1e-8)
-    assert np.array(ours["values"]) == pytest.approx(theirs.x, rel=1e-4)
-    assert ours["evaluations"] < theirs.nfev * 3
+    reference = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    core_fit = problem.core.minimize(prepared, (start.tolist(), []), False, [], 100, 1e-12, False)
+    assert core_fit["status"] == "converged"
+    assert core_fit["cost"] == pytest.approx(reference.cost, rel=1e-8)
+    assert np.array(core_fit["values"]) == pytest.approx(reference.x, rel=1e-4)
+    assert core_fit["evaluations"] < reference.nfev * 3
 
 
 @pytest.mark.slow

@@ -71,9 +71,11 @@ def check(model: ftlm.Model, run: ftlm.Run) -> None:
     fitted = _fit_past_inputs(core, model, terms, 1 << 17)
     assert fitted is not None
     assert [[e for e, _ in own] for own in fitted[1]] == [[e for e, _ in own] for own in expected]
-    ours, theirs, rest = (simulated(core, each) for each in (fitted[1], expected, [[] for _ in expected]))
-    np.testing.assert_allclose(ours, theirs, atol=2e-4 * np.abs(theirs).max())
-    assert np.max(np.abs(theirs - rest)) > 0.1 * np.std(theirs)
+    fitted_response, expected_response, rest = (
+        simulated(core, each) for each in (fitted[1], expected, [[] for _ in expected])
+    )
+    np.testing.assert_allclose(fitted_response, expected_response, atol=2e-4 * np.abs(expected_response).max())
+    assert np.max(np.abs(expected_response - rest)) > 0.1 * np.std(expected_response)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -158,9 +158,9 @@ def test_a_fit_has_its_inputs_where_they_are_asked_for(joint, small_run):
 def test_poles_are_those_of_the_model(joint):
     axis = saved(ftlm.plot.poles(joint)).axes[0]
     crosses = next(line for line in axis.lines if line.get_marker() == "x")
-    ours = [m.pole**0.8 for m in joint.model.modes() if m.oscillatory]
-    theirs = crosses.get_xdata() + 1j * crosses.get_ydata()
-    assert theirs[np.argmax(theirs.imag)] == pytest.approx(ours[0])
+    poles = [m.pole**0.8 for m in joint.model.modes() if m.oscillatory]
+    plotted = crosses.get_xdata() + 1j * crosses.get_ydata()
+    assert plotted[np.argmax(plotted.imag)] == pytest.approx(poles[0])
     assert "s^{0.8}" in axis.get_xlabel()
     with pytest.raises(ftlm.errors.ModelError, match="no poles to draw"):
         ftlm.plot.poles(ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)")))

@@ -206,9 +206,9 @@ def test_a_real_arm_with_feed_through_prints_what_it_simulates():
     result = ftlm.identify(run, structure)
     own = nrmse_fit(acceleration, result.model.simulate(run)["y"])
     c = result.coefficients
-    theirs = exact([c["b2"], c["b1"], c["b0"]], [1, -c["a1"], -c["a0"]], torque, 0.01, "zoh")
+    simulated = exact([c["b2"], c["b1"], c["b0"]], [1, -c["a1"], -c["a0"]], torque, 0.01, "zoh")
     assert result.fit["y"] == pytest.approx(own, abs=1e-3)
-    assert result.fit["y"] == pytest.approx(nrmse_fit(acceleration, theirs), abs=1e-3)
+    assert result.fit["y"] == pytest.approx(nrmse_fit(acceleration, simulated), abs=1e-3)
 
 
 @pytest.mark.parametrize(("seed", "rows"), [(0, 401), (1, 201), (3, 201)])

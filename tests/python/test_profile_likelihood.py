@@ -92,10 +92,10 @@ def test_the_core_finds_what_the_program_in_numpy_finds(
     method = ftlm.OutputError(intervals="quadratic", loss=options.get("loss", "squares"))
     found = ftlm.identify(run, structure, method=method, threads=1)
     valley = likelihood_of(found)
-    ours, theirs = intervals_of(found), intervals_in_python(valley, valley.names, 0.95)
-    assert list(ours.intervals) == list(theirs.intervals)
-    for name, own in ours.intervals.items():
-        other = theirs.intervals[name]
+    found_intervals, expected_intervals = intervals_of(found), intervals_in_python(valley, valley.names, 0.95)
+    assert list(found_intervals.intervals) == list(expected_intervals.intervals)
+    for name, own in found_intervals.intervals.items():
+        other = expected_intervals.intervals[name]
         # Refits end at their tolerance, where rounding decides on a last step.
         width = other.high - other.low if math.isfinite(other.high - other.low) else valley.errors.max()
         np.testing.assert_allclose((own.low, own.high), (other.low, other.high), rtol=1e-7, atol=1e-7 * width)

@@ -80,30 +80,30 @@ def test_quiet_says_nothing(monkeypatch):
 
 def test_stopping_ends_what_another_thread_reports():
     stop, seen = threading.Event(), []
-    told = Stoppable(lambda done, total: seen.append((done, total)), stop)
-    told(1, 2, 0)
+    callback = Stoppable(lambda done, total: seen.append((done, total)), stop)
+    callback(1, 2, 0)
     stop.set()
     with pytest.raises(KeyboardInterrupt):
-        told(2, 2, 0)
+        callback(2, 2, 0)
     assert seen == [(1, 2)]
 
 
 def test_a_course_never_goes_back_whatever_its_parts_count():
-    told = []
-    course = ShareTracker(lambda done, total: told.append((done, total)))
-    part = course.subtask(0.5, 0.5)
+    reports = []
+    tracker = ShareTracker(lambda done, total: reports.append((done, total)))
+    part = tracker.subtask(0.5, 0.5)
     for total in (4, 9, 2):
         for done in range(total + 1):
             part(done, total)
-    assert course.reached < 0.5
-    course.advance_to(0.5)
-    course.advance_to(0.2)
-    last = course.subtask(1.0)
+    assert tracker.reached < 0.5
+    tracker.advance_to(0.5)
+    tracker.advance_to(0.2)
+    last = tracker.subtask(1.0)
     last(1, 1)
-    course.advance_to(1.0)
-    shares = [done for done, _ in told]
+    tracker.advance_to(1.0)
+    shares = [done for done, _ in reports]
     assert shares == sorted(set(shares))
-    assert told[-1] == (TOTAL_PARTS, TOTAL_PARTS)
+    assert reports[-1] == (TOTAL_PARTS, TOTAL_PARTS)
     # A sweep takes its share of what is left, and the next one of the rest.
     assert 250 in shares
     assert 375 in shares
@@ -116,9 +116,9 @@ def test_a_fit_tells_how_far_it_is_to_its_end():
     run = ftlm.Run.from_arrays(
         step=0.05, inputs={"u": u}, outputs={"y": np.cumsum(u) * 0.05 + 0.1 * np.random.default_rng(1).random(400)}
     )
-    told = []
-    ftlm.identify(run, ftlm.equation("D y = a y + b u"), progress=lambda *done: told.append(done))
-    shares = [done / total for done, total in told]
+    reports = []
+    ftlm.identify(run, ftlm.equation("D y = a y + b u"), progress=lambda *done: reports.append(done))
+    shares = [done / total for done, total in reports]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     # It is told of beyond the starts, too: there the bar used to stand still.
@@ -163,7 +163,7 @@ def test_time_left_follows_what_is_behind(monkeypatch):
 
 
 @pytest.fixture
-def told(monkeypatch):
+def estimates(monkeypatch):
     """What commands say beforehand, as if somebody sat before them: what takes how long at least and at most."""
     said = []
 
@@ -213,21 +213,21 @@ ASKED = {
 
 
 @pytest.mark.parametrize("command", ASKED)
-def test_commands_that_take_long_say_so_beforehand(folder, monkeypatch, told, command):
+def test_commands_that_take_long_say_so_beforehand(folder, monkeypatch, estimates, command):
     monkeypatch.chdir(folder)
     what, asked, last = ASKED[command]
     done = CliRunner().invoke(app, [*command.split(), *asked.split(), last])
     assert done.exit_code == 0, done.stderr
-    ((words, least, most),) = told
+    ((words, least, most),) = estimates
     assert words == what
     assert 0 < least < most < math.inf
 
 
-def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folder, monkeypatch, told):
+def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folder, monkeypatch, estimates):
     monkeypatch.chdir(folder)
     asked = ["compare", "model.json", "run.csv", "-u", "u", "-y", "y"]
     assert CliRunner().invoke(app, asked).exit_code == 0
-    assert told == []
+    assert estimates == []
     size = (folder / "run.csv").stat().st_size
     monkeypatch.setattr(wait, "READ_TIME_PER_BYTE_S", 1.0 / size)
     monkeypatch.setattr(wait, "SIMULATION_TIME_PER_SAMPLE_S", 1.0 / 320)
@@ -237,33 +237,33 @@ def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folde
         ["simulate", *asked[1:], "-o", "out.csv"],
         ["report", "model.json", "--validation", *asked[2:], "-o", "out.html"],
     ):
-        told.clear()
+        estimates.clear()
         assert CliRunner().invoke(app, command).exit_code in (0, 4)
-        assert [words for words, *_ in told] == ["reading", "running the model"], command
-        assert all(0 < least < most for _, least, most in told)
-    told.clear()
+        assert [words for words, *_ in estimates] == ["reading", "running the model"], command
+        assert all(0 < least < most for _, least, most in estimates)
+    estimates.clear()
     assert CliRunner().invoke(app, ["open", "run.csv"]).exit_code == 0
-    assert [words for words, *_ in told] == ["reading"]
+    assert [words for words, *_ in estimates] == ["reading"]
 
 
-def test_designs_are_announced_by_the_samples_that_their_loops_are_judged_on(monkeypatch, told):
+def test_designs_are_announced_by_the_samples_that_their_loops_are_judged_on(monkeypatch, estimates):
     monkeypatch.setattr(wait, "estimate_duration", lambda seconds, threads: seconds)
     for design, samples in (("pid", 100), ("lqg", 100), ("lqg", 1000)):
         wait.announce_design(design, samples)
-    assert [words for words, *_ in told] == ["designing"] * 3
-    times = [(least, most) for _, least, most in told]
+    assert [words for words, *_ in estimates] == ["designing"] * 3
+    times = [(least, most) for _, least, most in estimates]
     assert times == sorted(times)
     # On the known machine they took 0.6, 1.4 and some 10 s.
     assert all(least < took < most for (least, most), took in zip(times, (0.6, 1.4, 10.0), strict=True))
 
 
-def test_cross_validate_orders_says_how_long_all_of_their_fits_take(monkeypatch, told):
+def test_cross_validate_orders_says_how_long_all_of_their_fits_take(monkeypatch, estimates):
     signals = {f"theta{n}{k}": np.zeros(300) for n in (1, 2) for k in (1, 2)}
     runs = [ftlm.Run.from_arrays(step=0.01, inputs={"I1": np.ones(300)}, outputs=signals, name=n) for n in "ab"]
     monkeypatch.setattr(unseen, "identify", lambda *_, **__: sys.exit("begun"))
     with pytest.raises(SystemExit, match="begun"):
         unseen.cross_validate_orders(runs, threads=1, progress=Progress(""))
-    ((words, least, most),) = told
+    ((words, least, most),) = estimates
     assert words == "all of it"
     # Thirty-two fits of some ten numbers.
     assert 0.4 < least < most < math.inf
@@ -297,14 +297,14 @@ def test_a_search_is_announced_by_what_coarse_lattices_of_it_take(monkeypatch):
     assert expected_seconds(asked, clock=lambda: now[0])[0] == pytest.approx(2 * least, rel=0.5)
 
 
-def test_of_a_store_only_what_is_left_is_announced(tmp_path, told):
+def test_of_a_store_only_what_is_left_is_announced(tmp_path, estimates):
     asked = job(0.2)
     path = tmp_path / "search.ftlm"
     with Store(path, [asked.request("y")]) as kept:
         announce_time(Progress(""), [asked], kept)
         run_job(asked, store=kept)
         announce_time(Progress(""), [asked], kept)
-    (_, least, most), (_, *nothing) = told
+    (_, least, most), (_, *nothing) = estimates
     assert 0 < least < most
     assert nothing == [0.0, 0.0]
 

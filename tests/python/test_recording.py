@@ -168,13 +168,13 @@ def test_values_and_jumps_are_those_of_the_definition(kind):
         line = oracle.Line.of(run, structure, name, float(run.sample_times.data[name][0]))
         np.testing.assert_array_equal(found.values_at(k, times), line.at(times))
         jumps = found.jumps(k)
-        if line.held:
+        if line.is_zero_order_hold:
             np.testing.assert_array_equal(jumps, line.jumps())
         else:
             assert jumps is None
 
 
-def told():
+def recording_arguments():
     """What a recording is made of."""
     channel = {"samples": np.arange(5.0), "nonuniform": None, "delay": None, "limits": [], "filtered": False}
     return {
@@ -196,17 +196,17 @@ def told():
 
 
 def test_the_core_refuses_runs_that_are_none():
-    assert _core.Recording(told()).pulses(4, False)[1].shape == (2, 4)
-    shorter, unknown, late, holes = (told() for _ in range(4))
+    assert _core.Recording(recording_arguments()).pulses(4, False)[1].shape == (2, 4)
+    shorter, unknown, late, holes = (recording_arguments() for _ in range(4))
     shorter["signals"][1]["samples"] = np.arange(4.0)
     unknown["signals"][1]["role"] = "spline"
     late["signals"][1]["delay"] = np.inf
     holes["signals"][1]["samples"] = np.array([0.0, np.nan, 1.0, 2.0, 3.0])
     refused = [
-        ({**told(), "step": 0.0}, ftlm.ModelError, "step = 0"),
-        ({**told(), "outputs": [2]}, ftlm.ModelError, "output 2 of 2 signals"),
-        ({**told(), "times": np.arange(5.0)}, ftlm.DataError, "samples at their own times"),
-        ({**told(), "signals": []}, ftlm.DataError, "length 0"),
+        ({**recording_arguments(), "step": 0.0}, ftlm.ModelError, "step = 0"),
+        ({**recording_arguments(), "outputs": [2]}, ftlm.ModelError, "output 2 of 2 signals"),
+        ({**recording_arguments(), "times": np.arange(5.0)}, ftlm.DataError, "samples at their own times"),
+        ({**recording_arguments(), "signals": []}, ftlm.DataError, "length 0"),
         (shorter, ftlm.DataError, "signal u has length 4"),
         (unknown, ftlm.ModelError, "role 'spline'"),
         (late, ftlm.DataError, "delay of u is not finite"),
@@ -215,7 +215,7 @@ def test_the_core_refuses_runs_that_are_none():
     for given, kind, words in refused:
         with pytest.raises(kind, match=words):
             _core.Recording(given)
-    run = _core.Recording(told())
+    run = _core.Recording(recording_arguments())
     for m in (0, 1 << 40):
         with pytest.raises(ftlm.ModelError, match="m = "):
             run.pulses(m, False)
@@ -233,4 +233,4 @@ def test_the_core_refuses_runs_that_are_none():
 def test_a_fit_refuses_runs_of_another_structure():
     problem = FreeProblem.of(structure_of("one equation"))
     with pytest.raises(ftlm.DataError, match="signals of a run has length 2, but 3"):
-        _core.joint_multistart(problem.core, [_core.Recording(told())], (1, 1 << 30))
+        _core.joint_multistart(problem.core, [_core.Recording(recording_arguments())], (1, 1 << 30))

@@ -624,13 +624,17 @@ def test_a_lone_point_is_a_dot():
 
 def read_out(chart):
     """What a slider reads out of a chart: instants, values by line, and where it begins."""
-    (told,) = re.findall(r' data-readings="([^"]*)"', chart.svg)
-    told = json.loads(html.unescape(told))
+    (chart_values,) = re.findall(r' data-readings="([^"]*)"', chart.svg)
+    chart_values = json.loads(html.unescape(chart_values))
 
     def values(said):
         return np.array([np.nan if k is None else float(f"{k}e{said[0]}") for k in said[1]])
 
-    return values(told["at"]), {line["name"]: values(line["at"]) for line in told["lines"]}, told
+    return (
+        values(chart_values["at"]),
+        {line["name"]: values(line["at"]) for line in chart_values["lines"]},
+        chart_values,
+    )
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 600, 749, 750, 751, 40_000])
@@ -642,27 +646,27 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
         x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]", slider=True
     )
     assert "data-readings" not in chart.narrow
-    at, lines, told = read_out(chart)
+    at, lines, chart_values = read_out(chart)
     assert 1 <= at.size <= 753
     assert n > 750 or at.size == n
     places = [int(np.argmin(np.abs(x - v))) for v in at]
     assert at == pytest.approx(x[places], abs=1e-4 * 0.0017 * n + 1e-9)
     for name, values in (("measured", y), ("simulated", z)):
         assert lines[name] == pytest.approx(values[places], abs=1e-5 * (np.ptp(values) + 1e-12))
-    assert places[told["begin"]] == np.argmax(np.abs(y - z))
+    assert places[chart_values["begin"]] == np.argmax(np.abs(y - z))
     assert {0, n - 1} <= set(places)
-    assert (told["name"], told["unit"], told["y"]) == ("time", "s", "m")
+    assert (chart_values["name"], chart_values["unit"], chart_values["y"]) == ("time", "s", "m")
 
 
 def test_a_slider_has_nothing_where_there_is_nothing():
     t, gaps = np.arange(5.0), np.array([1.0, np.nan, np.inf, -1e300, 2e5])
     drawn = {"x_label": "time [s]", "y_label": "y", "title": "t", "slider": True}
-    at, lines, told = read_out(LineChart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
+    at, lines, chart_values = read_out(LineChart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
     assert at.tolist() == t.tolist()
     assert np.isnan(lines["simulated"]).all()
     assert np.isnan(lines["measured"]).tolist() == [False, True, True, False, False]
     assert lines["measured"][3] == -1e300
-    assert (told["apart"], told["y"]) == (False, "")
+    assert (chart_values["apart"], chart_values["y"]) == (False, "")
     for other in ({"log_x": True}, {"log_y": True}, {"slider": False}):
         assert "data-readings" not in LineChart(t + 1, [("", t + 1)], **{**drawn, **other}).svg
 

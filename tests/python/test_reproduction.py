@@ -485,11 +485,11 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     other = reproduction.sine.select(own).window(0.7, 3.7)
     monkeypatch.setattr("ftlm.reproduction.stage.MAX_FULL_SAMPLES", 1000)
     monkeypatch.setattr("ftlm.reproduction.stage.DECIMATED_SAMPLES", 500)
-    told = []
-    found = ftlm.reproduce(moving, other, increment=0.5, progress=lambda *share: told.append(share))
+    reports = []
+    found = ftlm.reproduce(moving, other, increment=0.5, progress=lambda *share: reports.append(share))
     # One share of the whole, which never falls.
-    assert told == sorted(told)
-    assert told[-1] == (1000, 1000)
+    assert reports == sorted(reports)
+    assert reports[-1] == (1000, 1000)
     words = " ".join(found.notes)
     assert "does not start at rest: every model is fitted and compared with initial terms" in words
     assert "Tables 6 and 7 and Figure 11 are left out" in words

@@ -13,7 +13,7 @@ from ftlm.estimation.genetic import differential_evolution_search
 from ftlm.fractional_calculus import block_pulse_matrix
 from ftlm.order_search.search import rank_orders
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.checks import beats, case, combine_cases, converges_faster, deviation_text
+from ftlm.reproduction.checks import case, combine_cases, converges_faster, deviation_text, has_smaller_error
 from ftlm.reproduction.published_values import (
     PRIOR_GRID,
     as_printed,
@@ -155,9 +155,9 @@ def test_printed_models_move_5_to_316_times_less_than_the_paper_s_arm(first_stag
 
 def test_words_on_printed_models_follow_their_numbers(first_stage):
     rows = tuple(first_stage.values())
-    told = deviation_text(SimpleNamespace(ran=rows))
-    assert "from 5.78 to 316, median 18.9" in told
-    assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in told
+    text = deviation_text(SimpleNamespace(ran=rows))
+    assert "from 5.78 to 316, median 18.9" in text
+    assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in text
     # Had they moved as far, nothing would follow.
     moving = tuple(replace(r, angle_deviation=0.9 * r.implied_deviation) for r in rows)
     assert deviation_text(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
@@ -273,13 +273,13 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     bounds = {"a1": (-10, 0), "a0": (-20, 0), "b0": (0, 10)}
     settings = ftlm.GeneticAlgorithm(order_grid=lattice, seeds=(3,), evaluations=6000, bounds=bounds)
     records = prepare([run], single, None, power_of_two=True)
-    told = []
+    reports = []
     found = differential_evolution_search(
-        records, single, settings, threads=1, progress=lambda done, of: told.append((done, of))
+        records, single, settings, threads=1, progress=lambda done, of: reports.append((done, of))
     )
     assert found.orders["alpha"] == pytest.approx(1.6, abs=0.05)
     assert found.coefficients["b0"] == pytest.approx(5, rel=0.1)
-    assert told[-1][0] == told[-1][1] == found.evaluations[3]
+    assert reports[-1][0] == reports[-1][1] == found.evaluations[3]
     assert differential_evolution_search(records, single, settings, threads=2) == found
     moving = prepare([run.window(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
     with pytest.raises(ftlm.ModelError, match="cut the runs so that they start at rest"):
@@ -288,11 +288,11 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
 
 def test_multi_innovation_is_held_against_the_median_seed():
     seeds = (1.0, 4.0, 9.0)
-    assert beats(3.0, seeds)
-    assert not beats(5.0, seeds)
-    assert not beats(np.inf, (np.inf,))
+    assert has_smaller_error(3.0, seeds)
+    assert not has_smaller_error(5.0, seeds)
+    assert not has_smaller_error(np.inf, (np.inf,))
     # The best of ten seeds is better than the best of three, the median is not.
-    assert beats(3.0, seeds * 4) == beats(3.0, seeds)
+    assert has_smaller_error(3.0, seeds * 4) == has_smaller_error(3.0, seeds)
 
 
 @pytest.mark.parametrize("step", [0.05, 0.25])
@@ -368,23 +368,23 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
 
 def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end():
-    told, stop = [], threading.Event()
-    whole = TotalProgress(10.0, lambda done, of: told.append(done / of))
+    reports, stop = [], threading.Event()
+    whole = TotalProgress(10.0, lambda done, of: reports.append(done / of))
     one, two = WorkerProgress(whole, stop), WorkerProgress(whole, stop)
     one.begin(4.0)
     two.begin(6.0)
     one(1, 2)
-    assert told[-1] == pytest.approx(0.2)
+    assert reports[-1] == pytest.approx(0.2)
     two(100, 100)
-    assert told[-1] == pytest.approx(0.8)
+    assert reports[-1] == pytest.approx(0.8)
     # A second search of the same step counts anew.
     one(0, 5)
     one(5, 5)
-    assert told[-1] <= 1.0
+    assert reports[-1] <= 1.0
     one.begin(0.0)
     two.begin(0.0)
-    assert told[-1] == 1.0
-    assert told == sorted(told)
+    assert reports[-1] == 1.0
+    assert reports == sorted(reports)
     short = []
     left_out = TotalProgress(10.0, lambda done, of: short.append((done, of)))
     WorkerProgress(left_out, stop).begin(1.0)

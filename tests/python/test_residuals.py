@@ -374,7 +374,7 @@ def test_the_caption_of_a_chart_says_what_its_bars_do(long_run, small_model):
             assert ("is not" in chart.caption) is not test.passed
 
 
-def held(numerator, denominator, u, step):
+def hold_response(numerator, denominator, u, step):
     """Response of a transfer function to an input that is constant between samples, by SciPy."""
     b, a, _ = scipy.signal.cont2discrete((numerator, denominator), step)
     return scipy.signal.lfilter(np.ravel(b), a, u)
@@ -395,7 +395,7 @@ def test_a_missing_lag_is_found_under_slow_inputs(kind):
     t = step * np.arange(900)
     u = SLOW_INPUTS[kind](t)
     for seed in range(3):
-        y = held([1.0], np.polymul([tau, 1.0], [0.2 * tau, 1.0]), u, step)
+        y = hold_response([1.0], np.polymul([tau, 1.0], [0.2 * tau, 1.0]), u, step)
         y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
         run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y})
         lacking = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
@@ -458,7 +458,7 @@ def test_a_wrong_behavior_between_samples_is_found(true):
     u = SLOW_INPUTS["two sines"](t)
     other = {"foh": "zoh", "zoh": "foh"}[true]
     for seed in range(3):
-        y = scipy.signal.lsim(([b], [1.0, -a]), u, t)[1] if true == "foh" else held([b], [1.0, -a], u, step)
+        y = scipy.signal.lsim(([b], [1.0, -a]), u, t)[1] if true == "foh" else hold_response([b], [1.0, -a], u, step)
         y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
         run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y}, intersample={"u": true})
         structure = ftlm.equation("D y = a y + b u")
@@ -477,7 +477,7 @@ def test_an_input_of_noise_and_a_missing_lag_keep_their_behavior_between_samples
     t = 0.05 * np.arange(900)
     for u, denominator in ((rng.normal(size=t.size), [1.0, 1.2]), (SLOW_INPUTS["two sines"](t), [0.2, 1.2, 1.2])):
         noise = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=t.size))
-        y = held([2.0], denominator, u, 0.05)
+        y = hold_response([2.0], denominator, u, 0.05)
         run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y + 0.05 * np.std(y) * noise})
         found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
         assert "other_intersample_fits" not in {f.code for f in found.findings}

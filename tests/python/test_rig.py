@@ -446,9 +446,9 @@ def test_live_estimates_are_shown(tmp_path, capsys):
         == 0
     )
     shown = capsys.readouterr()
-    told = json.loads(shown.out)
-    assert told["rows"] == 1001
-    assert f"a3 = {told['about']['live']['coefficients']['a3']:.6g}" in shown.err
+    printed = json.loads(shown.out)
+    assert printed["rows"] == 1001
+    assert f"a3 = {printed['about']['live']['coefficients']['a3']:.6g}" in shown.err
     assert "1.00 s: a3 = " in shown.err
 
 

@@ -661,11 +661,11 @@ def test_csv_holds_what_the_first_line_says(tmp_path):
     make(units={"y": "deg"}, name="n").resample(0.02).to_csv(tmp_path / "a.csv")
     lines = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()
     assert lines[0].startswith("# ftlm-run 1 {")
-    told = json.loads(lines[0].removeprefix("# ftlm-run 1 "))
-    assert told["inputs"] == ["u"]
-    assert told["units"] == {"u": "", "y": "rad"}
-    assert told["step"] == 0.02
-    assert len(told["warnings"]) == 1
+    header = json.loads(lines[0].removeprefix("# ftlm-run 1 "))
+    assert header["inputs"] == ["u"]
+    assert header["units"] == {"u": "", "y": "rad"}
+    assert header["step"] == 0.02
+    assert len(header["warnings"]) == 1
     assert lines[1] == "t_s,u,y"
     assert [line.split(",")[0] for line in lines[2:6]] == ["0.0", "0.02", "0.04", "0.06"]
 

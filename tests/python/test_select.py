@@ -242,10 +242,10 @@ def test_what_was_chosen_from_rest_is_judged_on_a_run_in_motion(runs):
     whole = motor(3, rows=800)
     found = ftlm.select(whole.window(0, 8.0), [ftlm.equation("D^2 y = d D y + a y + b u")], threads=1)
     late = whole.window(8.0, 16.0)
-    ours = found.best.validate(late).fit["y"]
-    theirs = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit["y"]
-    assert ours > 95.0
-    assert abs(ours - theirs) < 0.1
+    selected_fit = found.best.validate(late).fit["y"]
+    single_fit = ftlm.identify(whole.window(0, 8.0), found.winner.structure).validate(late).fit["y"]
+    assert selected_fit > 95.0
+    assert abs(selected_fit - single_fit) < 0.1
 
 
 def relaxing(alpha, noise, seed, rows=400):

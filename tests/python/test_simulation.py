@@ -11,7 +11,7 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.simulation.discretization import record
-from ftlm.simulation.simulate import comparison_records, respond
+from ftlm.simulation.simulate import comparison_records, simulate_record
 
 
 def zeros_run(n=301, step=0.02, inputs=None, outputs=("y",), **options):
@@ -49,7 +49,7 @@ def test_coupled_equations_are_the_dense_solve(m):
     run = zeros_run(n=201, outputs=("y", "z"))
     coupled = model(TWO, "simulated")
     (rec,) = comparison_records([run], coupled, m)
-    responses, _ = respond(coupled, rec)
+    responses, _ = simulate_record(coupled, rec)
     u = oracles.pulse_means(run["u"], m, "zoh")
     described = [
         {

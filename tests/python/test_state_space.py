@@ -178,14 +178,14 @@ def test_delays_of_a_held_input_follow_the_matrix_exponential(delay):
     whole = np.zeros((3, 3))
     whole[:2, :2], whole[1, 2] = a, 9.0
 
-    def held(share: float, value: float, state: np.ndarray) -> np.ndarray:
+    def propagate(share: float, value: float, state: np.ndarray) -> np.ndarray:
         return (expm(share * STEP * whole) @ [*state, value])[:2]
 
     state, truth = np.zeros(2), []
     for k in range(300):
         truth.append(state[0])
         earlier, later = (run["u"][j] if j >= 0 else 0.0 for j in (k - late - 1, k - late))
-        state = held(rest, later, held(1.0 - rest, earlier, state))
+        state = propagate(rest, later, propagate(1.0 - rest, earlier, state))
     assert np.max(np.abs(y - truth)) < 1e-11
 
 

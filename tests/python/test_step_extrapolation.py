@@ -23,7 +23,7 @@ def grids(powers: tuple[float, ...], count: int) -> list[np.ndarray]:
     return [TRUTH + sum(s * h**p for s, p in zip(SHAPES, powers, strict=False)) for h in steps]
 
 
-def told(samples: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def extrapolate(samples: list[np.ndarray]) -> tuple[np.ndarray, float]:
     found, change, _ = _core.richardson_limit([(each, []) for each in samples], [])
     return found, float(np.max(change))
 
@@ -42,14 +42,14 @@ def test_three_powers_of_the_step_are_taken_away():
 def test_the_change_bounds_the_error_whatever_its_powers(powers):
     # A kink leaves powers between those that are taken away.
     for count in range(3, 9):
-        found, change = told(grids(powers, count))
+        found, change = extrapolate(grids(powers, count))
         error = float(np.max(np.abs(found - TRUTH)) / np.max(np.abs(found)))
         assert error <= 2.5 * change + 1e-14
 
 
 def test_a_power_that_no_column_has_is_told_by_four_grids():
     # The factor by which its error shrinks is the last two moves'; a fourth grid says whether it is one.
-    found, change = told(grids((1.37,), 4))
+    found, change = extrapolate(grids((1.37,), 4))
     np.testing.assert_allclose(found, TRUTH, atol=1e-12)
     assert change < 1e-12
 
@@ -57,7 +57,7 @@ def test_a_power_that_no_column_has_is_told_by_four_grids():
 def test_a_logarithm_of_the_step_takes_fewer_grids():
     # Orders that meet leave h^2 ln h, which the next power of the triangle does not take away.
     samples = [TRUTH + SHAPES[0] * h**2 * (1.0 - np.log(h)) for h in 0.5 ** np.arange(2, 9)]
-    every = [told(samples[: count + 1]) for count in range(2, 7)]
+    every = [extrapolate(samples[: count + 1]) for count in range(2, 7)]
     for found, change in every:
         assert np.max(np.abs(found - TRUTH)) / np.max(np.abs(found)) <= 2.5 * change
     assert [change < 1e-6 for _, change in every].index(True) == 2
@@ -85,27 +85,27 @@ def test_one_sample_that_moves_tells_no_factor():
     for each, value in zip(wild, (1.0, 0.7, 0.55, 0.475), strict=True):
         each[0, 7] = value
         each[0, 8] = 1.0
-    assert told(wild)[1] > 0.02
+    assert extrapolate(wild)[1] > 0.02
 
 
 def test_two_grids_tell_no_change_and_three_do():
-    assert told(grids((2, 3), 1))[1] == told(grids((2, 3), 2))[1] == np.inf
-    assert told(grids((2, 3), 3))[1] < 1.0
+    assert extrapolate(grids((2, 3), 1))[1] == extrapolate(grids((2, 3), 2))[1] == np.inf
+    assert extrapolate(grids((2, 3), 3))[1] < 1.0
 
 
 def test_a_grid_without_numbers_tells_nothing():
     lost = np.full_like(TRUTH, np.nan)
-    found, change = told([lost, *grids((2, 3, 4), 5)])
-    after = told(grids((2, 3, 4), 5))
+    found, change = extrapolate([lost, *grids((2, 3, 4), 5)])
+    after = extrapolate(grids((2, 3, 4), 5))
     assert (change, found.tolist()) == (after[1], after[0].tolist())
-    assert np.isnan(told([*grids((2,), 3), lost])[0]).all()
+    assert np.isnan(extrapolate([*grids((2,), 3), lost])[0]).all()
     # In the middle it tells nothing of those after it either.
-    between = told([*grids((2, 3, 4), 3), lost, *grids((2, 3, 4), 2)])
-    assert (between[1], between[0].tolist()) == (np.inf, told(grids((2, 3, 4), 2))[0].tolist())
+    between = extrapolate([*grids((2, 3, 4), 3), lost, *grids((2, 3, 4), 2)])
+    assert (between[1], between[0].tolist()) == (np.inf, extrapolate(grids((2, 3, 4), 2))[0].tolist())
 
 
 def test_what_does_not_move_has_stood_still():
-    assert told([np.zeros((1, 3))] * 3)[1] == 0.0
+    assert extrapolate([np.zeros((1, 3))] * 3)[1] == 0.0
 
 
 #: The last row of each companion matrix, and what the input drives.

@@ -349,7 +349,7 @@ def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
     counts = (0, 0, 5, 0, 0, 0, 0)
     first = frames.PartialRounds(0, 0, 2, (1, 5, 256, 256, 1.0), (row,), counts, ((7, False),), 9, True)
     section.add_frame(first)
-    section.add_frame(msgspec.structs.replace(first, rows=((4, *row[1:]),), failures=None, anew=False))
+    section.add_frame(msgspec.structs.replace(first, rows=((4, *row[1:]),), failures=None, restarted=False))
     assert [r[0] for r in section.open[0].rows] == [3, 4]
     assert section.open[0].failures == ((7, False),)
     assert section.open[0].checkpoint[0] == (1, 5, 256, 256, 1.0, 9)
@@ -477,19 +477,19 @@ def stage_store(stage_run, small_pieces, tmp_path):
 )
 def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, small_pieces, tmp_path, options):
     path = tmp_path / "s.ftlm"
-    told = []
+    reports = []
     found = search_stage(stage_run, **options)
-    with_store = search_stage(stage_run, path, progress=lambda *done: told.append(done), **options)
+    with_store = search_stage(stage_run, path, progress=lambda *done: reports.append(done), **options)
     assert bytes_of(with_store) == bytes_of(found)
-    assert told[-1][0] == told[-1][1]
-    assert [d for d, _ in told] == sorted(d for d, _ in told)
+    assert reports[-1][0] == reports[-1][1]
+    assert [d for d, _ in reports] == sorted(d for d, _ in reports)
     size = path.stat().st_size
     assert bytes_of(search_stage(stage_run, path, **options)) == bytes_of(found)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == bytes_of(found)
     assert path.stat().st_size == size
     status = ftlm.search_status(path)["stage"]
     assert status.complete
-    assert status.candidates == told[-1][1]
+    assert status.candidates == reports[-1][1]
     assert status.best == found.score
 
 
@@ -540,42 +540,42 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
     monkeypatch.setattr("ftlm.order_search.batches.CoupledProblem.build_evaluator", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
-    held = msgspec.structs.asdict(read_store(path).sections[0].table)
+    stored = msgspec.structs.asdict(read_store(path).sections[0].table)
     whole = read_store(path)
     for number, change in enumerate(
         (
             {"rows": ()},
-            {"rows": ((*held["rows"][0][:2], (1.0,), held["rows"][0][3]), *held["rows"][1:])},
-            {"rows": ((*held["rows"][0][:3], held["rows"][0][3][:1]), *held["rows"][1:])},
-            {"counts": {**held["counts"], "beaten": 0}},
+            {"rows": ((*stored["rows"][0][:2], (1.0,), stored["rows"][0][3]), *stored["rows"][1:])},
+            {"rows": ((*stored["rows"][0][:3], stored["rows"][0][3][:1]), *stored["rows"][1:])},
+            {"counts": {**stored["counts"], "beaten": 0}},
             {"counts": {"candidates": 0}},
             {"failures": ((0, (1.0,), "singular"),)},
         )
     ):
         forged = tmp_path / f"{number}.ftlm"
         with Store(forged, whole.requests) as kept:
-            kept._append([CoupledTable(**{**held, **change})])
+            kept._append([CoupledTable(**{**stored, **change})])
         for call in (ftlm.resume_search, ftlm.search_status):
             with pytest.raises(ftlm.DataError, match="its table belongs to another search"):
                 call(forged)
     with Store(path) as kept, pytest.raises(ModelError, match="it has an unexpected final table"):
-        kept.contents.sections[0].add_frame(CoupledTable(**held))
+        kept.contents.sections[0].add_frame(CoupledTable(**stored))
 
 
 def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pieces, tmp_path):
     path = tmp_path / "s.ftlm"
     for after in (1, 3, 2):
-        told = []
+        reports = []
 
-        def stop(done, total, told=told, after=after):
-            told.append(done)
-            if len(told) == after:
+        def stop(done, total, reports=reports, after=after):
+            reports.append(done)
+            if len(reports) == after:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
             search_stage(stage_run, path, progress=stop)
         # What was told is in the store.
-        assert ftlm.search_status(path)["stage"].done_count == told[-1]
+        assert ftlm.search_status(path)["stage"].done_count == reports[-1]
     assert bytes_of(search_stage(stage_run, path)) == stage_expected
 
 
@@ -794,7 +794,7 @@ def _header(run, path):
 def test_a_limit_of_the_system_on_file_sizes_leaves_the_store_whole(run, expected, tmp_path, room):
     path = tmp_path / "s.ftlm"
     begun = _header(run, path)
-    held = path.read_bytes()
+    stored = path.read_bytes()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     # Less than the journal needs, or less than the file does.
     resource.setrlimit(resource.RLIMIT_FSIZE, (max(begun + room, 600), before[1]))
@@ -803,7 +803,7 @@ def test_a_limit_of_the_system_on_file_sizes_leaves_the_store_whole(run, expecte
             search(run, path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert path.read_bytes()[: len(held)] == held or records(path)
+    assert path.read_bytes()[: len(stored)] == stored or records(path)
     assert [p.name for p in tmp_path.iterdir()] == ["s.ftlm"]
     assert bytes_of(search(run, path)) == expected
 
@@ -938,11 +938,11 @@ def test_a_database_of_another_program_is_refused_and_kept(run, tmp_path):
         with contextlib.closing(sqlite3.connect(path)) as file, file:
             for table in tables:
                 file.execute(f"CREATE TABLE {table}")
-        held = path.read_bytes()
+        stored = path.read_bytes()
         for call in (lambda: search(run, path), lambda: ftlm.resume_search(path), lambda: ftlm.search_status(path)):
             with pytest.raises(ftlm.DataError, match="is not an ftlm search store"):
                 call()
-        assert path.read_bytes() == held
+        assert path.read_bytes() == stored
 
 
 def test_an_append_that_a_kill_cut_short_is_void(run, whole, expected, tmp_path):
@@ -950,7 +950,7 @@ def test_an_append_that_a_kill_cut_short_is_void(run, whole, expected, tmp_path)
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)
     keep(path, 2)
-    held = records(path)
+    stored = records(path)
     script = """if True:
         import os, signal, sqlite3, sys
         file = sqlite3.connect(sys.argv[1], isolation_level=None)
@@ -963,7 +963,7 @@ def test_an_append_that_a_kill_cut_short_is_void(run, whole, expected, tmp_path)
     for read in (records, lambda path: (search(run, path), records(path)[:2])[1]):
         assert subprocess.run([sys.executable, "-c", script, path], check=False).returncode == -signal.SIGKILL
         assert (tmp_path / "s.ftlm-journal").exists()
-        assert read(path) == held
+        assert read(path) == stored
         assert [p.name for p in tmp_path.iterdir()] == ["s.ftlm"]
     assert bytes_of(search(run, path)) == expected
 

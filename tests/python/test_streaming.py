@@ -110,9 +110,9 @@ def test_a_record_is_identified_while_it_is_made(tmp_path, stage):
     )
     assert seen[0] == 499
     assert seen[-1] == 1000
-    told = ftlm.load(tmp_path / "run.csv").metadata["live"]
-    assert told["coefficients"] == stream.coefficients
-    assert told["trouble"] is None
+    settings = ftlm.load(tmp_path / "run.csv").metadata["live"]
+    assert settings["coefficients"] == stream.coefficients
+    assert settings["trouble"] is None
     truth = batch(run, stage, prior_covariance=1e8)
     assert stream.coefficients["a1"] == pytest.approx(truth["a1"], rel=1e-6)
     assert stream.coefficients["a1"] == pytest.approx(628.89, rel=0.02)

@@ -48,8 +48,8 @@ def test_a_flat_fit_does_not_depend_on_the_unit_of_time(seed):
     for unit, scale in UNITS.items():
         other = found[unit]
         assert other.orders == pytest.approx(seconds.orders, abs=1e-6)
-        told = in_seconds(dict(zip(other.names, other.values, strict=True)), scale)
-        assert told == pytest.approx(in_seconds(values, 1.0), rel=1e-4)
+        converted = in_seconds(dict(zip(other.names, other.values, strict=True)), scale)
+        assert converted == pytest.approx(in_seconds(values, 1.0), rel=1e-4)
         assert other.noise == pytest.approx(seconds.noise, rel=1e-8)
         assert other.refinement == seconds.refinement
         assert other.standard_errors["alpha"] == pytest.approx(seconds.standard_errors["alpha"], rel=1e-3)

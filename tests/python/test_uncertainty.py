@@ -49,7 +49,7 @@ print(json.dumps([found.to_dict()[key] for key in ("coefficients", "orders", "st
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="kernels of another processor, by name")
 def test_another_linear_algebra_moves_last_digits_alone() -> None:
-    told = []
+    reports = []
     for kernels in ("Prescott", "Nehalem"):
         done = subprocess.run(
             [sys.executable, "-c", FITTED],
@@ -59,8 +59,8 @@ def test_another_linear_algebra_moves_last_digits_alone() -> None:
             timeout=240,
             env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
         )
-        told.append(json.loads(done.stdout))
-    (*numbers, spread), (*others, again) = told
+        reports.append(json.loads(done.stdout))
+    (*numbers, spread), (*others, again) = reports
     for one, other in zip(numbers, others, strict=True):
         assert one == pytest.approx(other, rel=1e-9)
     assert again == pytest.approx(spread, rel=1e-9)

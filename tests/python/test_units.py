@@ -11,7 +11,7 @@ from oracles import held_response
 UNITS = {"time in ms": (1e3, 1.0, 1.0), "time in min": (1 / 60, 1.0, 1.0), "y x 1000, u x 0.001": (1.0, 1e3, 1e-3)}
 
 
-def told(run, time, outputs, inputs):
+def in_units(run, time, outputs, inputs):
     """A run in other units."""
     return ftlm.Run.from_arrays(
         step=time * run.step,
@@ -51,7 +51,7 @@ def test_friction_is_the_same_in_any_unit(kind):
     here = identified(run, structure)
     assert here.coefficients["fc"] > 0.4
     for time, outputs, inputs in UNITS.values():
-        there = identified(told(run, time, outputs, inputs), structure)
+        there = identified(in_units(run, time, outputs, inputs), structure)
         assert there.orders == pytest.approx(here.orders, abs=1e-6)
         assert there.fit["y"] == pytest.approx(here.fit["y"], abs=1e-5)
         alpha, mu = here.orders.get("alpha", 2.0), here.orders.get("mu", 1.0)
@@ -100,7 +100,7 @@ def test_laws_between_coefficients_are_the_same_in_any_unit():
     assert here.orders == pytest.approx({"alpha1": 2.0, "mu2": 0.9, "beta2": 0.1}, abs=0.01)
     for kind in ("time in ms", "y x 1000, u x 0.001"):
         time, outputs, inputs = UNITS[kind]
-        there = identified(told(run, time, outputs, inputs), structure)
+        there = identified(in_units(run, time, outputs, inputs), structure)
         assert there.orders == pytest.approx(here.orders, abs=1e-6)
         assert there.fit == pytest.approx(here.fit, abs=1e-4)
         alpha, mu, beta = (here.orders[n] for n in ("alpha1", "mu2", "beta2"))

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("no_extension_tests")
 STEP = 0.01
 
 
-def held(a, b, gain, *, seed, noise, rows=3000, every=100):
+def controlled_run(a, b, gain, *, seed, noise, rows=3000, every=100):
     """First-order unstable plant D y = a y + b u under proportional control with reference steps."""
     g = np.random.default_rng(seed)
     reference = np.repeat(g.uniform(-1, 1, rows // every), every)
@@ -38,14 +38,14 @@ def codes(found):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
 def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
-    run = held(4.0, 2.0, 5.0, seed=seed, noise=noise)
+    run = controlled_run(4.0, 2.0, 5.0, seed=seed, noise=noise)
     found = ftlm.identify(run, ftlm.equation(EQUATION))
     for name, truth in (("a", 4.0), ("b", 2.0)):
         assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
     (split,) = (f for f in found.findings if f.code == "runs_split")
     assert split.numbers["pieces"] == len(run.split(split.numbers["seconds"]))
     assert found.verdict.level == "with care"
-    other = held(4.0, 2.0, 5.0, seed=seed + 10, noise=noise)
+    other = controlled_run(4.0, 2.0, 5.0, seed=seed + 10, noise=noise)
     validation = found.validate(other)
     assert validation.verdict.level in ("trust", "with care")
     assert validation.output_error["y"].nr < 0.3
@@ -59,7 +59,7 @@ def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
 
 @pytest.mark.parametrize("initial", ["rest", "caputo"])
 def test_a_start_that_is_given_is_kept_and_the_way_is_named(initial):
-    run = held(4.0, 2.0, 5.0, seed=1, noise=1e-2)
+    run = controlled_run(4.0, 2.0, 5.0, seed=1, noise=1e-2)
     default = ftlm.identify(run, ftlm.equation(EQUATION), initial=initial)
     assert default.verdict.level == "do not use"
     (said,) = (f for f in default.findings if f.code == "plant_needs_pieces")
@@ -108,7 +108,7 @@ def test_split():
 
 @pytest.mark.parametrize("method", ["least-squares", "instrumental-variables"])
 def test_an_equation_error_method_that_has_the_truth_is_not_refused_for_growing(method, tmp_path):
-    run = held(4.0, 2.0, 5.0, seed=5, noise=1e-3)
+    run = controlled_run(4.0, 2.0, 5.0, seed=5, noise=1e-3)
     found = ftlm.identify(run, ftlm.equation(EQUATION), method=method)
     assert found.coefficients["a"] == pytest.approx(4.0, rel=0.05)
     assert "plant_unstable_in_pieces" in codes(found)

@@ -30,9 +30,9 @@ def simple(run):
 
 def test_a_simpler_model_says_where_the_richer_one_starts(simple):
     problem = FreeProblem.of(ftlm.equation(RICH, initial="rest"))
-    told = values_of_model(problem, simple.model, {})
-    assert told == {"alpha": 2.0, "mu": 1.0, **simple.coefficients}
-    assert warm_starts(problem, told) == [told]
+    values = values_of_model(problem, simple.model, {})
+    assert values == {"alpha": 2.0, "mu": 1.0, **simple.coefficients}
+    assert warm_starts(problem, values) == [values]
 
 
 def test_what_is_not_known_does_nothing_at_first():

@@ -317,7 +317,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     powers = np.array(list(polynomial))
     values = np.array(list(polynomial.values()))
 
-    def shares(at: float, omega: float) -> float:
+    def other_terms_ratio(at: float, omega: float) -> float:
         """Return, at s = omega, the sum of the magnitudes of all other terms relative to the term with power `at`."""
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
@@ -327,9 +327,9 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     except OverflowError:  # coefficients that differ much, with powers that differ little
         centre = math.exp(OVERFLOW_LOG_FREQUENCY)
     low, high = centre, centre
-    while shares(lowest, low) > DOMINANCE_RATIO and low > 1e-300:
+    while other_terms_ratio(lowest, low) > DOMINANCE_RATIO and low > 1e-300:
         low /= 10
-    while shares(highest, high) > DOMINANCE_RATIO and high < 1e300:
+    while other_terms_ratio(highest, high) > DOMINANCE_RATIO and high < 1e300:
         high *= 10
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
@@ -481,8 +481,10 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     """
     size, angle = math.exp(w.real), w.imag
     # A poorly determined pole may be far from the real axis although its interval includes it, so the limit is fixed.
-    sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD)
-    if angle >= math.pi - max(sure, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
+    half_width = min(
+        NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD
+    )
+    if angle >= math.pi - max(half_width, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
         sign = 1.0 if angle <= DISTINCT_ZERO_TOLERANCE else -1.0
         error = None if spread is None else spread[0]
         scaled = (None, None) if error is None else (size * error, error / size)
@@ -510,8 +512,8 @@ def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
     return [w for w in zeros if w.imag <= max(MAX_SHEET_ANGLE_RAD, first) + REAL_AXIS_ANGLE_RAD]
 
 
-def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
-    """Return the zeros of a sum of c s^p as ln s, slowest first, with 0 <= Im ln s <= reach [rad] and without s = 0."""
+def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
+    """Return the zeros of a sum of c s^p ln s, slowest first, without s = 0 and with 0 <= Im ln s <= max_argument."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < POWER_TOLERANCE:
@@ -522,26 +524,26 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
         roots = roots[np.abs(roots) > 0]
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
         # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
-        inside = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= reach)]
+        inside = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= max_argument)]
         if abs(base - 1) < POWER_TOLERANCE:
             inside = inside[inside.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
         return sorted(inside.tolist(), key=lambda z: (z.real, z.imag))
     values = np.array(list(polynomial.values()))
     roots_so_far: list[complex] = []
-    seeds = [_two_term_zeros(powers, values, reach)]
+    seeds = [_two_term_zeros(powers, values, max_argument)]
     for base in SEED_ORDER_BASES:
         if (highest - lowest) / base > MAX_SEED_DEGREE:
             continue
-        seeds.append(_seeds(polynomial, base, reach))
+        seeds.append(_rounded_order_zeros(polynomial, base, max_argument))
     for z in _newton_zeros(np.concatenate(seeds), powers, values):
-        if -DISTINCT_ZERO_TOLERANCE <= z.imag <= reach and all(
+        if -DISTINCT_ZERO_TOLERANCE <= z.imag <= max_argument and all(
             abs(z - other) > DISTINCT_ZERO_TOLERANCE for other in roots_so_far
         ):
             roots_so_far.append(complex(z.real, max(z.imag, 0.0)))
     return sorted(roots_so_far, key=lambda z: (z.real, z.imag))
 
 
-def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
+def _rounded_order_zeros(polynomial: Polynomial, base: float, max_argument: float) -> Complex:
     """Return initial guesses for zeros as ln s, the roots of the sum with orders rounded to multiples of a base."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
@@ -553,10 +555,10 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
     step, roots = base_roots
     roots = roots[np.abs(roots) > 0]
     w = np.log(np.abs(roots)) / step + 1j * np.abs(np.angle(roots)) / step
-    return np.asarray(w[w.imag <= 1.2 * reach], dtype=np.complex128)
+    return np.asarray(w[w.imag <= 1.2 * max_argument], dtype=np.complex128)
 
 
-def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
+def _two_term_zeros(powers: Floats, values: Floats, max_argument: float) -> Complex:
     """Return initial guesses for zeros as ln s: for each pair of terms, the zeros of their sum.
 
     The guesses are accurate for zeros of very small or large magnitude if orders differ little.
@@ -565,9 +567,11 @@ def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
     for i, j in itertools.combinations(range(powers.size), 2):
         difference = powers[j] - powers[i]
         turn = np.angle(-values[i] / values[j] + 0j)
-        angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(difference) / math.pi) + 1)) / difference
+        angles = (
+            turn + 2 * math.pi * np.arange(-1, math.ceil(max_argument * abs(difference) / math.pi) + 1)
+        ) / difference
         size = math.log(abs(values[i] / values[j])) / difference
-        out += [complex(size, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= reach]
+        out += [complex(size, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= max_argument]
     return np.array(out, dtype=np.complex128)
 
 
@@ -759,6 +763,6 @@ def settling_time(model: Model) -> float:
     if not model_modes:
         return 10.0
     slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in model_modes)
-    swings = [2 * math.pi / m.frequency for m in model_modes if m.oscillatory]
-    settled = min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
-    return settled + max(model.structure.delay.values(), default=0.0)
+    periods = [2 * math.pi / m.frequency for m in model_modes if m.oscillatory]
+    duration = min(6.0 * slowest, 50.0 * min(periods)) if periods else 6.0 * slowest
+    return duration + max(model.structure.delay.values(), default=0.0)

@@ -214,21 +214,21 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay
-    early = next((name for name, delay in delays.items() if delay < 0.0), None)
-    if early is not None:
+    leading = next((name for name, delay in delays.items() if delay < 0.0), None)
+    if leading is not None:
         raise ModelError(
-            f"{early} acts {-delays[early]:g} s before it is logged, and no linear system responds before its input; "
-            "shift the rows of that input, and identify again"
+            f"{leading} acts {-delays[leading]:g} s before it is logged, and no linear system responds before its "
+            "input; shift the rows of that input, and identify again"
         )
-    reach = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
-    matrices = state_space_matrices(model, delays, reach, count)
+    extended_band = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
+    matrices = state_space_matrices(model, delays, extended_band, count)
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
-    unjudged = Approximation(*matrices, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
-    return _with_errors(model, unjudged)
+    without_errors = Approximation(*matrices, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
+    return _with_errors(model, without_errors)
 
 
 def state_space_matrices(
-    model: Model, delays: Mapping[str, float], reach: tuple[float, float], count: int
+    model: Model, delays: Mapping[str, float], extended_band: tuple[float, float], count: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the state-space matrices A, B, C and D of a model with coupled equations.
 
@@ -240,7 +240,7 @@ def state_space_matrices(
         A linear model. Integer orders are represented exactly.
     delays
         Delays of inputs [s] by name, which are approximated.
-    reach, count
+    extended_band, count
         Frequency band (low, high) [rad/s] and order of the filters that approximate fractional orders.
 
     Raises
@@ -260,7 +260,7 @@ def state_space_matrices(
     filters: dict[tuple[str, float], _Signal] = {}
     read: list[_Signal] = []
     for item in model.equations:
-        fed: dict[int, list[tuple[float, _Signal]]] = {}
+        by_level: dict[int, list[tuple[float, _Signal]]] = {}
         for term in item.terms:
             eta = round(item.order.constant - term.order.constant, 9)
             whole = math.ceil(eta)
@@ -272,13 +272,13 @@ def state_space_matrices(
             key = (term.signal, round(whole - eta, 9))
             if key not in filters:
                 source = sources[term.signal]
-                filters[key] = _filter_signal(states, source, key[1], reach, count) if key[1] > 0 else source
-            fed.setdefault(whole, []).append((float(term.fixed or 0.0), filters[key]))
-        behind: _Signal = {}
-        for level in range(max(fed), 0, -1):
-            states.append(_sum([*fed.get(level, []), (1.0, behind)]))
-            behind = {("state", len(states) - 1): 1.0}
-        read.append(_sum([(1.0, behind), *fed.get(0, [])]))
+                filters[key] = _filter_signal(states, source, key[1], extended_band, count) if key[1] > 0 else source
+            by_level.setdefault(whole, []).append((float(term.fixed or 0.0), filters[key]))
+        previous_integrator: _Signal = {}
+        for level in range(max(by_level), 0, -1):
+            states.append(_sum([*by_level.get(level, []), (1.0, previous_integrator)]))
+            previous_integrator = {("state", len(states) - 1): 1.0}
+        read.append(_sum([(1.0, previous_integrator), *by_level.get(0, [])]))
     widths = {"state": len(states), "input": len(inputs), "output": len(outputs)}
     a, b, feedback = (_dense(states, kind, width) for kind, width in widths.items())
     reads, direct, loop = (_dense(read, kind, width) for kind, width in widths.items())
@@ -298,14 +298,14 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
     exact = frequency_response(model, omega, sensor=False)
-    got = system.frequency_response(omega)
+    approximated = system.frequency_response(omega)
     gain, phase = {}, {}
     for i, output in enumerate(system.outputs):
         for j, signal in enumerate(system.inputs):
             if not np.any(exact[i, j]):
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
-                quotient = got[i, j] / exact[i, j]
+                quotient = approximated[i, j] / exact[i, j]
                 gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
                 phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
     roots = np.linalg.eigvals(system.a)

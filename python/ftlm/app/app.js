@@ -90,7 +90,7 @@ document.addEventListener("drop", (event) => {
 });
 
 // Values of the form fields of a file. A new layout may have other columns, so the columns are then omitted.
-function told(card, layout) {
+function fieldValues(card, layout) {
   const form = card.querySelector("form"), out = Object.fromEntries(new FormData(form));
   for (const name of Object.keys(out)) if (/-\d+$/.test(name)) delete out[name];
   if (!layout && card.querySelector("[data-column]")) {
@@ -107,7 +107,7 @@ files.addEventListener("change", async (event) => {
   say("Reading again …");
   card.setAttribute("aria-busy", "true");
   try {
-    put(files, await send(`files/${card.dataset.key}`, told(card, "layout" in event.target.dataset)));
+    put(files, await send(`files/${card.dataset.key}`, fieldValues(card, "layout" in event.target.dataset)));
     say("Read again.");
   } catch (error) {
     say(error.message, true);
@@ -117,8 +117,8 @@ files.addEventListener("change", async (event) => {
 });
 files.addEventListener("submit", (event) => event.preventDefault());
 
-const gone = new Set();
-let looking = new AbortController();
+const removed = new Set();
+let poll = new AbortController();
 
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-do]");
@@ -131,15 +131,15 @@ document.addEventListener("click", async (event) => {
       soon();
     } else {
       // No request for an element may follow its removal.
-      gone.add(place);
-      looking.abort();
+      removed.add(place);
+      poll.abort();
       await request(place, { method: "DELETE" });
       card.remove();
       say("Removed.");
       (files.querySelector("button") || $("pick")).focus();
     }
   } catch (error) {
-    gone.delete(place);
+    removed.delete(place);
     say(error.message, true);
   }
   arrange();
@@ -179,12 +179,12 @@ function arrange() {
   ]);
   const run = runs.find((each) => each.key === $("estimation").value);
   if (run) offer(run);
-  ways();
+  showMode();
 }
 
 function offer(run) {
   const place = $("offers"), written = JSON.stringify(run.offers);
-  $("auto-way").hidden = run.outputs.length !== 1;
+  $("auto-mode").hidden = run.outputs.length !== 1;
   if (place.dataset.offers === written) return;
   place.dataset.offers = written;
   place.replaceChildren();
@@ -227,10 +227,10 @@ const WORDS = {
   auto: "Whole orders 1 to 4, every input, then free orders: what predicts best what it was not fitted to. It takes minutes.",
 };
 
-function ways() {
-  const chosen = ask.elements.way.value;
-  if (chosen === "auto" && $("auto-way").hidden) { ask.elements.way.value = "fit"; return ways(); }
-  $("way-words").textContent = WORDS[chosen];
+function showMode() {
+  const chosen = ask.elements.selection_mode.value;
+  if (chosen === "auto" && $("auto-mode").hidden) { ask.elements.selection_mode.value = "fit"; return showMode(); }
+  $("mode-text").textContent = WORDS[chosen];
   $("equation-field").hidden = chosen === "offered" || chosen === "auto";
   $("offers").hidden = chosen === "auto";
   $("offers").classList.toggle("all", chosen === "offered");
@@ -238,11 +238,11 @@ function ways() {
 
 function wanted() {
   const run = facts().find((each) => each.key === $("estimation").value), on = $("validation").value;
-  const share = /^[0-9.]+$/.test(on) && on.length < 5, way = ask.elements.way.value;
+  const share = /^[0-9.]+$/.test(on) && on.length < 5, mode = ask.elements.selection_mode.value;
   const first = run ? run.offers.filter((each) => each.output === run.outputs[0] && !each.structure.includes("sign(")).map((each) => each.structure) : [];
   return {
-    estimation: $("estimation").value, validation: share ? "" : on, share: share ? Number(on) : 0, way,
-    structure: way === "auto" ? [] : way === "offered" ? first : [$("structure").value],
+    estimation: $("estimation").value, validation: share ? "" : on, share: share ? Number(on) : 0, selection_mode: mode,
+    structure: mode === "auto" ? [] : mode === "offered" ? first : [$("structure").value],
     method: ask.elements.method.value, offset: ask.elements.offset.value, loss: ask.elements.loss.value,
   };
 }
@@ -264,7 +264,7 @@ async function check() {
 $("structure").addEventListener("input", () => { mark(); clearTimeout(pause); pause = setTimeout(check, 500); });
 ask.addEventListener("change", (event) => {
   if (event.target.id === "estimation") arrange();
-  ways();
+  showMode();
   if (event.target.id !== "structure") wrong("");
 });
 ask.addEventListener("submit", async (event) => {
@@ -302,12 +302,12 @@ function progress(card, state) {
 }
 
 async function look() {
-  looking = new AbortController();
-  const { signal } = looking;
+  poll = new AbortController();
+  const { signal } = poll;
   const state = JSON.parse(await request("state", { signal }));
   let changed = false;
   for (const [key, each] of Object.entries(state.models)) {
-    if (gone.has(`models/${key}`)) continue;
+    if (removed.has(`models/${key}`)) continue;
     const card = document.getElementById(`model-${key}`);
     if (!card || Number(card.dataset.version) !== each.version) {
       const part = put(models, await request(`models/${key}`, { signal }), true);
@@ -321,7 +321,7 @@ async function look() {
     if (!(card.dataset.key in state.models)) { card.remove(); changed = true; }
   }
   for (const [key, version] of Object.entries(state.files)) {
-    if (gone.has(`files/${key}`)) continue;
+    if (removed.has(`files/${key}`)) continue;
     const card = document.getElementById(`file-${key}`);
     if (version && (!card || Number(card.dataset.version) < version) && !files.querySelector("[aria-busy]")) {
       say(`“${put(files, await request(`files/${key}`, { signal })).querySelector("h3").textContent}” is read.`);
@@ -340,7 +340,7 @@ async function again() {
     busy = await look();
     if (lost) { lost = false; say("ftlm app answers again."); }
   } catch (error) {
-    if (!lost && !looking.signal.aborted) { lost = true; say(error.message, true); }
+    if (!lost && !poll.signal.aborted) { lost = true; say(error.message, true); }
   }
   timer = setTimeout(again, busy ? 300 : lost ? 3000 : 2000);
 }

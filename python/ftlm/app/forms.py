@@ -98,7 +98,7 @@ class FitRequest:
     structure
         Equations, or keys of :data:`NAMED_STRUCTURES`. The mode ``"offered"`` has several, ``"auto"`` has none, and the
         other modes have one.
-    way
+    selection_mode
         Selection mode, one of :data:`SELECTION_MODES`: ``"fit"`` fits the structure as given, ``"inside"`` selects
         terms of it, ``"offered"`` selects among several structures, and ``"auto"`` requires none.
     method, offset, loss
@@ -109,7 +109,7 @@ class FitRequest:
     validation: RunSource | None = None
     share: float = 0.0
     structure: tuple[str, ...] = ()
-    way: str = "fit"
+    selection_mode: str = "fit"
     method: str = ""
     offset: str = ""
     loss: str = ""
@@ -126,14 +126,14 @@ class FitRequest:
         return asdict(self)
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Structure or selection mode of the request as one line of text."""
         return {
             "fit": "; ".join(self.structure),
             "inside": f"chosen inside {'; '.join(self.structure)}",
             "offered": f"chosen among {len(self.structure)} structures",
             "auto": "chosen by ftlm",
-        }[self.way]
+        }[self.selection_mode]
 
     def settings(self) -> dict[str, str]:
         """Return method, offset and loss by name; options at their defaults are omitted."""
@@ -163,9 +163,9 @@ class FitRequest:
         return [structure_of(text) for text in self.structure]
 
     @property
-    def is_choice(self) -> bool:
+    def selects_structure(self) -> bool:
         """Whether the request selects a structure. A selection takes so long that a checkpoint file is useful."""
-        return self.way != "fit"
+        return self.selection_mode != "fit"
 
     def fit_model(self, listener: ProgressListener, store: str | None = None) -> FittedModel:
         """Read the runs, fit and validate the model, and return it with its runs and a script.
@@ -185,13 +185,21 @@ class FitRequest:
         structures = self.structures()
         listener.phase("reading")
         own, other, cut = self._runs()
-        listener.phase(SELECTION_PHASE if self.is_choice else f"fitting{self._time_estimate(own, structures[0])}")
+        listener.phase(
+            SELECTION_PHASE if self.selects_structure else f"fitting{self._time_estimate(own, structures[0])}"
+        )
         choice = None
-        if not self.is_choice:
+        if not self.selects_structure:
             method, offset = self.estimation_method(), cast("Offset", self.offset) if self.offset else None
             result = identify(own, structures[0], method=method, offset=offset, progress=listener)
         else:
-            candidates = "auto" if self.way == "auto" else structures[0] if self.way == "inside" else structures
+            candidates = (
+                "auto"
+                if self.selection_mode == "auto"
+                else structures[0]
+                if self.selection_mode == "inside"
+                else structures
+            )
             choice = select(own, candidates, progress=listener, store=store)
             # The selection may have assumed zero initial conditions. Its structure allows others, which this fit tests.
             listener.phase("fitting what was chosen")
@@ -237,17 +245,16 @@ class FitRequest:
             lines.append(f"run, other = whole.window(None, {cut!r}), whole.window({cut!r}, None)")
         if self.validation is not None:
             lines += self.validation.script("other")
-        if not self.is_choice:
+        if not self.selects_structure:
             lines.append(f"structure = {structure_expression(self.structure[0])}")
             lines += format_call("result", "ftlm.identify", ["run", "structure", *self.identify_arguments()], {})
         else:
-            if self.way == "offered":
+            if self.selection_mode == "offered":
                 lines += ["candidates = [", *(f"    {structure_expression(text)}," for text in self.structure), "]"]
             else:
-                lines.append(
-                    "candidates = "
-                    f"{format_string('auto') if self.way == 'auto' else structure_expression(self.structure[0])}"
-                )
+                is_auto = self.selection_mode == "auto"
+                candidates = format_string("auto") if is_auto else structure_expression(self.structure[0])
+                lines.append(f"candidates = {candidates}")
             lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)"]
             lines.append("result = ftlm.identify(run, choice.winner.structure)")
         has_validation = cut is not None or self.validation is not None
@@ -276,32 +283,34 @@ def structure_of(text: str) -> Structure:
     return NAMED_STRUCTURES[text]() if text in NAMED_STRUCTURES else equation(text)
 
 
-def parse_structures(recipe: FitRequest) -> list[Structure]:
+def parse_structures(request: FitRequest) -> list[Structure]:
     """Return the structures of a request.
 
     Raise ModelError if an option is unknown, the number of structures does not suit the selection mode, the options
     contradict each other, or an equation is invalid.
     """
     for name, value, choices in (
-        ("way", recipe.way, SELECTION_MODES),
-        ("method", recipe.method, ("", *METHOD_NAMES)),
-        ("offset", recipe.offset, ("", *OFFSET_KINDS)),
-        ("loss", recipe.loss, ("", *LOSS_NAMES)),
+        ("selection_mode", request.selection_mode, SELECTION_MODES),
+        ("method", request.method, ("", *METHOD_NAMES)),
+        ("offset", request.offset, ("", *OFFSET_KINDS)),
+        ("loss", request.loss, ("", *LOSS_NAMES)),
     ):
         if value not in choices:
             raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, choices))}")
-    if recipe.way == "offered" and len(recipe.structure) < 2:
+    if request.selection_mode == "offered" and len(request.structure) < 2:
         raise ModelError("a comparison needs at least two structures; fit this one, or select its terms")
-    if recipe.way in ("fit", "inside") and len(recipe.structure) != 1:
+    if request.selection_mode in ("fit", "inside") and len(request.structure) != 1:
         raise ModelError("no structure is given; write an equation, or use a suggested one")
-    if recipe.way != "fit" and recipe.settings():
+    if request.selection_mode != "fit" and request.settings():
         raise ModelError(
-            f"{', '.join(recipe.settings())}: a structure selection uses output error and decides on the offset; "
+            f"{', '.join(request.settings())}: a structure selection uses output error and decides on the offset; "
             "leave these options at their defaults"
         )
-    if not 0.0 <= recipe.share <= 0.8:
-        raise ModelError(f"share = {recipe.share!r} of the run for validation is outside [0, 0.8]; use a smaller share")
-    return recipe.structures()
+    if not 0.0 <= request.share <= 0.8:
+        raise ModelError(
+            f"share = {request.share!r} of the run for validation is outside [0, 0.8]; use a smaller share"
+        )
+    return request.structures()
 
 
 def split_time(rows: int, step: float, share: float) -> float:

@@ -114,9 +114,9 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     token, key = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
     own = sock.getsockname()[1]
     hosts = (f"{LOOPBACK_ADDRESS}:{own}", f"localhost:{own}")
-    desk = Session()
+    session = Session()
     config = uvicorn.Config(
-        WebApplication(desk, token, hosts, key if browser else ""),
+        WebApplication(session, token, hosts, key if browser else ""),
         log_config=None,
         log_level="critical",
         access_log=False,
@@ -137,7 +137,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     address = f"http://{hosts[0]}/{token}/"
     try:
         for path in paths:
-            await desk.take(path.name, path.stat().st_size, _read_chunks(path))
+            await session.take(path.name, path.stat().st_size, _read_chunks(path))
         print(f"ftlm app: {address}\nCtrl-C ends it. Who knows this address can use it: do not pass it on.", flush=True)
         opener = None
         if browser:
@@ -149,7 +149,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         # Ctrl-C cancels the next await. This one is cancelled in place of the cleanup.
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.sleep(0)
-        await desk.close()
+        await session.close()
 
 
 async def _read_chunks(path: Path) -> AsyncIterator[bytes]:

@@ -100,7 +100,7 @@ class Model:
 
     Parameters
     ----------
-    key, number, recipe
+    key, number, fit_request
         Identifier in addresses, serial number, and fit request.
     state
         ``"waiting"``, ``"running"``, ``"made"``, ``"failed"`` or ``"stopped"``.
@@ -122,7 +122,7 @@ class Model:
 
     key: str
     number: int
-    recipe: FitRequest
+    fit_request: FitRequest
     state: str = STATE_WAITING
     phase: str = "waiting"
     share: float | None = None
@@ -253,7 +253,7 @@ class Session:
             If a queued or running model requires the file.
         """
         file = self.files[key]
-        if any(m.is_busy and file.name in _file_names(m.recipe) for m in self.models.values()):
+        if any(m.is_busy and file.name in _file_names(m.fit_request) for m in self.models.values()):
             raise DataError(f"{file.name!r} is in use by a model that is being fitted; stop the fit first")
         del self.files[key]
         if file.task is not None:
@@ -280,20 +280,20 @@ class Session:
             raise ModelError("structure is not an equation; write one, such as D y = a0 y + b0 u")
         if sum(map(len, texts)) > 4000:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
-        recipe = FitRequest(
+        fit_request = FitRequest(
             self._run(str(fields.get("estimation") or "")),
             self._run(other) if other else None,
             0.0 if other else share,
             tuple(t.strip() for t in texts if t.strip()),
             *(
                 str(fields.get(name) or default)
-                for name, default in (("way", "fit"), ("method", ""), ("offset", ""), ("loss", ""))
+                for name, default in (("selection_mode", "fit"), ("method", ""), ("offset", ""), ("loss", ""))
             ),
         )
-        for structure in parse_structures(recipe):
-            for reading in filter(None, (recipe.estimation, recipe.validation)):
+        for structure in parse_structures(fit_request):
+            for reading in filter(None, (fit_request.estimation, fit_request.validation)):
                 _check_signals(structure, reading)
-        return recipe
+        return fit_request
 
     def _run(self, key: str) -> RunSource:
         file = self.files.get(key)
@@ -307,7 +307,7 @@ class Session:
             )
         return file.run_source(self.folder)
 
-    def start(self, recipe: FitRequest) -> Model:
+    def start(self, fit_request: FitRequest) -> Model:
         """Add a model to the queue of fits, and return it.
 
         Raises
@@ -319,8 +319,8 @@ class Session:
             raise DataError(f"{MAX_MODELS} models are kept, the maximum number; remove one")
         self._check_queue()
         self._count += 1
-        model = Model(secrets.token_hex(8), self._count, recipe)
-        model.files = tuple(f.key for f in self.files.values() if f.name in _file_names(recipe))
+        model = Model(secrets.token_hex(8), self._count, fit_request)
+        model.files = tuple(f.key for f in self.files.values() if f.name in _file_names(fit_request))
         self.models[model.key] = model
         self._start_job(self._make(model))
         return model
@@ -344,7 +344,7 @@ class Session:
             return model
         if any(file not in self.files for file in model.files):
             raise DataError(
-                f"{' or '.join(sorted(_file_names(model.recipe)))} is no longer on the page; add the file again, "
+                f"{' or '.join(sorted(_file_names(model.fit_request)))} is no longer on the page; add the file again, "
                 "and repeat the request"
             )
         self._check_queue()
@@ -361,10 +361,10 @@ class Session:
             model.version += 1
             request = {
                 "do": "model",
-                "recipe": model.recipe.to_dict(),
+                "fit_request": model.fit_request.to_dict(),
                 "model": str(self.folder / f"{model.key}.json"),
                 "report": str(self.folder / f"{model.key}.html"),
-                "store": str(self.folder / f"{model.key}.ftlm") if model.recipe.is_choice else None,
+                "store": str(self.folder / f"{model.key}.ftlm") if model.fit_request.selects_structure else None,
             }
             model.task = Task(request, lambda message: _record_progress(model, message))
             try:
@@ -439,8 +439,8 @@ def _check_signals(structure: Structure, reading: RunSource) -> None:
             )
 
 
-def _file_names(recipe: FitRequest) -> set[str]:
-    return {recipe.estimation.file, *(() if recipe.validation is None else (recipe.validation.file,))}
+def _file_names(fit_request: FitRequest) -> set[str]:
+    return {fit_request.estimation.file, *(() if fit_request.validation is None else (fit_request.validation.file,))}
 
 
 def _record_progress(model: Model, message: Mapping[str, Any]) -> None:

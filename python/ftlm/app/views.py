@@ -90,12 +90,13 @@ def page_words(text: str) -> str:
     return _ARGUMENT_PATTERN.sub(_field_label, text)
 
 
-def page(desk: Session) -> str:
-    """Return the HTML of the whole page for the current state of the session `desk`."""
+def page(session: Session) -> str:
+    """Return the HTML of the whole page for the current state of `session`."""
     parts = {
-        "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # safe: its template escapes all text
-        "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
-        "comparison": Markup(comparison(desk)),
+        # The templates escape all text.
+        "files": Markup("").join(Markup(file(f)) for f in session.files.values()),
+        "models": Markup("").join(Markup(model(m)) for m in reversed(session.models.values())),
+        "comparison": Markup(comparison(session)),
     }
     return _render_template(
         "page.html.j2",
@@ -137,12 +138,12 @@ def file(item: File) -> str:
 
 def model(item: Model) -> str:
     """Return the HTML element of a model, whether it is queued, running, finished or failed."""
-    return _render_template("model.html.j2", model=item, description=item.description, recipe=item.recipe)
+    return _render_template("model.html.j2", model=item, description=item.description, fit_request=item.fit_request)
 
 
-def comparison(desk: Session) -> str:
+def comparison(session: Session) -> str:
     """Return an HTML table of all finished models, sorted by verdict and then by worst fit, best first."""
-    models = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
+    models = [m for m in session.models.values() if m.state == STATE_MADE and m.description is not None]
     models.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
     outputs = list(dict.fromkeys(f["output"] for m in models for f in (m.description or {})["fits"]))
     fits = {m.key: {f["output"]: f for f in (m.description or {})["fits"]} for m in models}
@@ -155,10 +156,10 @@ def _worst_fit(item: Model) -> float:
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
-def state(desk: Session) -> dict[str, Any]:
+def state(session: Session) -> dict[str, Any]:
     """Return the versions of all files, and version, phase and progress of all models, by key. The page polls it."""
     return {
-        "files": {f.key: f.version for f in desk.files.values()},
+        "files": {f.key: f.version for f in session.files.values()},
         "models": {
             m.key: {
                 "version": m.version,
@@ -167,7 +168,7 @@ def state(desk: Session) -> dict[str, Any]:
                 "share": m.share,
                 "left": m.time_left,
             }
-            for m in desk.models.values()
+            for m in session.models.values()
         },
     }
 

@@ -88,7 +88,7 @@ class WebApplication:
 
     Parameters
     ----------
-    desk
+    session
         Session to serve.
     token
         Secret first part of every path; requests without it are rejected with status 404.
@@ -99,18 +99,18 @@ class WebApplication:
         there is no such address.
     """
 
-    def __init__(self, desk: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
-        self._desk = desk
+    def __init__(self, session: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
+        self._session = session
         self._token = token
         self._hosts = hosts
         self._key = key
         self._router = Router(
             [
-                Route("/", _view(lambda: view.page(desk), "text/html")),
+                Route("/", _view(lambda: view.page(session), "text/html")),
                 Route("/app.js", _view(view.script, "text/javascript")),
                 Route("/app.css", _view(view.style, "text/css")),
-                Route("/state", _view(lambda: json.dumps(view.state(desk)), "application/json")),
-                Route("/comparison", _view(lambda: view.comparison(desk), "text/html")),
+                Route("/state", _view(lambda: json.dumps(view.state(session)), "application/json")),
+                Route("/comparison", _view(lambda: view.comparison(session), "text/html")),
                 Route("/check", self._check, methods=["POST"]),
                 Route("/files", self._upload, methods=["POST"]),
                 Route("/files/{key}", self._file, methods=["GET", "POST", "DELETE"]),
@@ -157,7 +157,7 @@ class WebApplication:
         await answer(scope, receive, send_secured)
 
     def _words(self, error: FtlmError) -> str:
-        return view.page_words(self._desk.without_paths(str(error)))
+        return view.page_words(self._session.without_paths(str(error)))
 
     def _check_head(self, scope: Scope) -> str:
         """Check host, origin, token and query of a request, and return its path without the token.
@@ -209,7 +209,7 @@ class WebApplication:
         """Return JSON with the key "error": the message for an invalid fit request, or "" for a valid one."""
         request_body = await read_json(request)
         try:
-            self._desk.parse_request(request_body)
+            self._session.parse_request(request_body)
         except FtlmError as error:
             return json_response({"error": self._words(error)})
         return json_response({"error": ""})
@@ -224,47 +224,47 @@ class WebApplication:
         )
         name = request.query_params.get("name", "")
         try:
-            self._desk.check_room(name, size)
-            file = await self._desk.take(name, size, request.stream())
+            self._session.check_room(name, size)
+            file = await self._session.take(name, size, request.stream())
         except FtlmError as error:
-            raise HTTPException(413, self._desk.without_paths(str(error))) from None
+            raise HTTPException(413, self._session.without_paths(str(error))) from None
         return html_response(view.file(file))
 
     async def _file(self, request: Request) -> Response:
-        file = _find(self._desk.files, request, "file")
+        file = _find(self._session.files, request, "file")
         if request.method == "DELETE":
-            self._desk.remove_file(file.key)
+            self._session.remove_file(file.key)
             return json_response({})
         if request.method == "POST":
             file.user_options = parse_fields(await read_json(request))
-            await self._desk.open(file)
+            await self._session.open(file)
         return html_response(view.file(file))
 
     async def _start(self, request: Request) -> Response:
-        return html_response(view.model(self._desk.start(self._desk.parse_request(await read_json(request)))))
+        return html_response(view.model(self._session.start(self._session.parse_request(await read_json(request)))))
 
     async def _model(self, request: Request) -> Response:
-        model = _find(self._desk.models, request, "model")
+        model = _find(self._session.models, request, "model")
         if request.method == "DELETE":
-            self._desk.remove_model(model.key)
+            self._session.remove_model(model.key)
             return json_response({})
         return html_response(view.model(model))
 
     async def _stop(self, request: Request) -> Response:
-        model = _find(self._desk.models, request, "model")
-        self._desk.stop(model.key)
+        model = _find(self._session.models, request, "model")
+        self._session.stop(model.key)
         return html_response(view.model(model))
 
     async def _resume(self, request: Request) -> Response:
-        model = _find(self._desk.models, request, "model")
-        return html_response(view.model(self._desk.resume(model.key)))
+        model = _find(self._session.models, request, "model")
+        return html_response(view.model(self._session.resume(model.key)))
 
     async def _download(self, request: Request) -> Response:
         """Return the response with a file of a model. No part of the file path is taken from the request.
 
         Raise HTTPException (status 404) if the model is unknown or not finished, or its file is missing.
         """
-        model = _find(self._desk.models, request, "model")
+        model = _find(self._session.models, request, "model")
         if model.state != STATE_MADE or model.description is None:
             raise HTTPException(404, "this model is not finished yet")
         what = request.url.path.rpartition("/")[2]
@@ -274,12 +274,12 @@ class WebApplication:
         else:
             suffix = "json" if what == "model" else "html"
             try:
-                content = (self._desk.folder / f"{model.key}.{suffix}").read_bytes()
+                content = (self._session.folder / f"{model.key}.{suffix}").read_bytes()
             except OSError:
                 raise HTTPException(404, "the file of this model was removed") from None
         headers = {"content-security-policy": REPORT_POLICY}
         if what != "page":
-            stem = Path(model.recipe.estimation.file).stem
+            stem = Path(model.fit_request.estimation.file).stem
             plain = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in stem)[:80] or "ftlm"
             headers["content-disposition"] = f'attachment; filename="{plain}-{model.number}-{ending}"'
         return Response(content, headers=headers, media_type=media_type)
@@ -350,8 +350,8 @@ class TimedConnection(H11Protocol):
         self._unread = unread
         if unread < size_before or (unread and not size_before):
             self._since = self.loop.time()
-        owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
-        if owes and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
+        is_incomplete = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+        if is_incomplete and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
             # close() would wait until the client reads the remaining data.
             self.transport.abort()
         else:

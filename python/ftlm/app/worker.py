@@ -4,7 +4,7 @@ A separate process protects the server from damaged files and long fits. `ftlm.u
 file by its path.
 
 The first line of standard input is the task, a JSON object with absolute paths: ``{"do": "open", "file": …,
-"options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …, "report": …}``. The process exits
+"options": …}`` or ``{"do": "model", "fit_request": …, "store": …, "model": …, "report": …}``. The process exits
 when standard input ends.
 
 Standard output has one JSON object per line: progress reports ``{"phase": words}`` and ``{"done": …, "total": …}``,
@@ -125,7 +125,7 @@ def _run_preview(opened: OpenedFile) -> dict[str, Any]:
 
 def make_model(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
     """Fit a model, write the model file and the report, and return the description for the page."""
-    fitted_model = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
+    fitted_model = FitRequest.of(task["fit_request"]).fit_model(reports, task["store"])
     reports.phase("writing the report")
     fitted_model.result.model.save(task["model"])
     fitted_model.result.report(task["report"], validation=fitted_model.other)

@@ -450,8 +450,8 @@ def _joint_equations(
         return law[name] if tied else Order(0.0, ((name, 1.0),))
 
     def extra(n: int) -> list[Term]:
-        rubs = friction and (n == h or form == "published")
-        return [Term(f"coulomb_{hub}", Order(), f"c{n}")] if rubs else []
+        has_friction = friction and (n == h or form == "published")
+        return [Term(f"coulomb_{hub}", Order(), f"c{n}")] if has_friction else []
 
     def equation(output: str, n: int, drive: Order | None) -> Equation:
         terms = [
@@ -472,8 +472,8 @@ def _joint_equations(
 
 def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
     """Return an equation with additional terms, which are inserted before its terms of Coulomb friction."""
-    rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
-    return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
+    friction_terms = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
+    return replace(item, terms=(*item.terms[: len(item.terms) - len(friction_terms)], *terms, *friction_terms))
 
 
 def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:

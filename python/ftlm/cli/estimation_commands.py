@@ -37,7 +37,7 @@ from ftlm.cli.reading_options import ReadingOptions, given_fields, layout_option
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
-from ftlm.estimation import consistency as parts_of_runs
+from ftlm.estimation import consistency as consistency_module
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import Weights
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
@@ -620,17 +620,17 @@ def select(
     runs = reading.runs(files, equation)
     targets = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
     candidates = "auto" if not targets else targets[0] if len(targets) == 1 else targets
-    of_its_own = validation if validation not in ("runs", "blocks") else None
-    if of_its_own is not None and not Path(of_its_own).exists():
-        raise ModelError(f"--validation {of_its_own!r} is neither runs nor blocks nor a file; check the path")
-    judges = validation_runs(reading, of_its_own, validation_window, equation) or validation
+    validation_file = validation if validation not in ("runs", "blocks") else None
+    if validation_file is not None and not Path(validation_file).exists():
+        raise ModelError(f"--validation {validation_file!r} is neither runs nor blocks nor a file; check the path")
+    validation_data = validation_runs(reading, validation_file, validation_window, equation) or validation
     with resumable(store, "the same command"):
         selection = select_structure(
             runs,
             candidates,
             shape,
             driven_by=driven_by,
-            validation=judges,
+            validation=validation_data,
             threads=threads,
             store=store,
             quiet=as_json,
@@ -669,7 +669,7 @@ def consistency(
     with Progress("fitting segments", quiet=as_json) as progress:
         count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
         progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
-        result = parts_of_runs.consistency(
+        result = consistency_module.consistency(
             runs, target, segments=segments, method=method, threads=threads, progress=progress
         )
     if report is not None:

@@ -415,11 +415,11 @@ def print_text(text: str, end: str = "\n") -> None:
     Table rows and commands to copy are not wrapped.
     """
     if sys.stdout.isatty():
-        text = "\n".join(piece for line in text.split("\n") for piece in broken_line(line))
+        text = "\n".join(piece for line in text.split("\n") for piece in wrap_line(line))
     print(text, end=end)
 
 
-def broken_line(line: str) -> list[str]:
+def wrap_line(line: str) -> list[str]:
     """Return a line of text wrapped to the width of the terminal, as a list of lines.
 
     Table rows, and lines that begin with "next: ", are not wrapped.
@@ -437,9 +437,9 @@ def show_json(document: Any) -> None:
     print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_to_json_value))
 
 
-def print_outcome(sentence: str, *, as_json: bool, **facts: Any) -> None:
-    """Print the outcome of a command as a sentence, or its data `facts` as one line of JSON."""
-    print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
+def print_outcome(sentence: str, *, as_json: bool, **data: Any) -> None:
+    """Print the outcome of a command as a sentence, or `data` as one line of JSON."""
+    print(json.dumps(data, ensure_ascii=False) if as_json else sentence)
 
 
 def _to_json_value(value: Any) -> Any:

@@ -154,8 +154,8 @@ class StructureOptions:
 
     def given_options(self) -> list[str]:
         """Return the flags of the options whose values differ from the defaults."""
-        usual = StructureOptions()
-        return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
+        defaults = StructureOptions()
+        return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(defaults, f.name)]
 
     def _check_equation(self, count: int) -> None:
         """Raise ModelError for options of the flexible link, which do not apply to `count` equations given as text."""

@@ -107,7 +107,7 @@ class LiveOptions:
             if useless:
                 raise ModelError(f"{', '.join(useless)}: only valid with --live; remove the option, or add --live")
             return None
-        free = numbers("--orders", self.orders)
+        orders = numbers("--orders", self.orders)
         if self.live.startswith("flexible-link:"):
             stages: dict[str, Literal[1, 2]] = {"1": 1, "2": 2}
             stage = stages.get(self.live.removeprefix("flexible-link:"))
@@ -118,12 +118,12 @@ class LiveOptions:
             structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
             if rig == "virtual":
                 arm = ArmParameters.of(parameters)
-                usual = (arm.stage1 if stage == 1 else arm.stage2).orders(stage)
-                free = {n: v for n, v in usual.items() if n in structure.order_names} | free
+                default_orders = (arm.stage1 if stage == 1 else arm.stage2).orders(stage)
+                orders = {n: v for n, v in default_orders.items() if n in structure.order_names} | orders
         else:
             structure = equation(self.live)
         return Streaming(
-            structure.with_orders(free),
+            structure.with_orders(orders),
             step=1.0 / rate,
             longest=limit + 1.0,
             innovation_length=self.method.innovation_length,
@@ -233,8 +233,8 @@ def record(
     except (KeyboardInterrupt, SystemExit) as ended:
         signals.ignore()
         what = experiment.describe_interruption(ended)
-        *troubles, rows = getattr(ended, "__notes__", None) or ["nothing was recorded"]
-        print(f"ftlm: {'; '.join([what, *(troubles or ['the motors are at 0 V']), rows])}", file=sys.stderr)
+        *errors, rows = getattr(ended, "__notes__", None) or ["nothing was recorded"]
+        print(f"ftlm: {'; '.join([what, *(errors or ['the motors are at 0 V']), rows])}", file=sys.stderr)
         code = ended.code if isinstance(ended, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
     finally:

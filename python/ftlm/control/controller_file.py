@@ -25,7 +25,8 @@ CONTROLLER_SCHEMA = 1
 ALGORITHM_TEXTS = {
     "pid": "each sample, with e = reference - measured: every lag becomes x = keep x + now e + before e_last, and the "
     "output is (kp + direct) e + the sum of weight x, cut at the limit; lags of the derivative begin with "
-    "e (now + before)/(1 - keep), those of the integral with 0 and stand still where they would push further",
+    "e (now + before)/(1 - keep), those of the integral with 0 and are not updated while the output is "
+    "saturated in their direction",
     "lqg": "each sample, with y what is measured and u what the last sample put out, cut at the limit: "
     "x = x + correction (y - [c 0] x); x = [[a, b], [0, 1]] x + [b; 0] u; output = ahead reference - [feedback 1] x",
 }

@@ -578,8 +578,8 @@ def _best(
                 candidates.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
         if not candidates:
             return None
-        calm = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in candidates))
-        best = max((f for f in candidates if f[0] <= calm), key=lambda f: f[1])[2]
+        sensitivity_limit = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in candidates))
+        best = max((f for f in candidates if f[0] <= sensitivity_limit), key=lambda f: f[1])[2]
         centre, reach = (best.lam, best.mu), reach / ORDERS_PER_ROUND * 2
     return best
 

@@ -196,19 +196,19 @@ def input_shaper(
         every: tuple[Mode, ...] = (_mode_of(model),)
     else:
         every = model_modes(model, coupling=coupling)
-    growing = [m for m in every if m.unstable or m.damping <= 0.0]
-    if growing:
+    unstable = [m for m in every if m.unstable or m.damping <= 0.0]
+    if unstable:
         raise ModelError(
-            f"the model is not stable ({growing[0]}), so its response cannot be shaped; close a loop around it, and "
+            f"the model is not stable ({unstable[0]}), so its response cannot be shaped; close a loop around it, and "
             "shape the poles of the loop"
         )
-    swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
-    if len(swings) < count:
+    oscillatory = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
+    if len(oscillatory) < count:
         raise ModelError(
-            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate, and only "
-            "these need a shaper; give at most this number"
+            f"{short_repr(count)} modes are to be shaped, but {len(oscillatory)} modes of the model oscillate, and "
+            "only these need a shaper; give at most this number"
         )
-    modes_used = tuple(swings[:count])
+    modes_used = tuple(oscillatory[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
     for mode in modes_used:
         half, decay = _half(mode)

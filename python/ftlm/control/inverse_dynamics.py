@@ -212,13 +212,13 @@ def inverse_dynamics(
     w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
     inside = w.real < 0.999 * math.pi * design.rate
     weight = np.exp(-fall * np.arange(size) / design.rate)
-    heard, acts, asks = design.controller_response(w[inside])
+    measured, feedback_response, reference_response = design.controller_response(w[inside])
 
     def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Return the closed-loop responses of the command, (W,), and of the outputs, (outputs, W), to the reference."""
         responses = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
-        loop = np.sum([a * responses[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
-        command = asks / (1.0 + loop)
+        loop = np.sum([a * responses[names.index(o)] for o, a in zip(measured, feedback_response, strict=True)], axis=0)
+        command = reference_response / (1.0 + loop)
         return command, responses * command
 
     command, outputs = closed_loop_response(design.plants[0].model)
@@ -252,22 +252,22 @@ def inverse_dynamics(
             f"{most:g}; give it more time, or a smaller move"
         )
     ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * move)[-1]) + 1
-    plain = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, ends)
+    unshaped_residual = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, ends)
     errors = [
         _residual_rms(inverse_transform(needed * (row @ closed_loop_response(one.model)[1])) + rows[0], rows, ends)
         for one in design.plants[0].samples(count, start)
     ]
     worst = float(np.quantile(errors, 0.975)) if errors else None
-    if worst is not None and not worst <= MAX_RESIDUAL_SHARE * plain:
+    if worst is not None and not worst <= MAX_RESIDUAL_SHARE * unshaped_residual:
         raise ModelError(
             "the confidence intervals are too wide to design on: within them the deviation after the end of the path "
             "may be "
-            f"{worst:.2g}, and {plain:.2g} with the path itself as reference; "
+            f"{worst:.2g}, and {unshaped_residual:.2g} with the path itself as reference; "
             f"{least_certain_parameter(design.plants[0].model)}; identify from a longer or richer run (ftlm "
             "design-input lays it out)"
         )
     ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
-    return Trajectory(reference, rows, effort, ways, worst, plain)
+    return Trajectory(reference, rows, effort, ways, worst, unshaped_residual)
 
 
 def _path(path: ArrayLike) -> Floats:

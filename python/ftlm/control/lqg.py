@@ -316,9 +316,9 @@ class Lqg:
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
-        rest = _equilibrium(realization, tracked)
+        equilibrium_state = _equilibrium(realization, tracked)
         #: Gain of the reference in the command, with which the output equals the reference in steady state.
-        self.ahead = float(gains[0] @ rest[:-1] + rest[-1])
+        self.ahead = float(gains[0] @ equilibrium_state[:-1] + equilibrium_state[-1])
         self.reset()
 
     @property
@@ -441,8 +441,8 @@ class LqgDesign(LoopDesign):
         They are the names of the measured outputs, the responses of the command to minus each measured output, shape
         (outputs, W), and the response of the command to the reference, shape (W,).
         """
-        heard, reference_response = self.controller.response(w)
-        return self.controller.observer.measured, -heard, reference_response
+        feedback_response, reference_response = self.controller.response(w)
+        return self.controller.observer.measured, -feedback_response, reference_response
 
     def with_limit(self, limit: float) -> Lqg:
         """Return a new controller of this design whose command saturates at the magnitude `limit`."""
@@ -534,20 +534,20 @@ def lqg(
     argument principle on the exact response.
     """
     count, start = check_samples(samples, seed)
-    dear = positive("max_input", max_input)
-    walks = 0.2 * dear if process_noise is None else positive("process_noise", process_noise)
+    max_input_value = positive("max_input", max_input)
+    process_noise_value = 0.2 * max_input_value if process_noise is None else positive("process_noise", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
     read = select_outputs("measured", measured, names)
     weights = _weights(max_deviation, names)
     tracked = _tracked_output(output, plants)
     realization = fit_realization(plants, band, poles)
-    kalman = kalman_filter(realization, read, noise_deviations(model, read, noise), walks)
+    kalman = kalman_filter(realization, read, noise_deviations(model, read, noise), process_noise_value)
     c = realization.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback stabilizes the model; state a maximum deviation of every output that integrates"
     with catch_numerical_errors(*no.split("; ")):
-        gains, _, own = python_control().dlqr(realization.a, realization.b, cost, np.eye(1) / dear**2)
+        gains, _, own = python_control().dlqr(realization.a, realization.b, cost, np.eye(1) / max_input_value**2)
     if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
         raise ModelError(no)
     controller = Lqg(kalman, gains, tracked, limit=limit)
@@ -555,14 +555,14 @@ def lqg(
     acting = -controller.response(w)[0]
     poles_of_it = controller.poles()
     at_one = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
-    integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
-    heard = [plants[names.index(o)] for o in kalman.measured]
+    integral, unstable_poles = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
+    measured_plants = [plants[names.index(o)] for o in kalman.measured]
 
     def loop_margins(which: Model) -> Margins:
-        parts = [replace(p, model=which) for p in heard]
+        parts = [replace(p, model=which) for p in measured_plants]
         loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
         order = max(p.integral_order() for p in parts)
-        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].count_unstable_poles() + grows)
+        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].count_unstable_poles() + unstable_poles)
 
     nominal = loop_margins(model)
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):

@@ -257,12 +257,12 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         solved = _least(matrix / scale, vector) / scale
         a, b = _system(poles)
-        relocated = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
+        stable_poles = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
         # The model is stable. A pole that errors of the fit put into the right half-plane is mirrored.
-        relocated = -np.abs(relocated.real) + 1j * relocated.imag
+        stable_poles = -np.abs(stable_poles.real) + 1j * stable_poles.imag
         poles_before, poles = (
             poles,
-            np.array(sorted(relocated[relocated.imag >= 0], key=lambda p: (p.imag == 0, abs(p)))),
+            np.array(sorted(stable_poles[stable_poles.imag >= 0], key=lambda p: (p.imag == 0, abs(p)))),
         )
         if len(poles_before) == len(poles) and np.max(np.abs(poles_before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break

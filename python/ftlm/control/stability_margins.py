@@ -187,9 +187,13 @@ class Plant:
 
     def check_stable(self) -> None:
         """Raise ModelError if the model is unstable; an integrator is permitted."""
-        grows = self.count_unstable_poles()
-        if grows != 0:
-            why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
+        unstable_poles = self.count_unstable_poles()
+        if unstable_poles != 0:
+            why = (
+                "a pole is on the imaginary axis"
+                if math.isnan(unstable_poles)
+                else f"{unstable_poles:g} of its poles are on the right"
+            )
             raise ModelError(
                 f"the model is not stable ({why}), so stability margins of its loop are meaningless; stabilize the "
                 "machine first, and identify the stabilized machine"
@@ -217,7 +221,7 @@ def nyquist_frequencies(crossover: float, rate: float) -> Floats:
     return np.geomspace(LOWEST_FREQUENCY_SHARE * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
 
 
-def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
+def margins_of(loop: Complex, w: Floats, integrates: float, unstable_poles: float = 0.0) -> Margins:
     """Return the stability margins of a loop from its frequency response on a fine grid of frequencies.
 
     Parameters
@@ -228,16 +232,16 @@ def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) 
         Frequencies [rad/s], ascending, shape (W,).
     integrates
         Order of the pole of L at s = 0.
-    grows
+    unstable_poles
         Number of unstable poles of L; with NaN the loop counts as unstable.
     """
-    if not np.isfinite(loop).all() or math.isnan(grows):
+    if not np.isfinite(loop).all() or math.isnan(unstable_poles):
         return Margins(False, math.nan, math.nan, math.nan, math.inf)
     difference = 1.0 + loop
     turned = np.unwrap(np.angle(difference))
     # Number of unstable poles of the closed loop, from the phase of 1 + L over the upper half of the Nyquist contour
     # and over the upper half of the small circle around the origin.
-    closed = grows + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
+    closed = unstable_poles + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     at = np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:]))
     share = size[at] / (size[at] - size[at + 1])

@@ -107,7 +107,7 @@ class RunArguments:
             # A view would keep the other rows in memory, and would be writable through its base array.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
         data = self._values(vectors, units, first, missing)
-        times, facts = clock.times[first:last], self.notes + clock.notes
+        times, all_notes = clock.times[first:last], self.notes + clock.notes
         if clock.step is not None:
             step, start = clock.step, float(f"{first * clock.step:.12g}")
         else:
@@ -118,18 +118,18 @@ class RunArguments:
                 if missing != "refuse":
                     times, data = self._insert_missing_samples(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
-                facts += jitter
+                all_notes += jitter
         data, notes = self._fill_input_gaps(data, behavior)
-        facts += notes
-        readings = None
+        all_notes += notes
+        nonuniform_samples = None
         if new_step is not None:
             step, since = new_step, times - times[0]
             whole = not any(np.isnan(data[s]).any() for s in self.outputs)
             if not (whole and rows_coincide(since, new_step)):
-                readings = NonuniformSamples(since, data)
+                nonuniform_samples = NonuniformSamples(since, data)
             data = resample_uniform(since, data, behavior, new_step)
-            how = describe_resampled_signals(behavior, keep_times=readings is not None)
-            facts += (describe_resampling(since, new_step, first, how),)
+            how = describe_resampled_signals(behavior, keep_times=nonuniform_samples is not None)
+            all_notes += (describe_resampling(since, new_step, first, how),)
         return dict(
             name=self.name,
             step=step,
@@ -139,9 +139,9 @@ class RunArguments:
             _data=data,
             _units={s: unit for s, (unit, _) in units.items()},
             _intersample=behavior,
-            notes=tuple(dict.fromkeys(facts)),
+            notes=tuple(dict.fromkeys(all_notes)),
             _metadata=dict(self.metadata),
-            sample_times=readings,
+            sample_times=nonuniform_samples,
         )
 
     def _insert_missing_samples(

@@ -176,7 +176,7 @@ UTF8_BOM = b"\xef\xbb\xbf"
 #: Maximum length of the first line; without it, a file without line breaks would be read into memory as a whole.
 MAX_HEADER_BYTES = 1 << 20
 #: Note in files of runs with nonuniform samples: the files contain only the samples on the uniform grid.
-OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read stayed behind"
+OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read are not written"
 
 
 class Header(msgspec.Struct, frozen=True, omit_defaults=True):

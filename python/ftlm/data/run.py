@@ -391,10 +391,10 @@ class Run:
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
-        readings = self.sample_times
-        if readings is not None:
-            readings = readings.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
-        return self._with(_data=data, start=begin, sample_times=readings)
+        nonuniform = self.sample_times
+        if nonuniform is not None:
+            nonuniform = nonuniform.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
+        return self._with(_data=data, start=begin, sample_times=nonuniform)
 
     def split(self, duration: float) -> list[Run]:
         """Split this run into consecutive runs whose lengths differ by at most one row.
@@ -447,14 +447,14 @@ class Run:
             If `step` is not positive, or gives fewer than three rows or more than 50 million.
         """
         new_step = check_step(step, "resample")
-        since, readings = uniform_times(self.length, self.step), self.sample_times
-        if readings is None and (self.missing_samples or not rows_coincide(since, new_step)):
-            readings = NonuniformSamples(since, self._data)
-        source = readings or NonuniformSamples(since, self._data)
+        since, nonuniform = uniform_times(self.length, self.step), self.sample_times
+        if nonuniform is None and (self.missing_samples or not rows_coincide(since, new_step)):
+            nonuniform = NonuniformSamples(since, self._data)
+        source = nonuniform or NonuniformSamples(since, self._data)
         data = resample_uniform(source.times, source.data, self._intersample, new_step)
-        how = describe_resampled_signals(self._intersample, keep_times=readings is not None)
+        how = describe_resampled_signals(self._intersample, keep_times=nonuniform is not None)
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
-        return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
+        return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=nonuniform)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of signals subtracted from them.
@@ -484,23 +484,23 @@ class Run:
         unknown = next((name for name in names if name not in self), None)
         if unknown is not None:
             raise self._unknown_signal_error(unknown)
-        data, facts, readings = dict(self._data), list(self.notes), self.sample_times
+        data, run_notes, nonuniform = dict(self._data), list(self.notes), self.sample_times
         for name in names:
             trend, words = fit_trend(self._data[name], self.step, linear=kind == "linear")
             data[name] = self._data[name] - trend(self.time)
-            if readings is not None:
-                readings = readings.replace_signals(**{name: readings.data[name] - trend(readings.times)})
-            facts.append(f"detrended: {words} subtracted from {name}")
-        return self._with(_data=data, notes=tuple(facts), sample_times=readings)
+            if nonuniform is not None:
+                nonuniform = nonuniform.replace_signals(**{name: nonuniform.data[name] - trend(nonuniform.times)})
+            run_notes.append(f"detrended: {words} subtracted from {name}")
+        return self._with(_data=data, notes=tuple(run_notes), sample_times=nonuniform)
 
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
         """Return this run with the given saturations and dead zones, which must be fixed, applied to its inputs."""
-        data, readings = dict(self._data), self.sample_times
+        data, nonuniform = dict(self._data), self.sample_times
         for limit in limits:
             data[limit.signal] = limit.apply(data[limit.signal])
-            if readings is not None:
-                readings = readings.replace_signals(**{limit.signal: limit.apply(readings.data[limit.signal])})
-        return self._with(_data=data, sample_times=readings)
+            if nonuniform is not None:
+                nonuniform = nonuniform.replace_signals(**{limit.signal: limit.apply(nonuniform.data[limit.signal])})
+        return self._with(_data=data, sample_times=nonuniform)
 
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
         """Return this run with some of its signals replaced by new samples.
@@ -518,11 +518,11 @@ class Run:
             If a name is not a signal of this run, the number of values differs, or a value of an input is not finite.
         """
         checked = self._checked_samples("samples", samples, self.length)
-        readings = self.sample_times
-        if readings is not None:
+        nonuniform = self.sample_times
+        if nonuniform is not None:
             own = {} if read is None else read
-            readings = readings.replace_signals(**self._checked_samples("read", own, readings.times.size))
-        return self._with(_data={**self._data, **checked}, sample_times=readings)
+            nonuniform = nonuniform.replace_signals(**self._checked_samples("read", own, nonuniform.times.size))
+        return self._with(_data={**self._data, **checked}, sample_times=nonuniform)
 
     def with_unmasked_run(self, run: Run) -> Run:
         """Return this run with `unmasked_run` set to the original run, whose first samples give the initial state."""
@@ -624,16 +624,16 @@ class Run:
                 raise DataError(f"with_outputs: {name!r} is an input of run {self.name!r}; give it another name")
             check_lengths({f"run {self.name!r}": self.length, f"output {name!r}": numbers.size})
             check_values(numbers, f"output {name!r}", 0)
-        readings = self.sample_times
-        if readings is not None:
-            readings = readings.replace_signals(
-                **{n: np.interp(readings.times, self.time, v) for n, v in values_by_name.items()}
+        nonuniform = self.sample_times
+        if nonuniform is not None:
+            nonuniform = nonuniform.replace_signals(
+                **{n: np.interp(nonuniform.times, self.time, v) for n, v in values_by_name.items()}
             )
         return self._with(
             outputs=tuple(dict.fromkeys([*self.outputs, *values_by_name])),
             _data={**self._data, **values_by_name},
             _units={**dict.fromkeys(values_by_name, ""), **self._units},
-            sample_times=readings,
+            sample_times=nonuniform,
         )
 
     def select(self, names: Iterable[str]) -> Run:
@@ -861,10 +861,10 @@ def check_compatible(runs: Iterable[Run]) -> None:
     first = every[0]
     for index, run in enumerate(every[1:], start=1):
         who = f"run {index} ({run.name!r}) and run 0 ({first.name!r})"
-        for role, mine, other in (("inputs", first.inputs, run.inputs), ("outputs", first.outputs, run.outputs)):
-            if set(mine) != set(other):
+        for role, first_names, other in (("inputs", first.inputs, run.inputs), ("outputs", first.outputs, run.outputs)):
+            if set(first_names) != set(other):
                 raise DataError(
-                    f"{who} have different {role}: {join_names(other)} and {join_names(mine)}; "
+                    f"{who} have different {role}: {join_names(other)} and {join_names(first_names)}; "
                     "use rename() and select() so that the names agree"
                 )
         units, first_units = run.units, first.units

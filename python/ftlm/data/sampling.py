@@ -196,8 +196,8 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
         return (lambda t: np.full(t.size, mean)), f"{mean:.6g}"
     clock = np.arange(values.size) * step
     middle = float(np.mean(clock[is_present]))
-    late = clock[is_present] - middle
-    slope = float(late @ (values[is_present] - mean)) / float(late @ late)
+    centered_times = clock[is_present] - middle
+    slope = float(centered_times @ (values[is_present] - mean)) / float(centered_times @ centered_times)
     sign = "-" if slope < 0 else "+"
     return (lambda t: mean + slope * (t - middle)), f"{mean - slope * middle:.6g} {sign} {abs(slope):.6g} t"
 
@@ -219,9 +219,9 @@ def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False,
     rows = np.flatnonzero(~good)
     value = float(values[rows[0]])
     first, count = offset + int(rows[0]), rows.size
-    avoided = f"avoid them with {parameter('window')}"
+    advice = f"avoid them with {parameter('window')}"
     if math.isnan(value):
-        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead or avoided}")
+        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead or advice}")
     if math.isinf(value):
         raise bad_rows(
             thing, f"infinity ({value})", first, count, f"correct these rows, or avoid them with {parameter('window')}"

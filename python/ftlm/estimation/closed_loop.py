@@ -67,15 +67,15 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
             f"{parameter('reference', reference)}: the model has no input of run {runs[0].name!r} that could "
             "depend on it; omit this argument, or add the input to the equation"
         )
-    moves = [run[reference] for run in runs]
-    if is_constant(moves):
+    references = [run[reference] for run in runs]
+    if is_constant(references):
         raise DataError(
             f"{parameter('reference', reference)} is constant, so it explains no input; record a reference that changes"
         )
     shortest = min(run.length for run in runs)
     ends = np.cumsum([run.length for run in runs])[:-1]
     laws = [
-        _columns(moves, shortest, dense)
+        _columns(references, shortest, dense)
         for dense in DENSE_LAG_COUNTS
         if dense == DENSE_LAG_COUNTS[0] or dense * MIN_ROWS_PER_LAG < shortest
     ]
@@ -95,53 +95,53 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
 
 
-def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES) -> list[Floats]:
+def past_regressors(signal: Floats, first: int, max_lag: int, *, dense: int = DENSE_PAST_SAMPLES) -> list[Floats]:
     """Return past samples of a signal as regressors, minus its first sample: single lags, then means of lag blocks.
 
-    Lags from ``first`` to ``dense`` each give one regressor. Longer lags up to ``reach`` are averaged in blocks of
+    Lags from ``first`` to ``dense`` each give one regressor. Longer lags up to ``max_lag`` are averaged in blocks of
     growing length. Each regressor has the length of the signal.
 
-    Samples before the first one equal it. ``reach`` may be at most the length of the signal.
+    Samples before the first one equal it. ``max_lag`` may be at most the length of the signal.
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
     deviations = padded - signal[0]
     sums = np.concatenate([[0.0], np.cumsum(deviations)])
-    columns = [deviations[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
+    columns = [deviations[count - lag : 2 * count - lag] for lag in range(first, min(dense, max_lag) + 1)]
     start, width = dense + 1, max(2, dense // 4)
-    while start + width <= reach:
+    while start + width <= max_lag:
         end = count - start + 1
         columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
         start, width = start + width, int(width * BLOCK_GROWTH_FACTOR) + 1
     return columns
 
 
-def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
+def first_stage_f(explained: Sequence[Floats], residuals: Sequence[Floats], coefficients: int) -> float:
     """Return the F statistic of the first stage of a two-stage fit, corrected for colored residuals.
 
-    `answers` are the explained parts of an input by run, `missed` the residuals, and `coefficients` is the number of
-    coefficients of the first stage. The statistic is infinite if the residuals are 0.
+    `explained` are the explained parts of an input by run, `residuals` its residuals, and `coefficients` is the number
+    of coefficients of the first stage. The statistic is infinite if the residuals are 0.
     """
-    colour = autoregression(missed, DEFAULT_LAGS)
-    errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
-    level = float(np.mean(errors**2)) / max(float(np.sum(colour)) ** 2, 1e-12)
-    power = sum(float(np.var(a)) * a.size for a in answers)
+    noise_filter = autoregression(residuals, DEFAULT_LAGS)
+    errors = np.concatenate([np.convolve(e - np.mean(e), noise_filter, "valid") for e in residuals])
+    level = float(np.mean(errors**2)) / max(float(np.sum(noise_filter)) ** 2, 1e-12)
+    power = sum(float(np.var(a)) * a.size for a in explained)
     return power / coefficients / level if level > 0 else math.inf
 
 
-def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
+def _columns(references: Sequence[Floats], shortest: int, dense: int) -> Floats:
     """Return a regressor matrix for all runs: past reference samples, then one constant column per run.
 
     Lags reach to half the length `shortest` of the shortest run, and up to `dense` each has its own column.
     """
-    parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
-    levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
+    parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in references]
+    levels = np.repeat(np.eye(len(references)), [r.size for r in references], axis=0)
     return np.hstack([np.concatenate(parts), levels])
 
 
-def _criterion(missed: Floats, coefficients: int) -> float:
-    power = float(np.mean(missed**2))
-    return missed.size * math.log(max(power, 1e-300)) + coefficients * math.log(missed.size)
+def _criterion(residuals: Floats, coefficients: int) -> float:
+    power = float(np.mean(residuals**2))
+    return residuals.size * math.log(max(power, 1e-300)) + coefficients * math.log(residuals.size)
 
 
 def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:

@@ -93,7 +93,7 @@ def with_intervals(
         if all(o in exact or v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in again.noise.items()):
             joint = replace(again, starts=joint.starts, origin=joint.origin)
             continue
-        joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
+        joint = replace(again, origin="a lower optimum found by the search for its intervals")
         before_text, after_text = (
             ", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise)
         )

@@ -78,9 +78,9 @@ def fit_with_instruments(
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         attempt, slopes, instruments = moments
         residuals = np.asarray(attempt.outcome["residuals"])
-        bread = np.linalg.pinv(instruments @ slopes.T)
-        step = -bread @ (instruments @ residuals)
-        errors = np.sqrt(np.diag(_covariance(data_objective, attempt, bread @ instruments)))
+        moment_inverse = np.linalg.pinv(instruments @ slopes.T)
+        step = -moment_inverse @ (instruments @ residuals)
+        errors = np.sqrt(np.diag(_covariance(data_objective, attempt, moment_inverse @ instruments)))
         if np.all(np.abs(step) <= STEP_TOLERANCE_ERRORS * errors):
             converged = True
             break
@@ -204,27 +204,27 @@ def estimate_output_error(
         guess = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
         begins = warm_starts(free, guess)
     # Progress assumes one fit, since a second one (with or without a history) is rare. Profiles take about a third.
-    course = ShareTracker(progress)
+    tracker = ShareTracker(progress)
     joint = joint_fit or fit_with_initial_conditions(
         answers or task.runs,
         structure,
         start,
         threads=threads,
-        progress=course.subtask(0.7, 0.9),
+        progress=tracker.subtask(0.7, 0.9),
         loss=loss,
         guesses=begins,
         alone=alone,
     )
-    course.advance_to(0.7)
+    tracker.advance_to(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     lower: list[Finding] = []
     if answers is not None:
         joint = fit_with_instruments(joint, problem, task.runs, answers)
     else:
         joint, lower = with_intervals(
-            joint, problem, task.runs, intervals, threads=threads, progress=course.subtask(1.0, 0.9), loss=loss
+            joint, problem, task.runs, intervals, threads=threads, progress=tracker.subtask(1.0, 0.9), loss=loss
         )
-    course.advance_to(1.0)
+    tracker.advance_to(1.0)
     findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
     if answers is None:
         findings += multistart_findings(joint, problem, task.runs)
@@ -347,8 +347,8 @@ def prior_findings(
         (output,) = part.outputs
         records = prepare(task.runs, part, m, power_of_two=settings.needs_haar)
         outputs = np.concatenate([record.of(output) for record in records])
-        still = np.abs(outputs).sum() if settings.norm == "l1" else np.sqrt(np.mean(outputs**2))
-        share = search.score / float(still)
+        zero_output_score = np.abs(outputs).sum() if settings.norm == "l1" else np.sqrt(np.mean(outputs**2))
+        share = search.score / float(zero_output_score)
         if share > MAX_PRIOR_SCORE_RATIO:
             findings.append(
                 make_finding("prior_decides_ranking", output=output, prior=settings.prior_covariance, share=share)

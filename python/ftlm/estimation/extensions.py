@@ -412,7 +412,7 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     delays = {n: structure.delay.get(n, 0.0) for n in names}
-    late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in delays.items()})
+    delayed_structure = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in delays.items()})
     begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in delays.items()}}
     extensions: list[Extension] = []
 
@@ -443,7 +443,7 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
         rates = dict.fromkeys(structure.coefficient_names, rate)
         fast = {lag_name: -rate} | {n: v * rates.get(n, 1.0) for n, v in unchanged.items()}
     add("lag_fits", partial(with_lag, []), 1, names, local_start=fast, term_text=former)
-    add("delay_fits", lambda: late, len(names), names, local_start=begin)
+    add("delay_fits", lambda: delayed_structure, len(names), names, local_start=begin)
     if known_orders and all(t.order.constant <= equation.order.constant for t in more):
         add("zero_fits", partial(with_terms, more), len(more), names, local_start=unchanged, term_text=terms_text)
     if known_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in more):

@@ -131,9 +131,9 @@ class FreeProblem:
                         others = [free[f] for j, f in enumerate(factors) if j != k]
                         row[count + list(free).index(name)] += term.factor * sign * math.prod(others)
                 rows += [of_order(term.order), row]
-            rubs, more = item.friction, None if item.friction is None else item.friction.stribeck
-            numbers = [] if rubs is None else [rubs.coefficient]
-            for number in numbers + ([] if more is None else [more.coefficient, more.speed]):
+            friction, stribeck = item.friction, None if item.friction is None else item.friction.stribeck
+            numbers = [] if friction is None else [friction.coefficient]
+            for number in numbers + ([] if stribeck is None else [stribeck.coefficient, stribeck.speed]):
                 row = np.zeros(count + len(free) + idle)
                 if isinstance(number, str):
                     row[count + list(free).index(number)] = 1.0
@@ -151,11 +151,11 @@ def core_arguments(structure: Structure) -> Any:
     def order(of: Order) -> tuple[float, list[tuple[str, float]]]:
         return of.constant, list(of.weights)
 
-    def friction(rubs: Friction | None) -> list[tuple[float, str | float]] | None:
-        if rubs is None:
+    def friction(term: Friction | None) -> list[tuple[float, str | float]] | None:
+        if term is None:
             return None
-        more = rubs.stribeck or Stribeck(0.0, 1.0)
-        return [(-rubs.factor, rubs.coefficient), (-more.factor, more.coefficient), (1.0, more.speed)]
+        stribeck = term.stribeck or Stribeck(0.0, 1.0)
+        return [(-term.factor, term.coefficient), (-stribeck.factor, stribeck.coefficient), (1.0, stribeck.speed)]
 
     equations = [
         (

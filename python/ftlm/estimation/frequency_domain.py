@@ -208,20 +208,26 @@ def _fit_response(
             "the fit",
             *duration_bounds(estimate_duration(0.007 * numbers**2 + 2e-6 * numbers * count, 1), DURATION_FACTOR_RANGE),
         )
-    course = ShareTracker(progress)
+    tracker = ShareTracker(progress)
     words = problem.constraints()[2]
     PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
     # The multistart uses a subset of the frequencies. Only its best candidate is fitted to all of them.
-    few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
-    racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else problem.with_records(few, light)
-    guesses = _user_start(racing, start)
-    guesses += [] if alone else racing.initial_guesses()
-    course.advance_to(STARTS_END_FRACTION)
+    subsampled_records, subsampled_weights = zip(
+        *(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True
+    )
+    multistart_problem = (
+        problem
+        if count <= 2 * MAX_MULTISTART_FREQUENCIES
+        else problem.with_records(subsampled_records, subsampled_weights)
+    )
+    guesses = _user_start(multistart_problem, start)
+    guesses += [] if alone else multistart_problem.initial_guesses()
+    tracker.advance_to(STARTS_END_FRACTION)
     fits = []
     for values in guesses:
-        fits.append(_fit(racing, values))
-        course.advance_to(
+        fits.append(_fit(multistart_problem, values))
+        tracker.advance_to(
             STARTS_END_FRACTION + (MULTISTART_END_FRACTION - STARTS_END_FRACTION) * len(fits) / len(guesses)
         )
     fits = [f for f in fits if math.isfinite(f.cost)]
@@ -235,17 +241,20 @@ def _fit_response(
         f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
     # Another fit from the best optimum continues steps that a bound has shortened.
-    best = _fit_again(problem, racing, first)
-    if racing is problem and first.cost < best.cost:
+    best = _fit_again(problem, multistart_problem, first)
+    if multistart_problem is problem and first.cost < best.cost:
         best = first
     if start is None and np.any((placed := problem.sort_groups(best.values)) != best.values):
         best = _fit(problem, placed)
-    course.advance_to(1.0)
+    tracker.advance_to(1.0)
     active_bounds = [words[k] for k in best.active_constraints]
     at_limit = [n for n in problem.exponents if exponent_bound(n) in active_bounds]
     if at_limit and not _is_bound_significant(problem, records, best, kind):
         active_bounds = [text for text in active_bounds if text not in map(exponent_bound, at_limit)]
-    ends = [f if racing is problem else _fit_again(problem, racing, f) for f in _near_optima(fits, racing, kind)]
+    ends = [
+        f if multistart_problem is problem else _fit_again(problem, multistart_problem, f)
+        for f in _near_optima(fits, multistart_problem, kind)
+    ]
     return _result(
         problem,
         records,
@@ -543,11 +552,13 @@ def _result(
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
     findings += [make_finding("response_on_bound", bound=bound) for bound in active_bounds]
-    falls = [(end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in ends]
+    likelihood_differences = [
+        (end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in ends
+    ]
     optima = [
-        (problem.in_seconds(end.values), fall, errors_of(covariance_at(end)))
-        for end, fall in falls
-        if fall <= SECOND_OPTIMUM_LOG_LIKELIHOOD
+        (problem.in_seconds(end.values), difference, errors_of(covariance_at(end)))
+        for end, difference in likelihood_differences
+        if difference <= SECOND_OPTIMUM_LOG_LIKELIHOOD
     ]
     findings += second_optimum_findings(problem.names, values, standard, optima)
     findings += _identifiability_findings(problem, values, standard)
@@ -619,8 +630,8 @@ def _identifiability_findings(problem: ResponseProblem, values: Floats, standard
         out.append(make_finding("response_not_separately_identifiable", parameter=", ".join(unidentifiable)))
     for name, value in zip(problem.names, values.tolist(), strict=True):
         error = standard[name]
-        vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
-        if math.isfinite(error) and vague:
+        is_uncertain = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
+        if math.isfinite(error) and is_uncertain:
             out.append(make_finding("response_parameter_imprecise", parameter=name, value=value, error=error))
     return out
 

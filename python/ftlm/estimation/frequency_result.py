@@ -167,11 +167,11 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> L
     omega = record.frequency[order]
     response = model_response(model, record, omega)
     size = np.abs(record.response[order])
-    missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
+    relative_errors = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     hertz = is_impedance(record)
     return LineChart(
         omega / (2.0 * math.pi) if hertz else omega,
-        [("real part", missed.real), ("imaginary part", missed.imag)],
+        [("real part", relative_errors.real), ("imaginary part", relative_errors.imag)],
         log_x=True,
         width=SMALL_WIDTH_PX,
         height=220,
@@ -633,13 +633,13 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
 def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     """Return the relative error of a model on one measured frequency response."""
     size = np.abs(record.response)
-    missed = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
+    relative_errors = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
         size > 0, size, np.max(size) or 1.0
     )
-    at = int(np.argmax(missed))
-    rms = 100 * float(np.sqrt(np.mean(missed**2)))
+    at = int(np.argmax(relative_errors))
+    rms = 100 * float(np.sqrt(np.mean(relative_errors**2)))
     return ResponseError(
-        record.name, record.output, record.input, rms, 100 * float(missed[at]), float(record.frequency[at])
+        record.name, record.output, record.input, rms, 100 * float(relative_errors[at]), float(record.frequency[at])
     )
 
 

@@ -173,27 +173,27 @@ class GeneticProblem:
 
     def round_orders(self, genes: Floats) -> Floats:
         """Return genes whose orders are rounded to the resolution with which candidates are evaluated."""
-        tidied = np.array(genes, dtype=np.float64)
+        rounded = np.array(genes, dtype=np.float64)
         n = len(self.order_names)
-        tidied[:, :n] = np.round(tidied[:, :n] / ORDER_RESOLUTION) * ORDER_RESOLUTION
-        return tidied
+        rounded[:, :n] = np.round(rounded[:, :n] / ORDER_RESOLUTION) * ORDER_RESOLUTION
+        return rounded
 
     def errors(self, genes: Floats, limit: float) -> Floats:
         """Return the simulation error of the candidate in each row of genes; infinite if it exceeds the limit."""
-        tidied, total = self.round_orders(genes), np.zeros(genes.shape[0])
+        rounded, total = self.round_orders(genes), np.zeros(genes.shape[0])
         for part in self.rows:
-            rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
+            rows = np.ascontiguousarray(part.candidates(rounded, repaired=not self.law))
             total += part.points.scores(rows, limit * part.scale, self.threads) / part.scale
         return np.where(total <= limit, total, np.inf)
 
     def values_by_name(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
         """Return orders and coefficients of one row of genes, by name."""
-        tidied = self.round_orders(genes[None, :])
+        rounded = self.round_orders(genes[None, :])
         n = len(self.order_names)
-        values = dict(zip(self.names, tidied[0].tolist(), strict=True))
+        values = dict(zip(self.names, rounded[0].tolist(), strict=True))
         if not self.law:
             part = self.rows[0]
-            row = part.candidates(tidied, repaired=True)[0]
+            row = part.candidates(rounded, repaired=True)[0]
             for column, value in enumerate(row[: 1 + part.own.size].tolist()):
                 gene = np.flatnonzero(part.weights[:n, column])
                 if gene.size:
@@ -555,9 +555,9 @@ class GeneticAlgorithm:
         )
         free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
         names = [n for own in free.values() for n in own]
-        strange = [n for n in self.bounds if n not in names]
-        if strange:
-            raise ModelError(f"bounds of {strange[0]!r}: not a free parameter; free are {', '.join(names)}")
+        unknown = [n for n in self.bounds if n not in names]
+        if unknown:
+            raise ModelError(f"bounds of {unknown[0]!r}: not a free parameter; free are {', '.join(names)}")
         record = prepare(task.runs, structure, m, power_of_two=True)[0]
         ends = {}
         for name, part in parts.items():

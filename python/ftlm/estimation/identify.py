@@ -212,16 +212,16 @@ def _fit_runs(
             )
         return fit
 
-    light, initial_condition_fits = (
+    preliminary_method, initial_condition_fits = (
         getattr(estimator, "hypothesis", None),
         InitialConditionFits(estimate, may_add_offset),
     )
-    if light is not None:
-        course = ShareTracker(progress)
+    if preliminary_method is not None:
+        tracker = ShareTracker(progress)
         initial_condition_fits = InitialConditionFits(
-            partial(estimate, method=light, report=course.subtask(INITIAL_CONDITIONS_SHARE, 0.9)),
+            partial(estimate, method=preliminary_method, report=tracker.subtask(INITIAL_CONDITIONS_SHARE, 0.9)),
             may_add_offset,
-            lambda request, joint: estimate(request, report=course.subtask(1.0, 1.0), fitted=joint),
+            lambda request, joint: estimate(request, report=tracker.subtask(1.0, 1.0), fitted=joint),
         )
     return fit_with_offset_decision(runs, structure, estimate, initial_condition_fits)
 
@@ -445,11 +445,11 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
     plain = fit.task.structure.is_linear and all(run.sample_times is None for run in runs)
     if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not plain:
         return tests
-    answers = [
+    noise_free_runs = [
         run_with_inputs(run, {n: run[n] - np.pad(v[k], 1) for n, v in fed.items()}) for k, run in enumerate(runs)
     ]
     problem = FreeProblem.of(replace(fit.task.structure, initial=fit.joint.initial))
-    bias = feedback_bias(fit.joint, problem, runs, answers)
+    bias = feedback_bias(fit.joint, problem, runs, noise_free_runs)
     outputs = {
         name: replace(
             o, feedback_tests={n: replace(t, bias=bias) if t.has_feedback else t for n, t in o.feedback_tests.items()}

@@ -119,12 +119,14 @@ class InitialConditionFits:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
-        near = refit_after_screening(joint, runs, request, accepts)
-        if near is None:
+        refit_joint = refit_after_screening(joint, runs, request, accepts)
+        if refit_joint is None:
             return None
-        self.joint_fits[near.initial, request.offset] = near
+        self.joint_fits[refit_joint.initial, request.offset] = refit_joint
         return (
-            None if not accepts(near) else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+            None
+            if not accepts(refit_joint)
+            else replace(fit, joint=replace(refit_joint, starts=joint.starts, origin=joint.origin))
         )
 
 
@@ -178,8 +180,8 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
         return None
     whole = _fit_in_motion(candidate, request, fits) or fits.with_intervals(request, candidate)
-    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
-    return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **about)])
+    context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
+    return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **context)])
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
@@ -245,8 +247,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
         try:
             # With integer orders, automatic guesses cost little and lead to the best optimum.
             fresh = candidate is None and (is_suggested or not has_memory(structure))
-            near = fit if candidate is None else candidate[1]
-            level = fits.fit(request) if fresh else fits.refit(request, near, is_preferred)
+            previous_fit = fit if candidate is None else candidate[1]
+            level = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
                 # There is no optimum under these initial conditions near the optimum under the others.
                 level = fits.fit(request)
@@ -270,8 +272,8 @@ def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bo
     if is_rest_rejected and initial != "rest":
         findings.append(make_finding("rest_rejected", run=names))
     if fit.task.structure.offset == "level" and structure.offset != "level":
-        was = "rested" if initial == "rest" else "moved"
-        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=was))
+        verb = "rested" if initial == "rest" else "moved"
+        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=verb))
     model = replace(fit.model, structure=replace(fit.model.structure, initial=structure.initial))
     return replace(fit, model=model, findings=findings)
 
@@ -323,12 +325,12 @@ def _history_offset_findings(fit: Fit) -> list[Finding]:
     joint, structure = fit.joint, fit.task.structure
     if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):
         return []
-    few = fit_without_history(joint, fit.task.runs, structure)
-    if few is None:
+    joint_without_history = fit_without_history(joint, fit.task.runs, structure)
+    if joint_without_history is None:
         return []
-    less = joint.initial_terms - few.initial_terms
+    fewer_terms = joint.initial_terms - joint_without_history.initial_terms
     outputs = ", ".join(fit.model.outputs)
-    return [make_finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
+    return [make_finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=fewer_terms)]
 
 
 def fit_offset_test(fit: Fit) -> OffsetTest | None:

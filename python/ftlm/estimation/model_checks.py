@@ -265,11 +265,11 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
     """
     exact = joint.exact_outputs(runs)
     outputs = [o for o in problem.structure.outputs if o not in exact]
-    coloured = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
+    colored_outputs = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
     findings = []
     if outputs and not joint.step_converged:
         findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
-    findings += [make_finding("residuals_not_white", output=output) for output in coloured]
+    findings += [make_finding("residuals_not_white", output=output) for output in colored_outputs]
     for output in outputs:
         findings += _outlier_findings(runs, problem.structure, joint, output)
         findings += _quantization_findings(runs, problem.structure, output, joint.noise[output])
@@ -299,8 +299,8 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
             findings.append(make_finding("rest_assumed", run=run.name, input=inputs, row=row, shown=levels))
         elif evidence.rows and resolved.offset == "level":
             driven = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
-            beside = f" with {enumerate_names(driven)}" if driven else ""
-            level_text = f"the run rests at {levels}{beside}"
+            other_inputs = f" with {enumerate_names(driven)}" if driven else ""
+            level_text = f"the run rests at {levels}{other_inputs}"
             findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=level_text))
         findings += _early_output_findings(run, structure, evidence)
     return findings
@@ -361,7 +361,7 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
         share < MIN_OUTLIER_POWER_FRACTION and far < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)
     ):
         return []
-    verb, holds, noun = ("lies", "holds", "an outlier") if far == 1 else ("lie", "hold", "outliers")
+    verb, holds, noun = ("lies", "contributes", "an outlier") if far == 1 else ("lie", "contribute", "outliers")
     return [
         make_finding(
             "outliers_dominate" if share >= MIN_OUTLIER_POWER_FRACTION else "outliers",
@@ -432,15 +432,15 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
     # Negated so that a NaN standard error counts as too large.
-    vague = [
+    uncertain = [
         i
         for i, n in enumerate(joint.names)
         if not errors[n] <= MAX_RELATIVE_STANDARD_ERROR * (1.0 if n in joint.orders else sizes[n])
     ]
     groups: list[list[int]] = []
-    for i in vague:
-        tied = [g for g in groups if any(_are_inseparable(joint, correlation, i, j) for j in g)]
-        groups = [g for g in groups if g not in tied] + [sorted([*(j for g in tied for j in g), i])]
+    for i in uncertain:
+        inseparable = [g for g in groups if any(_are_inseparable(joint, correlation, i, j) for j in g)]
+        groups = [g for g in groups if g not in inseparable] + [sorted([*(j for g in inseparable for j in g), i])]
     findings = []
     for group in (g for g in groups if len(g) > 1):
         *most, last = (joint.names[i] for i in group)
@@ -579,10 +579,10 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
     if not model.structure.is_linear:
         return []
     try:
-        swings = [m for m in modes(model, coupling=model.structure.coupling) if m.oscillatory]
+        oscillatory_modes = [m for m in modes(model, coupling=model.structure.coupling) if m.oscillatory]
     except FtlmError:
         return []
-    fastest = max((m.frequency for m in swings if abs(m.damping) < MAX_SWING_DAMPING), default=0.0)
+    fastest = max((m.frequency for m in oscillatory_modes if abs(m.damping) < MAX_SWING_DAMPING), default=0.0)
     if not fastest > 0.0:
         return []
     samples = 2.0 * math.pi / (fastest * max(run.step for run in runs))

@@ -213,9 +213,9 @@ def offset_test(
     # The sensitivities are orthogonal to the responses to initial terms. These responses are regressors as well,
     # because the regression under colored noise estimates the initial terms again.
     common = np.column_stack([basis, *_initial_responses(point, blocks, residuals.size)])
-    few, many = (np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part])))
+    nested, full = (np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part])))
     by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
-    statistic = _core.prediction_ratio(few, many, residuals, by_output, DEFAULT_LAGS)
+    statistic = _core.prediction_ratio(nested, full, residuals, by_output, DEFAULT_LAGS)
     explained = basis_part @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in grid.weights]
@@ -481,11 +481,11 @@ def _pooled_residuals(joint: JointFit) -> list[Floats]:
 def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Structure, *, refine: bool) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
 
-    def suffices(few: JointFit) -> bool:
-        return not _fit_needs_history(few, joint, runs, structure)
+    def suffices(simplified: JointFit) -> bool:
+        return not _fit_needs_history(simplified, joint, runs, structure)
 
-    few = refit_after_screening(joint, runs, replace(structure, initial="caputo"), suffices, refine=refine)
-    return joint if few is None or not suffices(few) else few
+    simplified = refit_after_screening(joint, runs, replace(structure, initial="caputo"), suffices, refine=refine)
+    return joint if simplified is None or not suffices(simplified) else simplified
 
 
 def _fit_without_implausible_history(
@@ -503,10 +503,10 @@ def _fit_without_implausible_history(
         under_prior = start_score(residuals, 0, residuals)
         if under_prior - start_score(_pooled_residuals(joint), 0, residuals) < START_SETTINGS.history_margin:
             return None
-        few = fit_caputo()
+        caputo = fit_caputo()
     except FtlmError:
         return None
-    return few if start_score(_pooled_residuals(few), 0, residuals) < under_prior else None
+    return caputo if start_score(_pooled_residuals(caputo), 0, residuals) < under_prior else None
 
 
 def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
@@ -591,9 +591,9 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
 
 def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether a fit with few initial terms has significantly larger residuals than one with many."""
-    ours, theirs = _pooled_residuals(few), _pooled_residuals(many)
+    caputo_residuals, history_residuals = _pooled_residuals(few), _pooled_residuals(many)
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
-    return needs_history(structure, ours, theirs, sizes, (few.initial_terms, many.initial_terms))
+    return needs_history(structure, caputo_residuals, history_residuals, sizes, (few.initial_terms, many.initial_terms))
 
 
 def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

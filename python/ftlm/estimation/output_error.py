@@ -377,7 +377,7 @@ def level_count(runs: Sequence[Run], structure: Structure) -> int:
 def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
     """Return the data of a fit by name, from which the core restores its objective and optimum."""
     # If an unstable optimum was discarded, the core must not return to it.
-    steady = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
+    prefers_stable = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
     return {
         "estimate": joint.values,
         "on_grid": joint.finest_grid_values,
@@ -385,7 +385,7 @@ def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
         "shares": joint.robust_weights,
         "every": joint.refinement,
         "settled": joint.step_converged,
-        "steady": steady,
+        "steady": prefers_stable,
     }
 
 
@@ -475,8 +475,8 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     )
     problem = FreeProblem.of(structure)
     if set(problem.names) != set(parameter_set.names):
-        odd = sorted(set(problem.names) ^ set(parameter_set.names))
+        differing = sorted(set(problem.names) ^ set(parameter_set.names))
         raise ModelError(
-            f"the fit results that the model stores contradict its equations: {odd[0]}; identify the model again"
+            f"the fit results that the model stores contradict its equations: {differing[0]}; identify the model again"
         )
     return problem, [values[n] for n in problem.names]

@@ -347,10 +347,10 @@ def _points(problem: ResponseProblem) -> Floats:
     fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
     room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
     count = len(axes)
-    lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, has_values, strict=True)], initial=1))
+    grid_size = int(np.prod([len(a) if g else 1 for a, g in zip(axes, has_values, strict=True)], initial=1))
     free = count - sum(has_values)
-    each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
-    if (free and each < 4) or (not free and lattice > room):
+    each = int(np.floor((room / max(grid_size, 1)) ** (1.0 / free))) if free and grid_size <= room else 0
+    if (free and each < 4) or (not free and grid_size > room):
         # For too many axes, a deterministic low-discrepancy sequence replaces the grid.
         spread = halton(room, count)
         columns = [
@@ -480,7 +480,7 @@ def _equation(
     weight = np.concatenate([r.weight for r in records])
     goal, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
     matrix = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
-    ours = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
+    denominator_parts = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
     slowest = _slowest(problem, item, points)
     bottom = 1.0 + np.abs(powers) + 0j
     answers = np.zeros((len(points), len(names)))
@@ -498,7 +498,9 @@ def _equation(
                     others = np.delete(matrix[is_finite], k, axis=2)
                     solved = _least_squares(others * scaled[is_finite][..., None], rest * scaled[is_finite])
                     answers[is_finite] = np.insert(solved, k, high_terms, axis=1)
-            bottom = powers - sum((answers[:, [names.index(n)]] * part for n, part in ours.items()), 0.0 * powers)
+            bottom = powers - sum(
+                (answers[:, [names.index(n)]] * part for n, part in denominator_parts.items()), 0.0 * powers
+            )
             missed = goal if matrix is None else goal - np.einsum("bnp,bp->bn", matrix, answers)
             cost = np.sum(np.abs(missed / bottom * weight) ** 2, axis=1)
     return answers, cost

@@ -69,15 +69,15 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
     unknown, or a simulation fails. It is also None if samples are nonuniform, too few or too far apart for the growth.
     """
     try:
-        growing = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]
+        growth_rates = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]
     except FtlmError:
         return None
     step = max(run.step for run in runs)
-    if not growing or max(growing) * MIN_PIECE_SAMPLES * step > MAX_GROWTH_EXPONENT:
+    if not growth_rates or max(growth_rates) * MIN_PIECE_SAMPLES * step > MAX_GROWTH_EXPONENT:
         return None
     shortest = min(run.length * run.step for run in runs)
-    seconds = max(PIECE_TIME_CONSTANTS / max(growing), MIN_PIECE_SAMPLES * step)
-    if shortest < seconds and shortest * max(growing) >= MIN_PIECE_TIME_CONSTANTS:
+    seconds = max(PIECE_TIME_CONSTANTS / max(growth_rates), MIN_PIECE_SAMPLES * step)
+    if shortest < seconds and shortest * max(growth_rates) >= MIN_PIECE_TIME_CONSTANTS:
         seconds = shortest
     pieces = [
         run.window(k * seconds, min((k + 1) * seconds, run.length * run.step))
@@ -98,8 +98,8 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
         residuals = [y - simulated.outputs[k] for y, simulated in zip(outputs, free, strict=True)]
         power = sum(float(np.nansum((y - np.nanmean(y)) ** 2)) for y in outputs)
         with np.errstate(over="ignore", invalid="ignore"):
-            missed = sum(float(np.nansum(e**2)) for e in residuals)
-        ratios.append(math.sqrt(missed / power) if power > 0 and math.isfinite(missed) else math.inf)
+            residual_power = sum(float(np.nansum(e**2)) for e in residuals)
+        ratios.append(math.sqrt(residual_power / power) if power > 0 and math.isfinite(residual_power) else math.inf)
     return PieceTest(seconds, max(ratios))
 
 
@@ -111,13 +111,13 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
     if not model.structure.is_linear:
         return []
     explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
-    grows = any(f.code == "simulation_unbounded" for f in stability_findings(model))
-    if grows:
+    is_unstable = any(f.code == "simulation_unbounded" for f in stability_findings(model))
+    if is_unstable:
         test = piece_test(model, runs)
         if test is not None and test.passed:
             code = "plant_unstable" if explained and fit.joint is not None else "plant_unstable_in_pieces"
             return [make_finding(code, fit=test.fit, seconds=test.seconds)]
-    if (explained and not grows) or fit.joint is None:
+    if (explained and not is_unstable) or fit.joint is None:
         return []
     test = least_squares_piece_test(runs, fit.task.structure.with_orders(model.orders), model.units)
     return [] if test is None else [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]

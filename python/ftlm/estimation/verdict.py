@@ -173,8 +173,8 @@ def _combined_verdict(
 
     None if no finding is a warning. `method` is the name of the estimation method.
     """
-    buried = [f.output for f in own if f.code in POOR_FIT_CODES]
-    findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
+    reported = [f.output for f in own if f.code in POOR_FIT_CODES]
+    findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, reported)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
     # A remedy must not suggest the method that was used.
     findings = [replace(f, method=method) for f in findings]
@@ -210,7 +210,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     if judgement is not None:
         return judgement
     fits = ", ".join(f"{o} {f.fit:.4g} %" for c in validation for o, f in c.output_error.items())
-    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), and no finding speaks against its fit")
+    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), with no finding against its fit")
 
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
@@ -249,13 +249,13 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     yield from _residuals(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")
-    vague = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
-    if vague:
-        text = enumerate_names([_format_uncertain(result, n) for n in vague])
-        yield make_finding("parameter_imprecise", parameter=", ".join(vague), shown=text)
-    endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
-    if endless:
-        yield make_finding("interval_open", parameter=enumerate_names(endless), sides=", ".join(endless))
+    uncertain = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
+    if uncertain:
+        text = enumerate_names([_format_uncertain(result, n) for n in uncertain])
+        yield make_finding("parameter_imprecise", parameter=", ".join(uncertain), shown=text)
+    unbounded = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
+    if unbounded:
+        yield make_finding("interval_open", parameter=enumerate_names(unbounded), sides=", ".join(unbounded))
     runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
     outputs = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
     if outputs:
@@ -280,9 +280,9 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
     if outputs:
         yield make_finding("out_of_range", output=", ".join(outputs))
     yield from _unstable_poles(result.model)
-    buried = [f for f in result.findings if f.code in POOR_FIT_CODES]
-    yield from _poor_fits("", result.comparison, [f.output for f in buried])
-    yield from buried
+    reported = [f for f in result.findings if f.code in POOR_FIT_CODES]
+    yield from _poor_fits("", result.comparison, [f.output for f in reported])
+    yield from reported
 
 
 def _unstable_poles(model: Model) -> Iterator[Finding]:
@@ -360,17 +360,17 @@ def is_buried(residuals: OutputResiduals) -> bool:
     return explained and residuals.whiteness.passed and bool(moving) and all(t.passed for t in moving)
 
 
-def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -> Iterator[Finding]:
+def _poor_fits(where: str, comparison: Comparison, reported: Sequence[str] = ()) -> Iterator[Finding]:
     """Yield a finding on the outputs whose NR exceeds `MAX_NORMALIZED_RESIDUAL` over all runs, or else in one run.
 
-    Each run is also tested by itself, because runs with large signals dominate the total. `buried` are outputs that are
-    not tested.
+    Each run is also tested by itself, because runs with large signals dominate the total. `reported` are outputs that
+    are not tested.
     """
     for run, errors in _each(comparison):
-        useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in buried]
-        if useless:
-            text = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
-            yield make_finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=text)
+        poor_outputs = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in reported]
+        if poor_outputs:
+            text = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in poor_outputs)
+            yield make_finding("poor_fit", run=run, output=", ".join(poor_outputs), where=where, shown=text)
             return
 
 
@@ -409,13 +409,14 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
             yield make_finding("too_short_for_tests")
         return
-    looped = has_loop_noise_model(result.settings)
+    has_loop_model = has_loop_noise_model(result.settings)
     outputs = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
     # Residuals of an incomplete model under a periodic input resemble feedback, so missing terms come first.
     coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in outputs]
-    unread = {(f.output, f.input) for f in coupled}
+    missing_couplings = {(f.output, f.input) for f in coupled}
     following = {
-        o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in unread] for o, r in outputs.items()
+        o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in missing_couplings]
+        for o, r in outputs.items()
     }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
@@ -426,8 +427,10 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in outputs)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in outputs)
     # Such a fit is consistent under colored noise, so color alone is no finding.
-    coloured = [] if looped else [o for o, r in outputs.items() if not (r.whiteness.passed or r.is_noise)]
-    yield from (make_finding("residuals_not_white", output=o) for o in coloured)
+    colored_outputs = (
+        [] if has_loop_model else [o for o, r in outputs.items() if not (r.whiteness.passed or r.is_noise)]
+    )
+    yield from (make_finding("residuals_not_white", output=o) for o in colored_outputs)
 
 
 def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:

@@ -270,12 +270,12 @@ def design_input(
     if isinstance(progress, Progress):
         size = len(fit.names) * len(fit.outputs) * task.rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
-    course = ShareTracker(progress)
+    tracker = ShareTracker(progress)
     sensitivities = Sensitivities.of(fit, task.step, task.rows - 1, bounds.ramp_samples(task.step))
-    course.advance_to(0.05)
+    tracker.advance_to(0.05)
     spectrum = best_spectrum(spectral_lines(fit, bounds, task.step, task.rows - 1), goal)
-    course.advance_to(0.15)
-    designs = _design_candidates(task, sensitivities, spectrum, course)
+    tracker.advance_to(0.15)
+    designs = _design_candidates(task, sensitivities, spectrum, tracker)
     plain = np.stack([p * square_wave(task.rows - 1, task.period) for p in bounds.peaks.values()])
     reference = fit.run(
         sensitivities.rig_commands(plain), task.step, f"square of period {task.period * task.step:.4g} s"
@@ -286,7 +286,7 @@ def design_input(
     run = fit.run(sensitivities.rig_commands(commands), task.step, "designed")
     errors = _errors(fit, reference, run)
     ratios = np.log(errors["square"][list(at)]) - np.log(errors["designed"][list(at)])
-    course.advance_to(1.0)
+    tracker.advance_to(1.0)
     return DesignedInput(
         run=run,
         reference=reference,
@@ -305,7 +305,7 @@ def design_input(
 
 
 def _design_candidates(
-    task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, course: ShareTracker
+    task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, tracker: ShareTracker
 ) -> list[Design]:
     """Return all candidate inputs, best first: initial inputs, and results of the exchange algorithm from the best.
 
@@ -338,7 +338,7 @@ def _design_candidates(
     ends = []
     for place, design in enumerate(starts):
         ends.append(exchange_holds(design, coarse, sensitivities, goal, bounds, raise_if_cancelled))
-        course.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
+        tracker.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
     best = max(ends, key=lambda d: d.score)
     for place, finer in enumerate(HOLD_DIVISORS[1:]):
         hold = max(sensitivities.ramp, 1, coarse // finer)
@@ -346,7 +346,7 @@ def _design_candidates(
             continue
         further = exchange_holds(best, hold, sensitivities, goal, bounds, raise_if_cancelled)
         best = further if further.score > best.score else best
-        course.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
+        tracker.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
     ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]
     return sorted([*feasible, *ends], key=lambda d: -d.score)
 
@@ -362,14 +362,14 @@ def _bounds_of(
 
     Raise ModelError if a limit is missing or invalid.
     """
-    peaks, swings = None, dict.fromkeys(fit.outputs, math.inf)
+    peaks, output_limits = None, dict.fromkeys(fit.outputs, math.inf)
     if reference_run is not None:
         peaks = _largest_values(reference_run, fit.inputs, from_start=False)
-        swings |= _largest_values(reference_run, fit.outputs, from_start=True)
+        output_limits |= _largest_values(reference_run, fit.outputs, from_start=True)
     bounds = Bounds(
         per_signal_values("peak", peak, fit.inputs, peaks),
         per_signal_values("slew", slew, fit.inputs, dict.fromkeys(fit.inputs, math.inf)),
-        per_signal_values("limits", limits, fit.outputs, swings),
+        per_signal_values("limits", limits, fit.outputs, output_limits),
     )
     for name, value in bounds.peaks.items():
         if math.isinf(value):
@@ -399,9 +399,9 @@ def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, .
     """
     findings = () if model.estimate is None else model.estimate.findings
     missing = [f for f in findings if f.code in LEFT_OUT_CODES]
-    doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
-    if doubt is not None:
-        return (make_finding("prediction_in_doubt", output=doubt.output, text=doubt.text),)
+    finding = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
+    if finding is not None:
+        return (make_finding("prediction_in_doubt", output=finding.output, text=finding.text),)
     colour = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
     if colour is None or noise_given:
         return ()
@@ -507,13 +507,13 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
     """
     spread = fit.covariance
     errors = np.sqrt(np.diag(spread))
-    vague = [
+    uncertain = [
         f"{n} = {v:.3g} ± {e:.2g}"
         for n, v, e in zip(fit.names, fit.values, errors, strict=True)
         if n in fit.problem.orders and not e <= MAX_ORDER_ERROR
     ]
-    if vague:
-        _raise_too_uncertain(fit, f"order {vague[0]}", (step, length))
+    if uncertain:
+        _raise_too_uncertain(fit, f"order {uncertain[0]}", (step, length))
     rows = min(max(round(length / step), MIN_RUN_SAMPLES), 2000)
     coarse = length / rows
     probe = np.stack([np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(fit.inputs))])

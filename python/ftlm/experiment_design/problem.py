@@ -96,15 +96,15 @@ class Criterion:
         p = len(information)
         size = np.sqrt(np.diag(information))
         whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
-        arms = whole[:, self.indices] / np.asarray(self.units)
-        block = arms[list(self.indices)] / np.asarray(self.units)[:, None]
+        covariance_rows = whole[:, self.indices] / np.asarray(self.units)
+        block = covariance_rows[list(self.indices)] / np.asarray(self.units)[:, None]
         axes, turn = np.linalg.eigh(0.5 * (block + block.T))
         axes = np.maximum(axes, np.finfo(np.float64).tiny)
         power = KIEFER_MEAN_EXPONENT if self.kind == "E" else 0
         share = (axes / axes[-1]) ** power
         weights = share / axes / np.sum(share)
-        lever = arms @ turn
-        return np.asarray((lever * weights) @ lever.T).reshape(p, p)
+        rotated_rows = covariance_rows @ turn
+        return np.asarray((rotated_rows * weights) @ rotated_rows.T).reshape(p, p)
 
     def _inverse(self, information: Floats) -> Floats:
         """Return the covariance matrix of the scaled parameters of interest for each information matrix (…, p, p).
@@ -430,8 +430,8 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     )
     problem = FreeProblem.of(replace(structure, equations=equations, offset="none"))
     values = dict(zip(fit.names, fit.values, strict=True))
-    still = fit.run(np.zeros((len(fit.inputs), rows + 2)), step, "still")
-    run = still.with_outputs(shapes)
+    zero_run = fit.run(np.zeros((len(fit.inputs), rows + 2)), step, "still")
+    run = zero_run.with_outputs(shapes)
     derivatives = _derivatives(
         problem,
         tuple(values.get(n, 0.0) for n in problem.names),

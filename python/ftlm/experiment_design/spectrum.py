@@ -88,16 +88,16 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
     frequencies = numbers / (rows * step)
     slopes, gains = _response_sensitivities(fit, 2 * math.pi * frequencies, step)
     peaks = np.array(list(bounds.peaks.values()))
-    swings = np.array(list(bounds.output_limits.values()))
+    output_limits = np.array(list(bounds.output_limits.values()))
     weights = 1.0 / np.array([fit.noise[o] for o in fit.outputs])
     information = (
         np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
     )
     count = len(inputs)
-    costs = np.zeros((count + len(swings), count, len(numbers)))
+    costs = np.zeros((count + len(output_limits), count, len(numbers)))
     for k in range(count):
         costs[k, k] = 1.0
-    costs[count:] = (np.abs(gains) * peaks[:, None] / swings[:, None, None]) ** 2
+    costs[count:] = (np.abs(gains) * peaks[:, None] / output_limits[:, None, None]) ** 2
     groups = [(k, np.arange(k, len(numbers), count)) for k in range(count)]
     return SpectralLines(
         np.concatenate([frequencies[at] for _, at in groups]),

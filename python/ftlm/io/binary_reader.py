@@ -511,7 +511,7 @@ READERS_BY_FORMAT = {
 }
 
 
-def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) -> int:
+def write_result(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) -> int:
     """Write the answer for one file to `out`: header with arrays or cells, or an error.
 
     Return the number of bytes of arrays and cells. `budget` limits the size of the arrays as float64 [bytes].
@@ -550,7 +550,7 @@ def main(arguments: list[str]) -> None:
     options = json.loads(text)
     budget = SIZE_LIMIT
     for path in paths:
-        budget -= answer(kind, path, sys.stdout.buffer, budget, options["sheet"])
+        budget -= write_result(kind, path, sys.stdout.buffer, budget, options["sheet"])
 
 
 if __name__ == "__main__":

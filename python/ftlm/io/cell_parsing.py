@@ -189,8 +189,8 @@ def _match_timestamp(cell: str) -> re.Match[str] | None:
         return None
     groups = match.groups("")
     hour, minute, second, fraction, half, _ = groups[4:10] if groups[1] else groups[10:16]
-    late = hour == "24" and int(f"0{minute}{second}{fraction}") > 0
-    return None if late or (half and int(hour) > 12) else match
+    is_after_midnight = hour == "24" and int(f"0{minute}{second}{fraction}") > 0
+    return None if is_after_midnight or (half and int(hour) > 12) else match
 
 
 @dataclass(frozen=True)

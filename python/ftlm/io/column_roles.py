@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ftlm.data.units import parse_unit
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.io.table import Column, Pool
+from ftlm.io.table import Column, ColumnTable
 from ftlm.utils.parameters import NAMED_COLUMNS, parameter
 from ftlm.utils.validation import CSV_TIME, join_names
 
@@ -95,20 +95,20 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         [c for c, words in words_by_column.items() if words & _WORDS_BY_ROLE[role]]
         for role in ("input", "output", "input or output")
     )
-    drives, follows = [c for c in inputs if c not in outputs], [c for c in outputs if c not in inputs]
-    either = [c for c in both if c not in drives and c not in follows]
-    if either and not drives:
-        drives, either = either, []
-    rest = [c for c in columns if c not in drives and c not in follows]
+    input_columns, output_columns = [c for c in inputs if c not in outputs], [c for c in outputs if c not in inputs]
+    either = [c for c in both if c not in input_columns and c not in output_columns]
+    if either and not input_columns:
+        input_columns, either = either, []
+    rest = [c for c in columns if c not in input_columns and c not in output_columns]
     if len(rest) == 1 and rest != either:
-        if drives and not follows:
-            follows, rest = rest, []
-        elif follows and not drives:
-            drives, rest = rest, []
-    if follows and not drives and not rest:
+        if input_columns and not output_columns:
+            output_columns, rest = rest, []
+        elif output_columns and not input_columns:
+            input_columns, rest = rest, []
+    if output_columns and not input_columns and not rest:
         # Outputs without any input are a free response.
-        return [], follows
-    return (drives, follows) if drives and follows else ([], [])
+        return [], output_columns
+    return (input_columns, output_columns) if input_columns and output_columns else ([], [])
 
 
 def known_unit(text: str, column: str = "") -> str:
@@ -173,14 +173,17 @@ def assume_roles(
     if len(own) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in unread):
         # If the input has no numbers, the file is faulty, and the output must not be taken for a free response.
         return ()
-    drives, follows = guess_roles(list(own))
-    names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
-    selection.inputs, selection.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
-    if not follows:
+    input_columns, output_columns = guess_roles(list(own))
+    names = signal_names({**dict.fromkeys(input_columns, "u"), **dict.fromkeys(output_columns, "y")})
+    selection.inputs, selection.outputs = (
+        {names[c]: own[c] for c in input_columns},
+        {names[c]: own[c] for c in output_columns},
+    )
+    if not output_columns:
         return ()
     inputs, outputs = join_names(selection.inputs.values(), 10), join_names(selection.outputs.values(), 10)
     words = f"{inputs} {'is an input' if len(selection.inputs) == 1 else 'are inputs'} of {outputs}, by their names"
-    if not drives:
+    if not input_columns:
         words = (
             f"there is no input of {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
         )
@@ -188,7 +191,7 @@ def assume_roles(
     return (Assumption("inputs", inputs, words, remedy),)
 
 
-def add_file_units(selection: ColumnSelection, pool: Pool) -> None:
+def add_file_units(selection: ColumnSelection, pool: ColumnTable) -> None:
     """Add the units in a file to a selection, in place, for selected columns without a unit."""
     for name, spec in (selection.inputs | selection.outputs).items():
         column = pool.find(spec, f"signal {name!r}")

@@ -153,9 +153,9 @@ def read_text(path: Path, layout: Layout) -> FileTable:
         raise DataError(f"{str(path)!r} cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _read_gzip(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
+def _read_gzip(path: Path, file: BinaryIO, layout: Layout) -> FileTable:
     try:
-        with gzip.GzipFile(fileobj=packed) as stream:
+        with gzip.GzipFile(fileobj=file) as stream:
             table = parse_text(path, _SizeLimitedStream(path, stream), layout)
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(
@@ -381,9 +381,9 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
     names = dialect.names if dialect.names is not None else [f"c{index + 1}" for index in range(dialect.width)]
     columns = []
     for k, (name, column) in enumerate(zip(names, values, strict=True)):
-        trouble, pieces = rows.bad_cells.get(k), rows.moments.get(k)
+        column_errors, pieces = rows.bad_cells.get(k), rows.moments.get(k)
         moments = None if pieces is None else Timestamps.concatenate(pieces)
-        problem = None if trouble is None else trouble.error(name, source)
+        problem = None if column_errors is None else column_errors.error(name, source)
         if pieces is not None and (moments is None or moments.clock.size != rows.count):
             problem = problem or DataError(
                 f"{source}: column {name!r}: dates or times have several notations; write all in the same notation"
@@ -395,7 +395,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
         unit = (
             (dialect.units[k] if dialect.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         )
-        blank = trouble is not None and trouble.blank
+        blank = column_errors is not None and column_errors.blank
         columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, file_unit=unit))
     return columns
 
@@ -463,13 +463,13 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
 def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: str) -> Iterator[tuple[int, list[str]]]:
     """Yield (number of the first line, lines) for blocks of about 8 MB; raise DataError if the text is invalid."""
     decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
-    carry, number_, newline = "", 1, ""
+    incomplete_line, number_, newline = "", 1, ""
     while True:
         block = stream.read(_BLOCK_BYTES)
         try:
-            data = carry + decoder.decode(block, final=not block)
+            data = incomplete_line + decoder.decode(block, final=not block)
         except UnicodeError as error:
-            raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
+            raise _undecodable(path, error, number_ + incomplete_line.count("\n"), encoding) from None
         if not block:
             # Old programs write Ctrl-Z at the end of a text.
             data = data.removesuffix("\x1a")
@@ -488,7 +488,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
             lines = data[:cut].split(newline)
             yield number_, lines
             number_ += len(lines) - 1
-        carry = data[cut:]
+        incomplete_line = data[cut:]
         if not block:
             return
 
@@ -507,8 +507,8 @@ def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> D
 
 def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
     width = len(cells[0])
-    careful = functools.partial(parse_number, comma=rows.dialect.comma, mark=rows.dialect.mark)
-    value: Callable[[str], float] = float if plain else careful
+    parse_cell = functools.partial(parse_number, comma=rows.dialect.comma, mark=rows.dialect.mark)
+    value: Callable[[str], float] = float if plain else parse_cell
     try:
         flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
     except ValueError:
@@ -519,7 +519,7 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
     for index in range(width):
         column = [row[index] for row in cells]
         try:
-            values[:, index] = list(map(careful, column))
+            values[:, index] = list(map(parse_cell, column))
         except ValueError:
             _not_numbers(rows, index, column, lines, values)
     return values

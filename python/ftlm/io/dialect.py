@@ -328,30 +328,40 @@ def find_table(
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
     _check_width(rows[-2:], source)
-    separator, comma, mark, cut = _choose_separator(rows, layout_options, source)
-    width = _width(cut)
-    first = 0 if layout_options.skip is not None and layout_options.header is not None else _first_row(cut, width)
-    top = (
-        first if layout_options.skip is None or layout_options.header is None else min(layout_options.header, len(cut))
+    separator, comma, mark, table_lines = _choose_separator(rows, layout_options, source)
+    width = _width(table_lines)
+    first = (
+        0 if layout_options.skip is not None and layout_options.header is not None else _first_row(table_lines, width)
     )
-    names, units, top = _header(cut, top, width, layout_options, source, own=own)
+    top = (
+        first
+        if layout_options.skip is None or layout_options.header is None
+        else min(layout_options.header, len(table_lines))
+    )
+    names, units, top = _header(table_lines, top, width, layout_options, source, own=own)
     header = 0 if names is None else 1 if units is None else 2
     layout = Layout(
         separator=_WORDS_BY_SEPARATOR[separator],
         decimal="comma" if comma else "point",
         thousands=mark,
-        skip=cut[top - header].at - 1 if 0 < top - header < len(cut) else 0,
+        skip=table_lines[top - header].at - 1 if 0 < top - header < len(table_lines) else 0,
         header=header,
     ).under(layout_options)
-    assumed = _layout_assumptions(cut, layout_options, layout, top, units)
+    assumed = _layout_assumptions(table_lines, layout_options, layout, top, units)
     if layout_options.skip is None:
-        _check_above(cut[: top - header], width, source, (comma, mark))
-    if not own and names is None and top < len(cut) and cut[top].words and layout_options.header is None:
+        _check_above(table_lines[: top - header], width, source, (comma, mark))
+    if (
+        not own
+        and names is None
+        and top < len(table_lines)
+        and table_lines[top].words
+        and layout_options.header is None
+    ):
         # A first row with words and numbers may be a header.
-        raise _mixed_line(cut[top], source)
+        raise _mixed_line(table_lines[top], source)
     if names is not None and not own and layout_options.separator is None:
-        _check_mixed(cut, top, separator, comma, source)
-    begin = cut[top].at if top < len(cut) else cut[-1].at + 1
+        _check_mixed(table_lines, top, separator, comma, source)
+    begin = table_lines[top].at if top < len(table_lines) else table_lines[-1].at + 1
     if names is not None:
         width = len(names)
     return TableDialect(separator, comma, names, units, begin, width, layout, assumed, mark)
@@ -375,25 +385,25 @@ def _split_lines(
 
     If a line has unbalanced quotes, the quotes are ignored here, and reading its row raises an error later.
     """
-    cut, parted = [], []
+    lines, cells_by_line = [], []
     for at, line in rows:
         try:
             (cells,) = split_cells([line], separator, source, at)
         except DataError:
             cells = line.split(separator)
-        parted.append((at, cells))
+        cells_by_line.append((at, cells))
     mark = None if layout.thousands == "none" else layout.thousands
     if layout.thousands is None:
-        marks = (detect_thousands_separator(cell, comma=comma) for _, cells in parted for cell in cells)
+        marks = (detect_thousands_separator(cell, comma=comma) for _, cells in cells_by_line for cell in cells)
         mark = next((candidate for candidate in marks if candidate is not None), None)
-    for at, cells in parted:
+    for at, cells in cells_by_line:
         is_full = [bool(cell.strip()) for cell in cells]
         numbers = [
             full and (is_number(cell, comma=comma, mark=mark) or is_timestamp(cell))
             for cell, full in zip(cells, is_full, strict=True)
         ]
-        cut.append(_Line(at, cells, numbers, sum(is_full) - sum(numbers)))
-    return cut, mark
+        lines.append(_Line(at, cells, numbers, sum(is_full) - sum(numbers)))
+    return lines, mark
 
 
 def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None, bool]]:
@@ -418,85 +428,85 @@ def _choose_separator(
     text = "".join(line for _, line in table_rows)
     best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
     for separator, comma in _dialect_candidates(text, layout):
-        cut, mark = _split_lines(table_rows, separator, source, layout, comma=comma)
-        if comma and layout.decimal is None and _decimal_comma(cut) is None:
+        lines, mark = _split_lines(table_rows, separator, source, layout, comma=comma)
+        if comma and layout.decimal is None and _decimal_comma(lines) is None:
             continue
-        width = _width(cut)
-        rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.is_row_candidate]
-        half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
+        width = _width(lines)
+        rows = [line for line in lines[_first_row(lines, width) :] if line.width == width and line.is_row_candidate]
+        half = 2 * sum(line.width > 1 for line in lines[:20]) >= len(lines[:20])
         rank = (len(rows), -sum(line.words for line in rows), half and not rows)
         if best is None or rank > best[0]:
-            best = rank, separator, comma, mark, cut
+            best = rank, separator, comma, mark, lines
     if best is None:
         raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not match the text; give others")
-    _, separator, comma, mark, cut = best
+    _, separator, comma, mark, lines = best
     if layout.decimal is None and layout.separator is None and separator == ",":
-        _check_commas(table_rows, cut, source)
+        _check_commas(table_rows, lines, source)
     if layout.decimal is None and comma:
-        _check_thousands(cut, source)
-    return separator, comma, mark, cut
+        _check_thousands(lines, source)
+    return separator, comma, mark, lines
 
 
-def _decimal_comma(cut: list[_Line]) -> str | None:
+def _decimal_comma(lines: list[_Line]) -> str | None:
     """Return the first number with a decimal comma; None if there is none."""
-    return next((c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip())), None)
+    return next((c.strip() for line in lines for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip())), None)
 
 
-def _width(cut: list[_Line]) -> int:
+def _width(lines: list[_Line]) -> int:
     """Return the most frequent number of cells per line, over the lines that are most likely rows.
 
     These are the lines with only numbers; without such lines, those that may be rows; otherwise the first line.
     """
-    for rows in ([line for line in cut if line.has_only_numbers], [line for line in cut if line.is_row_candidate]):
+    for rows in ([line for line in lines if line.has_only_numbers], [line for line in lines if line.is_row_candidate]):
         counts = Counter(line.width for line in rows)
         if counts:
             most = max(counts.values())
             widths = [width for width, count in counts.items() if count == most]
-            return cut[0].width if cut[0].width in widths else max(widths)
-    return cut[0].width
+            return lines[0].width if lines[0].width in widths else max(widths)
+    return lines[0].width
 
 
-def _first_row(cut: list[_Line], width: int) -> int:
+def _first_row(lines: list[_Line], width: int) -> int:
     """Return the index of the first row of data in the split lines.
 
     It is the first line of the given width that has numbers in all columns in which most rows have numbers. Damaged
     rows just before it are included.
     """
-    rows = [line for line in cut if line.width == width and line.is_row_candidate]
+    rows = [line for line in lines if line.width == width and line.is_row_candidate]
     if not rows:
-        return 1 if cut[0].has_only_words else 0
+        return 1 if lines[0].has_only_words else 0
     most = [2 * sum(line.numbers[k] for line in rows) > len(rows) for k in range(width)]
 
     def is_typical(line: _Line) -> bool:
         return line.width == width and all(n or not m for n, m in zip(line.numbers, most, strict=True))
 
-    first = next((k for k, line in enumerate(cut) if is_typical(line) and line.count), None)
+    first = next((k for k, line in enumerate(lines) if is_typical(line) and line.count), None)
     if first is None:
-        first = next(k for k, line in enumerate(cut) if line is rows[0])
-    while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
+        first = next(k for k, line in enumerate(lines) if line is rows[0])
+    while first > 0 and lines[first - 1].width == width and lines[first - 1].count:
         # A line with numbers is part of a header if the next line contains units.
-        if (first < len(cut) and _is_unit_line(cut[first])) or _is_settings_line(cut, first - 1):
+        if (first < len(lines) and _is_unit_line(lines[first])) or _is_settings_line(lines, first - 1):
             break
         first -= 1
     # Short lines right below a header count as rows; reading them raises a specific error later.
     above = first
-    while above > 0 and cut[above - 1].has_only_numbers:
+    while above > 0 and lines[above - 1].has_only_numbers:
         above -= 1
-    return above if above > 0 and cut[above - 1].has_only_words and cut[above - 1].width == width else first
+    return above if above > 0 and lines[above - 1].has_only_words and lines[above - 1].width == width else first
 
 
-def _is_settings_line(cut: list[_Line], at: int) -> bool:
+def _is_settings_line(lines: list[_Line], at: int) -> bool:
     """Whether a line below the names contains units and settings, such as start and increment of an oscilloscope."""
-    line = cut[at]
+    line = lines[at]
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
     others = {word.casefold() for word in words if not is_unit(word)}
     # Settings have columns of their own. Numbers in columns where the next line also has numbers belong to a row.
-    below = cut[at + 1].numbers if at + 1 < len(cut) else []
+    below = lines[at + 1].numbers if at + 1 < len(lines) else []
     row = any(one and other for one, other in zip(line.numbers, below, strict=False))
     return (
         at > 0
-        and cut[at - 1].has_only_words
+        and lines[at - 1].has_only_words
         and line.count > 0
         and _has_unit(units)
         and others <= {_ROW_INDEX_UNIT}
@@ -515,14 +525,14 @@ def _has_unit(units: Sequence[str]) -> bool:
 
 
 def _header(
-    cut: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
+    lines: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
     """Return names, units and the index of the first row; names or units are None if the header lacks them.
 
     `top` is the detected index of the first row. The result is larger if the layout states header lines that look like
     rows. Raise DataError if the header does not match the options, mixes words and numbers, or repeats a name.
     """
-    rows = [line for line in cut[top:] if line.width == width]
+    rows = [line for line in lines[top:] if line.width == width]
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
     def fit_names(line: _Line) -> list[str]:
@@ -539,16 +549,16 @@ def _header(
     count = layout.header
     if count is None:
         count = 0
-        units_above = top > 1 and (_is_unit_line(cut[top - 1]) or _is_settings_line(cut, top - 1))
-        if top > 0 and (cut[top - 1].has_only_words or own or units_above):
+        units_above = top > 1 and (_is_unit_line(lines[top - 1]) or _is_settings_line(lines, top - 1))
+        if top > 0 and (lines[top - 1].has_only_words or own or units_above):
             count = 1
-            if units_above and len(fit_names(cut[top - 2])) == width and cut[top - 2].words:
+            if units_above and len(fit_names(lines[top - 2])) == width and lines[top - 2].words:
                 count = 2
-            elif len(fit_names(cut[top - 1])) != width and top > 1:
+            elif len(fit_names(lines[top - 1])) != width and top > 1:
                 # A line between names and rows may consist of one cell with a remark.
-                has_names = len(fit_names(cut[top - 2])) == width and cut[top - 2].has_only_words
-                count = 2 if has_names and cut[top - 1].width == 1 else 0
-    if count > top and layout.skip is None and count < len(cut):
+                has_names = len(fit_names(lines[top - 2])) == width and lines[top - 2].has_only_words
+                count = 2 if has_names and lines[top - 1].width == 1 else 0
+    if count > top and layout.skip is None and count < len(lines):
         # A header of numbers looks like a row.
         top = count
     if count > top:
@@ -558,7 +568,7 @@ def _header(
         )
     if count == 0:
         return None, None, top
-    line = cut[top - count]
+    line = lines[top - count]
     names = fit_names(line)
     if not own and count == 1 and line.count and layout.header is None:
         raise _mixed_line(line, source)
@@ -571,7 +581,7 @@ def _header(
     check_distinct(names, line.at, source)
     if count == 1:
         return names, None, top
-    below = cut[top - 1].cells
+    below = lines[top - 1].cells
     units = [unit_of(cell) for cell in below] if len(below) > 1 or width == 1 else []
     units += [""] * (len(names) - len(units))
     return names, units[: len(names)], top
@@ -618,13 +628,13 @@ def _mixed_line(line: _Line, source: str) -> DataError:
     )
 
 
-def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
+def _check_commas(rows_of_text: Sequence[tuple[int, str]], lines: list[_Line], source: str) -> None:
     """Raise DataError if commas may be both separators and decimal marks."""
-    rows = [(line, text) for line, (_, text) in zip(cut, rows_of_text, strict=True) if line.has_only_numbers]
+    rows = [(line, text) for line, (_, text) in zip(lines, rows_of_text, strict=True) if line.has_only_numbers]
     if not rows:
         return
     pairs = all(_COMMA_PAIRS_PATTERN.fullmatch(text) for _, text in rows)
-    single = not any(line.has_only_words and line.width == 2 for line in cut) and all(
+    single = not any(line.has_only_words and line.width == 2 for line in lines) and all(
         line.width == 2 and all(cell.strip().lstrip("+-").isdecimal() for cell in line.cells) for line, _ in rows
     )
     if pairs or single:
@@ -635,11 +645,11 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], sou
         )
 
 
-def _check_thousands(cut: list[_Line], source: str) -> None:
+def _check_thousands(lines: list[_Line], source: str) -> None:
     """Raise DataError if three digits follow every comma, so that commas may be thousands separators."""
     cells = [
         (line.at, cell.strip())
-        for line in cut
+        for line in lines
         for cell, n in zip(line.cells, line.numbers, strict=True)
         if n and "," in cell and not is_timestamp(cell)
     ]
@@ -651,12 +661,12 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
         )
 
 
-def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
+def _check_mixed(lines: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
     """Raise DataError if header and rows have equal cell counts when split at commas as well as at the separator."""
     if not comma or separator is None:
         return
-    header = cut[top - 1]
-    both = [re.split(f"[,{separator}]", separator.join(line.cells)) for line in (header, *cut[top : top + 20])]
+    header = lines[top - 1]
+    both = [re.split(f"[,{separator}]", separator.join(line.cells)) for line in (header, *lines[top : top + 20])]
     if len(both[0]) > header.width and len(both) > 1 and len({len(cells) for cells in both}) == 1:
         raise DataError(
             f"{source}: line {header.at} and the rows below it have commas and {SEPARATOR_WORDS[separator]}s between "
@@ -666,11 +676,11 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
 
 
 def _layout_assumptions(
-    cut: list[_Line], given: Layout, layout: Layout, top: int, units: list[str] | None
+    lines: list[_Line], given: Layout, layout: Layout, top: int, units: list[str] | None
 ) -> tuple[Assumption, ...]:
     """Return the assumptions about the options in a detected layout that `given` does not set.
 
-    The first row of data is ``cut[top]``.
+    The first row of data is ``lines[top]``.
     """
     assumed = []
     if given.separator is None:
@@ -678,10 +688,10 @@ def _layout_assumptions(
         otherwise = layout_parameter(separator=Placeholder("NAME"))
         assumed.append(Assumption("separator", str(layout.separator), words, otherwise, False))
     if given.decimal is None and layout.decimal == "comma":
-        words, otherwise = f"decimal commas, as in {_decimal_comma(cut)!r}", layout_parameter(decimal="point")
+        words, otherwise = f"decimal commas, as in {_decimal_comma(lines)!r}", layout_parameter(decimal="point")
         assumed.append(Assumption("decimal", "comma", words, otherwise))
     if given.thousands is None and (mark := layout.thousands) is not None:
-        cells, comma = (c for line in cut for c in line.cells), layout.decimal == "comma"
+        cells, comma = (c for line in lines for c in line.cells), layout.decimal == "comma"
         example = next(c.strip() for c in cells if detect_thousands_separator(c, comma=comma) == mark)
         words = f"{mark}s group thousands, as in {example!r}"
         assumed.append(Assumption("thousands", mark, words, layout_parameter(thousands="none")))
@@ -689,7 +699,7 @@ def _layout_assumptions(
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
     if given.header is None and units is not None:
-        words = f"line {cut[top - 1].at} contains units" if any(units) else f"line {cut[top - 1].at} is a remark"
+        words = f"line {lines[top - 1].at} contains units" if any(units) else f"line {lines[top - 1].at} is a remark"
         assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
     elif given.header is None and layout.header == 0:
         words = "no line of names: columns are c1, c2, …"

@@ -179,7 +179,7 @@ class _Array(msgspec.Struct):
     since: int | None = None
 
 
-class _Answer(msgspec.Struct):
+class _ResultHeader(msgspec.Struct):
     """Header of the reader's answer for one file, before its numbers or cells; see :mod:`ftlm.io.binary_reader`."""
 
     arrays: list[_Array] = []
@@ -193,7 +193,7 @@ class _Answer(msgspec.Struct):
     way_out: str = ""
 
 
-ANSWER_DECODER = msgspec.json.Decoder(_Answer)
+HEADER_DECODER = msgspec.json.Decoder(_ResultHeader)
 
 
 class _ReaderOutput:
@@ -210,31 +210,31 @@ class _ReaderOutput:
             count += 1
         return count
 
-    def _next(self) -> tuple[_Answer, list[Floats], bytes] | None:
+    def _next(self) -> tuple[_ResultHeader, list[Floats], bytes] | None:
         end = self._content.find(b"\n", self._at)
         matrices = []
         try:
-            answer = ANSWER_DECODER.decode(self._content[self._at : max(end, self._at)])
+            header = HEADER_DECODER.decode(self._content[self._at : max(end, self._at)])
             at = end + 1
-            for array in answer.arrays:
+            for array in header.arrays:
                 count = array.rows * array.columns
                 flat = np.frombuffer(self._content, dtype="<f8", count=count, offset=at)
                 matrices.append(flat.reshape((array.rows, array.columns), order="F").astype(np.float64, copy=False))
                 at += 8 * count
         except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError):
             return None
-        self._at = at + answer.bytes
-        return (answer, matrices, self._content[at : self._at]) if self._at <= len(self._content) else None
+        self._at = at + header.bytes
+        return (header, matrices, self._content[at : self._at]) if self._at <= len(self._content) else None
 
     def table(self, path: Path, layout: Layout) -> FileTable | None:
         """Return the table of the next file; None if its answer is missing or incomplete.
 
         Raise DataError if the answer is an error, or the file has no column of numbers.
         """
-        answer = self._next()
-        if answer is None:
+        result = self._next()
+        if result is None:
             return None
-        header, matrices, cells = answer
+        header, matrices, cells = result
         if header.error is not None:
             remedy = header.way_out
             if remedy == _SHEET_CHOICE_HINT:

@@ -23,7 +23,7 @@ from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles, 
 from ftlm.io.delimited_text import read_text
 from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Assumption, Layout
 from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
-from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.io.table import Column, ColumnTable, FileTable, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER, nearest_file_hint, read_toml
 from ftlm.utils.parameters import NAMED_COLUMNS, parameter, type_name
@@ -189,7 +189,7 @@ def run_from_tables(
         raise DataError(f"{str(tables[0].path)!r} is a complete run; load it alone")
     if header is not None:
         _apply_header(selection, header)
-    pool = Pool(tables)
+    pool = ColumnTable(tables)
     roles = _assume_roles(selection, pool, signals) if header is None else ()
     _check_disjoint_roles(selection, pool)
     if not selection.outputs:
@@ -259,7 +259,7 @@ class _TimeColumn:
     notes: tuple[str, ...] = ()
 
 
-def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], options: LoadOptions) -> _TimeColumn:
+def _clock(selection: ColumnSelection, pool: ColumnTable, columns: list[Column], options: LoadOptions) -> _TimeColumn:
     unit_option = options.time_unit
     if selection.step is not None:
         if unit_option is not None:
@@ -296,7 +296,7 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
     return _TimeColumn(seconds, "s", label, column.name, facts)
 
 
-def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
+def _assume_roles(selection: ColumnSelection, pool: ColumnTable, signals: Signals | None) -> tuple[Assumption, ...]:
     """Set inputs and outputs of a selection by column names if it has none, and return the assumptions."""
     if selection.inputs or selection.outputs:
         return ()
@@ -307,7 +307,7 @@ def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | Non
     return assume_roles(selection, [c for c in pool.columns if c is not clock], signals)
 
 
-def unused_time(selection: ColumnSelection, pool: Pool, signals: Collection[str]) -> Column | None:
+def unused_time(selection: ColumnSelection, pool: ColumnTable, signals: Collection[str]) -> Column | None:
     """Return the time column beside a given step; None without a step, or if no column is a time by its name or unit.
 
     `signals` are the names of the columns that are used as signals.
@@ -328,7 +328,7 @@ def base_name(path: Path) -> str:
     return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
 
 
-def _check_disjoint_roles(selection: ColumnSelection, pool: Pool) -> None:
+def _check_disjoint_roles(selection: ColumnSelection, pool: ColumnTable) -> None:
     """Raise DataError if a column is an input and an output, because the model of this output would be trivial."""
     driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
     twice = [
@@ -434,7 +434,7 @@ def column_names(path: PathLike) -> tuple[str, ...] | None:
         In the cases of :func:`load`.
     """
     (table,) = read_tables(path, Layout())
-    return None if table.header is not None else Pool([table]).names
+    return None if table.header is not None else ColumnTable([table]).names
 
 
 def select_columns(

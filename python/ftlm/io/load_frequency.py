@@ -14,7 +14,7 @@ from ftlm.errors import DataError
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.dialect import Layout
 from ftlm.io.load import PathLike, base_name, read_tables
-from ftlm.io.table import Column, Pool
+from ftlm.io.table import Column, ColumnTable
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import PART_COLUMNS, parameter, type_name
@@ -136,7 +136,7 @@ def load_frequency(
         not positive.
     """
     (table,) = read_tables(path, Layout.of(layout))
-    pool = Pool([table])
+    pool = ColumnTable([table])
     if table.header is not None:
         raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")
     notes = [str(a) for a in table.assumed if a.counts]
@@ -196,7 +196,7 @@ def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
     ]
 
 
-def is_response(pool: Pool) -> bool:
+def is_response(pool: ColumnTable) -> bool:
     """Whether the column names are those of a frequency response, so that no argument is needed to load it."""
     try:
         _find_parts(pool)
@@ -205,7 +205,7 @@ def is_response(pool: Pool) -> bool:
     return True
 
 
-def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
+def _find_parts(pool: ColumnTable) -> dict[str, _ResponseColumn]:
     """Return the columns of a frequency response by part; raise DataError if a part is ambiguous or missing."""
     parts: dict[str, _ResponseColumn] = {}
     for column in pool.columns:
@@ -222,7 +222,7 @@ def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
     return parts
 
 
-def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _ResponseColumn]:
+def _select_parts(pool: ColumnTable, columns: Mapping[str, str | int]) -> dict[str, _ResponseColumn]:
     if not isinstance(columns, Mapping):
         raise DataError(f"columns is {type_name(columns)}; pass a dict of part: column")
     parts = {}
@@ -240,7 +240,7 @@ def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _Re
     return parts
 
 
-def _check_parts(parts: Mapping[str, _ResponseColumn], pool: Pool) -> None:
+def _check_parts(parts: Mapping[str, _ResponseColumn], pool: ColumnTable) -> None:
     whole = {"real", "imag"} <= parts.keys() or {"magnitude", "phase"} <= parts.keys()
     if "frequency" in parts and whole:
         return

@@ -31,7 +31,7 @@ from ftlm.io.load import (
     unused_time,
 )
 from ftlm.io.load_frequency import is_response
-from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
+from ftlm.io.table import Column, ColumnTable, FileTable, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import write_atomically
 from ftlm.utils.parameters import NAMED_COLUMNS, Placeholder, choose_text, flag_of, parameter, type_name
@@ -206,8 +206,8 @@ class OpenedFile:
                 name if bare and name == value else f"{name}={value}" for name, value in options.get(key, {}).items()
             )
             words += [w for pair in pairs for w in (flag_of(key), pair)]
-        told_layout: Layout = options.get("layout", Layout())
-        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
+        given_layout: Layout = options.get("layout", Layout())
+        words += [w for k, v in given_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
         return words
 
 
@@ -261,7 +261,7 @@ def open_file(
 def preview_selection(path: PathLike, selection: ColumnSelection, options: LoadOptions) -> OpenedFile:
     """Return a preview of a file with a selection of its columns; see :func:`open_file`."""
     (table,) = read_tables(path, selection.layout)
-    return _FilePreview(table, Pool([table]), selection, options).result(os.fspath(path))
+    return _FilePreview(table, ColumnTable([table]), selection, options).result(os.fspath(path))
 
 
 @dataclass
@@ -269,9 +269,9 @@ class _FilePreview:
     """Builder of the preview of a file; :meth:`result` returns it."""
 
     table: FileTable
-    pool: Pool
+    pool: ColumnTable
     selection: ColumnSelection
-    asked: LoadOptions
+    options: LoadOptions
 
     def result(self, path: str) -> OpenedFile:
         table, selection = self.table, self.selection
@@ -286,7 +286,7 @@ class _FilePreview:
         options = self._options(clock, of_clock)
         if not problem:
             try:
-                run = run_from_tables([table], selection, self.asked)
+                run = run_from_tables([table], selection, self.options)
                 step, notes = run.step, tuple(n for n in run.warnings if n not in {str(a) for a in assumed})
             except DataError as error:
                 problem = str(error)
@@ -357,8 +357,8 @@ class _FilePreview:
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
             )
-            wordy = (c for c in every if c is not clock and not has_numbers(c) and c.timestamps is None)
-            others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
+            text_columns = (c for c in every if c is not clock and not has_numbers(c) and c.timestamps is None)
+            others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in text_columns]
             if others:
                 more = f" and {len(others) - _MAX_LISTED_COLUMNS} more" * (len(others) > _MAX_LISTED_COLUMNS)
                 open_roles += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
@@ -373,7 +373,7 @@ class _FilePreview:
             return () if order is None else (order,)
         name = time_header(clock)
         is_certain = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
-        if self.asked.time_unit is not None or is_certain or clock.problem is not None:
+        if self.options.time_unit is not None or is_certain or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
         return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
@@ -384,7 +384,7 @@ class _FilePreview:
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and selection.step is None and self.table.header is None:
             options["time"] = clock.name
-        more = {key: getattr(self.asked, key) for key in ("window", "resample", "time_unit", "missing")}
+        more = {key: getattr(self.options, key) for key in ("window", "resample", "time_unit", "missing")}
         options |= {key: value for key, value in more.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
             if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):

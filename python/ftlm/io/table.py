@@ -162,7 +162,7 @@ class FileTable:
         return replace(self, path=path, columns=columns)
 
 
-class Pool:
+class ColumnTable:
     """Columns of all files with unique names: a name that several files have gets the file name as a prefix."""
 
     def __init__(self, tables: list[FileTable]) -> None:
@@ -261,7 +261,7 @@ class Pool:
             return self.find(spec, "time"), None
         clocks, assumed = [], None
         for table in self._tables:
-            columns, why = self._clocks(table, signals)
+            columns, why = self._time_candidates(table, signals)
             if len(columns) > 1 and table.runs:
                 raise DataError(
                     f"{table.path.name} contains {len(table.runs)} runs, each in a group with its own time; give the "
@@ -288,7 +288,7 @@ class Pool:
             _check_agreement(clocks[0], other)
         return clocks[0], assumed
 
-    def _clocks(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
+    def _time_candidates(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
         """Return candidates for the time column of a file, and the reason for the choice if it is an assumption.
 
         The first criterion with a candidate is used: t, time or seconds; another name of a time; dates; first column
@@ -300,9 +300,9 @@ class Pool:
         # Each group of an HDF5 file is a separate run.
         if groups != {""}:
             own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
-        sure = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
-        if sure:
-            return sure, ""
+        time_columns = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
+        if time_columns:
+            return time_columns, ""
         columns = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
         if columns:
             return columns, f"the time is column {columns[0].name!r}, by its name"

@@ -59,9 +59,9 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
     stribeck: Stribeck | None = None
 
     @classmethod
-    def of(cls, rubs: Friction) -> FrictionFile:
+    def of(cls, friction: Friction) -> FrictionFile:
         """Return the file form of the friction of an equation."""
-        return cls(float(rubs.coefficient), rubs.factor, rubs.name, rubs.stribeck)
+        return cls(float(friction.coefficient), friction.factor, friction.name, friction.stribeck)
 
     def friction(self) -> Friction:
         """Return the friction from its file form."""
@@ -91,8 +91,8 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     def equation(self) -> Equation:
         """Return the equation from its file form."""
         terms = tuple(t.term() for t in self.terms)
-        rubs = UNSET if self.friction is None else self.friction.friction()
-        return Equation(self.output, Order(self.order), terms, rubs)
+        friction = UNSET if self.friction is None else self.friction.friction()
+        return Equation(self.output, Order(self.order), terms, friction)
 
     @property
     def count(self) -> int:

@@ -524,16 +524,16 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         self.search = work.build_evaluator(keeps_state=True)
         self._first = 0
         self._spans: list[Span] = []
-        self._wave: list[Verdicts] = []
+        self._batch_results: list[Verdicts] = []
 
     def batches(self) -> Iterator[tuple[int, int]]:
         """Yield (first, exclusive end) of each batch of candidates, numbered consecutively through all batches."""
         while spans := self.search.pending_spans():
             end = self._first + sum(last - first for _, first, last, _ in spans)
-            self._spans, self._wave = spans, []
+            self._spans, self._batch_results = spans, []
             self.total, _ = self.search.state()
             yield self._first, end
-            self.search.record_outcomes(*_join_verdicts(self._wave, self._first, end), self.threads)
+            self.search.record_outcomes(*_join_verdicts(self._batch_results, self._first, end), self.threads)
             self._first = end
         self.total = self._first
 
@@ -577,7 +577,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
 
         Return the number of candidates with only a lower bound or a partial sum of the score.
         """
-        self._wave.append(frame)
+        self._batch_results.append(frame)
         self.done += len(frame.kinds)
         return frame.kinds.count(1) + frame.kinds.count(2)
 
@@ -709,10 +709,10 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
     Raise ModelError if sizes or counts of the table do not match the search.
     """
     widths = [len(terms) for _, _, terms in work.laws]
-    dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
+    accounted = sum(v for k, v in joined.counts.items() if k != "candidates")
     sound = (
         set(joined.counts) == {"candidates", "kept", "beaten", "bound", "stopped early", "singular", "diverged"}
-        and dealt == joined.counts["candidates"]
+        and accounted == joined.counts["candidates"]
         and 0 < len(joined.rows) == joined.counts["kept"] <= work.settings.top
         and all(len(free) == len(work.axes) for _, free, _ in joined.failures)
         and all(len(free) == len(work.axes) for _, _, free, _ in joined.rows)

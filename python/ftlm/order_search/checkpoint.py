@@ -115,7 +115,7 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
     """Checkpoint record of a partly evaluated block of rounds (groups of candidates of one equation).
 
     ``rows`` are the table rows found since the previous record of the block. ``failures`` is None if they did not
-    change since then. With ``anew``, the block was restarted and its earlier records are invalid. ``order`` is the
+    change since then. With ``restarted``, the block was restarted and its earlier records are invalid. ``order`` is the
     digest of the sequence in which candidates are evaluated, 0 before the first candidate.
     """
 
@@ -127,7 +127,7 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
     counts: Counts
     failures: Failures | None
     order: Natural = 0
-    anew: bool = False
+    restarted: bool = msgspec.field(default=False, name="anew")
 
 
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
@@ -238,7 +238,7 @@ class Section:
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
             raise ModelError(f"batches {frame.first} to {frame.last} have an invalid position")
-        if half is None or frame.anew:
+        if half is None or frame.restarted:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts
         half.rows.extend(frame.rows)
@@ -406,13 +406,13 @@ class Store:
         With None as checkpoint, nothing is queued.
         """
         if checkpoint is not None:
-            (*place, order), anew, (rows, counts, failures) = checkpoint
+            (*place, order), restarted, (rows, counts, failures) = checkpoint
             rounds_before = self._waiting.get((search, first))
             rows = (*(rounds_before.rows if rounds_before else ()), *rows)
-            anew = anew or (rounds_before is not None and rounds_before.anew)
+            restarted = restarted or (rounds_before is not None and rounds_before.restarted)
             checkpoint_place = cast("Place", tuple(place))
             self._waiting[search, first] = PartialRounds(
-                search, first, last, checkpoint_place, rows, counts, failures, order, anew
+                search, first, last, checkpoint_place, rows, counts, failures, order, restarted
             )
         if time.monotonic() - self._last >= FLUSH_INTERVAL_S:
             self.flush()
@@ -421,7 +421,7 @@ class Store:
         """Write all queued records to the file."""
         due = []
         for key, frame in self._waiting.items():
-            same = not frame.anew and self._failures.get(key) == frame.failures
+            same = not frame.restarted and self._failures.get(key) == frame.failures
             due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
             self._failures[key] = frame.failures
         self._waiting.clear()

@@ -112,7 +112,12 @@ class OrderCertificate:
 
     def __str__(self) -> str:
         lines = [
-            f"start {k}: {error:.5g}, {'may still be beaten' if open_ else 'is not beaten by more than that'}"
+            f"start {k}: {error:.5g}, "
+            + (
+                "other orders may have a smaller error"
+                if open_
+                else "no orders have an error smaller by more than this"
+            )
             for k, (error, open_) in enumerate(zip(self.start_errors, self.beatable, strict=True))
         ]
         return "\n".join([self._bound_text, *lines, *(f"! {f}; {f.remedy}" for f in self.findings)])
@@ -422,7 +427,7 @@ def search_summary(searches: Mapping[str, SearchResult]) -> Table:
         for name, s in searches.items()
     ]
     return Table(
-        "What became of the candidates",
+        "Outcome of the candidates",
         ("search", "ranked by", "candidates", "kept", *reasons),
         rows,
         groups=(("", 4), ("left out", len(reasons))) if reasons else (),
@@ -479,5 +484,5 @@ def search_html(result: SearchResult) -> str:
         if reason == "bound" and result.excluded_by_box:
             rows.append(["of these in boxes excluded whole", result.excluded_by_box])
     name = result.model.outputs[0] if len(result.model.outputs) == 1 else "stage"
-    rest = Table(f"{result.candidates} candidates", ("became of them", "count"), rows)
+    rest = Table(f"{result.candidates} candidates", ("outcome", "count"), rows)
     return str(search_top(name, result).to_html() + rest.to_html())

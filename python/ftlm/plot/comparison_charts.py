@@ -142,12 +142,12 @@ def residual_rows(
     suffix = f", {label}" if label else ""
     for k, (run, _, _) in enumerate(comparison.per_run):
         for name in comparison.output_error:
-            missed = comparison.measured[name][k] - comparison.simulated[name][k]
+            residual = comparison.measured[name][k] - comparison.simulated[name][k]
             what = f"Residual of {symbol(name)}{suffix}, {run}"
             axis = with_unit(f"residual of {symbol(name)}", units, name)
             over_time = LineChart(
                 pulse_times(comparison, k),
-                [("", missed)],
+                [("", residual)],
                 title=f"{what}: over time",
                 x_label="time [s]",
                 y_label=axis,
@@ -156,9 +156,9 @@ def residual_rows(
                 height=190,
             )
             rows.append([over_time])
-            if np.sum(np.isfinite(missed)) >= 2:
+            if np.sum(np.isfinite(residual)) >= 2:
                 words = "Line: the normal curve of the same mean and deviation."
-                rows[-1].append(histogram(missed, title=f"{what}: histogram", x_label=axis, caption=words))
+                rows[-1].append(histogram(residual, title=f"{what}: histogram", x_label=axis, caption=words))
     return rows
 
 
@@ -348,11 +348,11 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         (lower, upper) edges of the band by output. The dictionary is empty for a model without covariance, or if a
         simulation with a changed parameter fails.
     """
-    spread = covariance_of(model)
-    if spread is None:
+    covariance = covariance_of(model)
+    if covariance is None:
         return {}
-    errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
-    if not np.all(np.isfinite(spread)):
+    errors, values = np.sqrt(np.diag(covariance)), parameter_vector(model)
+    if not np.all(np.isfinite(covariance)):
         return {}
     rows = np.flatnonzero(errors)
     derivatives: dict[str, list[Floats]] = {name: [] for name in comparison.simulated}
@@ -361,15 +361,15 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         shifted = values.copy()
         shifted[k] += step
         try:
-            beside = compare(with_parameter_vector(model, shifted), run)
+            perturbed = compare(with_parameter_vector(model, shifted), run)
         except FtlmError:
             return {}
         for name, centre in comparison.simulated.items():
-            derivatives[name].append((beside.simulated[name][0] - centre[0]) / step)
+            derivatives[name].append((perturbed.simulated[name][0] - centre[0]) / step)
     bands = {}
     for name, columns in derivatives.items():
         matrix, middle = np.array(columns), comparison.simulated[name][0]
-        variance = np.einsum("kt,kl,lt->t", matrix, spread[np.ix_(rows, rows)], matrix)
+        variance = np.einsum("kt,kl,lt->t", matrix, covariance[np.ix_(rows, rows)], matrix)
         half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         if np.all(np.isfinite(half)):
             bands[name] = (middle - half, middle + half)

@@ -175,7 +175,7 @@ def _label_axes(axis: Any, x_label: str, y_label: str, **legend: Any) -> None:
 
 
 def _draw_plane(axis: Any, chart: PlaneChart) -> None:
-    points, (low, high) = chart.values, chart.corners
+    points, (low, high) = chart.values, chart.plot_corners
     if chart.line is None:
         corner = np.array(chart.sector_outline(high.real))
         axis.fill(corner.real, corner.imag, color=LINE_STYLES[1][0], alpha=0.16, linewidth=0, label="not stable")
@@ -192,7 +192,7 @@ def _draw_plane(axis: Any, chart: PlaneChart) -> None:
 
 
 def _draw_bars(axis: Any, chart: BarChart) -> None:
-    height, (low, high) = 0.8 / len(chart.tables), chart.ends
+    height, (low, high) = 0.8 / len(chart.tables), chart.axis_limits
     for i, (name, values) in enumerate(chart.tables):
         places = np.arange(values.size) + (i - (len(chart.tables) - 1) / 2) * height
         inside = np.clip(np.nan_to_num(values, nan=low), low, high) - low

@@ -285,9 +285,10 @@ class TimeResponse(Response):
                 name = f"value at {self.time[-1]:.4g} s"
                 if (output, signal) in self.final_values:
                     (last, error), name = self.final_values[output, signal], "final value"
-                sure = f" ± {error:.2g}" if error else ""
+                uncertainty = f" ± {error:.2g}" if error else ""
                 lines.append(
-                    f"  {output} from {signal}: {name} {last:.5g}{sure}, peak {values[at]:.5g} at {self.time[at]:.4g} s"
+                    f"  {output} from {signal}: {name} {last:.5g}{uncertainty}, "
+                    f"peak {values[at]:.5g} at {self.time[at]:.4g} s"
                 )
         return "\n".join(lines)
 

@@ -126,8 +126,8 @@ def behavior_tables(model: Model) -> list[Table]:
     tables = []
     try:
         model_modes = modes(model)
-        grows = any(mode.unstable for mode in model_modes)
-        states = () if grows or model.structure.limits else steady_states(model)
+        unstable = any(mode.unstable for mode in model_modes)
+        states = () if unstable or model.structure.limits else steady_states(model)
     except FtlmError:
         # Equations that cannot be solved for all outputs together have neither gains nor modes.
         return []
@@ -137,14 +137,16 @@ def behavior_tables(model: Model) -> list[Table]:
             above, below = (model.units.get(n, "") for n in (state.output, state.input))
             pair = Markup("{} from {}").format(symbol_html(state.output), symbol_html(state.input))
             unit = f"{above}/{below}" if above and below else ""
-            sure = describe_order(state)
+            uncertainty = describe_order(state)
             if state.order > 0:
                 runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
-                rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}{sure}"])
+                rows.append(
+                    [pair, state.rate, state.error, unit, f"none: the output does not settle; rate{runs}{uncertainty}"]
+                )
             else:
-                back = state.order < 0
-                what = "0: it dies away" if back else "gain"
-                rows.append([pair, state.gain, None if back else state.error, unit, f"{what}{sure}"])
+                decays = state.order < 0
+                what = "0: the response decays to zero" if decays else "gain"
+                rows.append([pair, state.gain, None if decays else state.error, unit, f"{what}{uncertainty}"])
         tables.append(
             Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
         )
@@ -470,15 +472,15 @@ def _search_sections(result: Identification) -> list[Section]:
             "against the prior; all lines end where the closed form is."
         )
         sections.append(Section("Convergence of the recursion", words, figures=traces))
-    around = output_error_landscape(result)
-    if around is not None:
-        first, second = map(symbol, around.names)
+    cost_landscape = output_error_landscape(result)
+    if cost_landscape is not None:
+        first, second = map(symbol, cost_landscape.names)
         words = (
-            f"The two orders that these runs tell apart least are {first} and {second}: the correlation of their "
-            f"estimates is {number(around.correlation, 3)}. For white residuals the 95 % region of both ends at a "
-            "score of 7."
+            f"The two orders with the most correlated estimates are {first} and {second}: their correlation is "
+            f"{number(cost_landscape.correlation, 3)}. For white residuals the 95 % region of both ends at a score of "
+            "7."
         )
-        sections.append(Section("Order landscape", words, figures=[around], small=True))
+        sections.append(Section("Order landscape", words, figures=[cost_landscape], small=True))
     return sections
 
 

@@ -113,7 +113,7 @@ def behavior_lines(model: Model) -> list[str]:
     # Equations that cannot be solved for all outputs together have neither modes nor gains.
     with contextlib.suppress(FtlmError):
         model_modes = modes(model)
-        grows = any(mode.unstable for mode in model_modes)
+        unstable = any(mode.unstable for mode in model_modes)
         word = "mode" if len(model_modes) == 1 else "modes"
         lines += [
             f"  {word if k == 0 else '':<7}{describe_mode(mode)}"
@@ -121,7 +121,7 @@ def behavior_lines(model: Model) -> list[str]:
         ]
         if len(model_modes) > MAX_LISTED_MODES:
             lines.append(f"         and {len(model_modes) - MAX_LISTED_MODES} faster ones: .model.modes()")
-        if not (grows or model.structure.limits):
+        if not (unstable or model.structure.limits):
             lines = [f"  {'gain':<7}{describe_gain(s, model)}" for s in steady_states(model)] + lines
     return lines
 
@@ -138,13 +138,13 @@ def describe_gain(state: SteadyState, model: Model) -> str:
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
-    rate, sure = with_error(state.rate, state.error), describe_order(state)
+    rate, uncertainty = with_error(state.rate, state.error), describe_order(state)
     if state.order > 0:
-        course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
-        return f"{pair}: none, it integrates: {rate}{unit} {course}{sure}"
+        per_time = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
+        return f"{pair}: none, it integrates: {rate}{unit} {per_time}{uncertainty}"
     if state.order < 0:
-        return f"{pair}: 0, the response to a step decays{sure}"
-    return f"{pair}: {rate}{unit}{sure}"
+        return f"{pair}: 0, the response to a step decays{uncertainty}"
+    return f"{pair}: {rate}{unit}{uncertainty}"
 
 
 def describe_order(state: SteadyState) -> str:

@@ -387,7 +387,7 @@ def weak_prior_variation(each: Mapping[int, Mapping[str, float]]) -> float:
     return max(abs(c[n] / first[n] - 1) for c in each.values() for n in first if first[n])
 
 
-def beats(error: float, seeds: Iterable[float]) -> bool:
+def has_smaller_error(error: float, seeds: Iterable[float]) -> bool:
     """Whether an error is finite and below the median of an optimizer's errors over its seeds (`seeds`).
 
     The minimum over seeds would depend on their number.
@@ -399,7 +399,13 @@ def optimizers(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
     contests = reproduction.panel.contests
     cases = [
-        case(beats(error, errors.values()), K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name)
+        case(
+            has_smaller_error(error, errors.values()),
+            K0=prior_text(k),
+            the_arm=c.arm,
+            the_angle=symbol(c.output),
+            the_rival=name,
+        )
         for c in contests
         for k, error in c.order_grid.items()
         for name, errors in c.optimizers.items()

@@ -252,9 +252,9 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
     """
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
-    for output, rival in reproduction.rivals.items():
-        models = {names.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
-        has_validation = rival.models["genetic"].validation is not None
+    for output, comparison in reproduction.rivals.items():
+        models = {names.get(n, n): c for n, c in comparison.models.items() if n != "differential evolution"}
+        has_validation = comparison.models["genetic"].validation is not None
         figures += _fits_chart(
             models, output, _place(11, output), sine=has_validation, simulated=reproduction.simulated
         )
@@ -458,19 +458,21 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
     They correspond to Tables 6 and 7 of the paper. The third has the error, eq. (45), for each optimizer and seed.
     """
-    rivals = reproduction.rivals
-    seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
+    comparisons = reproduction.rivals
+    seeds = list(
+        dict.fromkeys(seed for comparison in comparisons.values() for seed in comparison.optimizers["genetic"].errors)
+    )
     best: list[list[Cell]] = []
-    for output, rival in rivals.items():
-        head = Markup("{}, best of {} seeds").format(symbol_html(output), len(rival.optimizers["genetic"].errors))
-        best.append([head, *computed_cells(rival.models["genetic"], output)])
+    for output, comparison in comparisons.items():
+        head = Markup("{}, best of {} seeds").format(symbol_html(output), len(comparison.optimizers["genetic"].errors))
+        best.append([head, *computed_cells(comparison.models["genetic"], output)])
         best.append(printed_cells(symbol_html(output), printed.GENETIC_ROWS[output], criteria=False))
     labels = OPTIMIZER_LABELS | {
         n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
     }
 
     def errors(output: str) -> Iterator[list[Cell]]:
-        for label, candidate in rivals[output].models.items():
+        for label, candidate in comparisons[output].models.items():
             own, other = candidate.estimation, candidate.validation
             prediction = criteria_cells(None if other is None else other.output_error[output])
             spread = float(np.std(own.measured[output][0]))
@@ -480,14 +482,14 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
             yield [printed_head(label), *criteria, None, None, None, implied]
 
     def errors_by_seed(output: str) -> Iterator[list[Cell]]:
-        for name, run in rivals[output].optimizers.items():
+        for name, run in comparisons[output].optimizers.items():
             each = max(run.evaluations.values())
-            yield [OPTIMIZER_LABELS[name], rivals[output].candidates, each, *map(run.errors.get, seeds)]
+            yield [OPTIMIZER_LABELS[name], comparisons[output].candidates, each, *map(run.errors.get, seeds)]
 
     return [
         make_table("genetic", best),
-        make_table("optimizers", {o: errors(o) for o in rivals}, alpha=RIVAL_ALPHA),
-        make_table("seeds", {o: errors_by_seed(o) for o in rivals}, {"@seeds": [f"seed {s}" for s in seeds]}),
+        make_table("optimizers", {o: errors(o) for o in comparisons}, alpha=RIVAL_ALPHA),
+        make_table("seeds", {o: errors_by_seed(o) for o in comparisons}, {"@seeds": [f"seed {s}" for s in seeds]}),
     ]
 
 
@@ -500,12 +502,12 @@ def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
     def rows(output: str) -> Iterator[list[Cell]]:
         for p, row in reproduction.as_printed[output].rows.items():
             printed_row = printed.FRACTIONAL_ROWS[output][p]
-            ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
-            theirs = [*map(printed_row.coefficients.get, COEFFICIENT_LETTERS), *printed_row.criteria]
-            pairs = zip(ours, theirs, strict=True)
+            computed = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
+            printed_values = [*map(printed_row.coefficients.get, COEFFICIENT_LETTERS), *printed_row.criteria]
+            pairs = zip(computed, printed_values, strict=True)
             ratios = [number(float(a) / b, 3) if a is not None and b else None for a, b in pairs]
-            yield [f"p = {p}", *ours]
-            yield [printed_head(f"p = {p}"), *theirs]
+            yield [f"p = {p}", *computed]
+            yield [printed_head(f"p = {p}"), *printed_values]
             yield ["ours / printed", *ratios]
 
     tables = {symbol(o): reproduction.as_printed[o] for o in stage.outputs}

@@ -31,13 +31,13 @@ def _with_integer_orders(stage: StageParameters, *, friction: bool) -> StagePara
 
 
 def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
-    rubbing = PARAMETER_SETS["effective"]
+    effective = PARAMETER_SETS["effective"]
     # In the manufacturer's parameters, link 1 has no damping.
-    first = replace(_with_integer_orders(rubbing.stage1, friction=friction), d=0.0)
+    first = replace(_with_integer_orders(effective.stage1, friction=friction), d=0.0)
     return replace(
         DEMO_PARAMETERS,
         stage1=first,
-        stage2=_with_integer_orders(rubbing.stage2, friction=friction),
+        stage2=_with_integer_orders(effective.stage2, friction=friction),
         coupling=coupling,
         name="whole orders",
     )

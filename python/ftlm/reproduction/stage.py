@@ -288,17 +288,19 @@ def compare_optimizers(
         If PyGAD or SciPy is not installed, or the run does not start at rest.
     """
     # Reference values of a structure would influence the bounds of the optimizers.
-    blind = replace(single, reference={})
+    without_reference = replace(single, reference={})
     work: dict[str, Any] = {"threads": threads, "progress": progress}
-    searches = {k: best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES}
+    searches = {
+        k: best_orders(run, without_reference, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES
+    }
     count = searches[PRIOR_COVARIANCES[0]].candidates
     settings = optimizer or GeneticAlgorithm(seeds=seeds_for(count))
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
-    records = prepare([run], blind, None, power_of_two=True)
+    records = prepare([run], without_reference, None, power_of_two=True)
     optimizers = {
-        "genetic": genetic_search(records, blind, settings, **work),
-        "differential evolution": differential_evolution_search(records, blind, settings, **work),
+        "genetic": genetic_search(records, without_reference, settings, **work),
+        "differential evolution": differential_evolution_search(records, without_reference, settings, **work),
     }
     return Rival(count, order_grid.increment, settings.population, searches, optimizers)
 
@@ -332,7 +334,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Contest:
+class OptimizerErrors:
     """Errors of multi-innovation, genetic algorithm and differential evolution on one angle, at equal evaluations.
 
     Errors are sums of absolute simulation errors, eq. (45) of the paper.
@@ -357,11 +359,11 @@ class Contest:
     optimizers: dict[str, dict[int, float]]
 
     @classmethod
-    def of(cls, arm: str, output: str, rival: Rival) -> Contest:
+    def of(cls, arm: str, output: str, result: Rival) -> OptimizerErrors:
         """Return the errors of an optimizer comparison on one angle (`output`) of an arm."""
-        grid = {k: search.score for k, search in rival.order_grid.items()}
+        grid = {k: search.score for k, search in result.order_grid.items()}
         return cls(
-            arm, output, rival.candidates, rival.increment, grid, {n: r.errors for n, r in rival.optimizers.items()}
+            arm, output, result.candidates, result.increment, grid, {n: r.errors for n, r in result.optimizers.items()}
         )
 
 
@@ -431,7 +433,7 @@ class Panel:
     """All cases on which verdicts on claims are based: multi-innovation, other optimizers, integer and free orders."""
 
     trials: tuple[Trial, ...] = ()
-    contests: tuple[Contest, ...] = ()
+    contests: tuple[OptimizerErrors, ...] = ()
     order_comparisons: tuple[OrderComparison, ...] = ()
 
     @classmethod
@@ -536,7 +538,7 @@ def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
         arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
     )
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
-    return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), (freed,))
+    return Panel(tuple(trials), tuple(OptimizerErrors.of(arm, o, r) for o, r in stage.rivals.items()), (freed,))
 
 
 @dataclass(frozen=True)
@@ -570,7 +572,7 @@ def simulated_panel(
     :func:`panel_of` returns them.
     """
     trials: list[Trial] = []
-    contests: list[Contest] = []
+    contests: list[OptimizerErrors] = []
     freed: list[OrderComparison] = []
 
     def begin(step: str) -> None:
@@ -592,8 +594,8 @@ def simulated_panel(
             for output in structure.outputs:
                 begin("rivals")
                 single = structure.equation(output)
-                contest = compare_optimizers(own, single, grid, genetic, threads=threads, progress=steps)
-                contests.append(Contest.of(arm, output, contest))
+                comparison = compare_optimizers(own, single, grid, genetic, threads=threads, progress=steps)
+                contests.append(OptimizerErrors.of(arm, output, comparison))
         begin("freed")
         freed.append(compare_orders(stage, run, arm, threads, steps, validation=validation))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
@@ -719,7 +721,7 @@ class StageWork:
         }
         candidates, grid = {}, self.preset.order_grid
         for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
-            self.begin(f"orders on the lattice, {label}", "search")
+            self.begin(f"orders on the grid, {label}", "search")
             if self.preset.top is None:
                 candidates[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
             else:
@@ -759,8 +761,8 @@ class StageWork:
         """
         work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
-        heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
-        if not (heavy and own.increment < COARSE_INCREMENT and not own.orders):
+        is_expensive = own_terms > 1 and options.get("coefficients") == "multi-innovation"
+        if not (is_expensive and own.increment < COARSE_INCREMENT and not own.orders):
             return rank_orders(self.on, single, own, top=1, **work)
         values, coarse = own.values(single), replace(own, increment=COARSE_INCREMENT)
         ends = []
@@ -844,19 +846,19 @@ class StageWork:
             single = self.measured.equation(output)
             self.begin(f"the rivals on {output}", "rivals")
             try:
-                contest = compare_optimizers(
+                comparison = compare_optimizers(
                     self.on, single, grid, genetic, threads=self.threads, progress=self.progress
                 )
             except ModelError as error:
                 self.notes.append(page_text("rivals_omitted", reason=error))
                 return {}
-            best = dict(zip(MULTI_INNOVATION_LABELS, contest.order_grid.values(), strict=True))
-            ends: list[tuple[str, GeneticRun | SearchResult]] = [*contest.optimizers.items(), *best.items()]
+            best = dict(zip(MULTI_INNOVATION_LABELS, comparison.order_grid.values(), strict=True))
+            ends: list[tuple[str, GeneticRun | SearchResult]] = [*comparison.optimizers.items(), *best.items()]
             models = {
                 name: Model(single.with_orders(end.orders).with_coefficients(end.coefficients), orders=dict(end.orders))
                 for name, end in ends
             }
-            rivals[output] = replace(contest, models={n: self.candidate(n, model) for n, model in models.items()})
+            rivals[output] = replace(comparison, models={n: self.candidate(n, model) for n, model in models.items()})
         return rivals
 
     def in_published_form(self, model: Model) -> Model:

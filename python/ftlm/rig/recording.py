@@ -484,7 +484,7 @@ class Experiment:
             partial, source, self.progress, live, columns, _BLOCK_ROWS_REAL_TIME if paced else _BLOCK_ROWS_FAST
         )
         # Until the file is written, a second signal must not end the program.
-        link.signals.deaf |= {_Recorder.collect.__code__}
+        link.signals.uninterruptible |= {_Recorder.collect.__code__}
         try:
             link.signals.keep()
             partial.open()
@@ -549,8 +549,8 @@ def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None,
         ended = error
         faults.append(f"stopped by an error of the program ({type(error).__name__}: {error})")
     if ended is not None and not isinstance(ended, RigFault):
-        for trouble in link.shutdown_errors:
-            ended.add_note(trouble)
+        for shutdown_error in link.shutdown_errors:
+            ended.add_note(shutdown_error)
     return ended, faults + [t for t in link.shutdown_errors if t not in faults]
 
 

@@ -187,14 +187,14 @@ class SignalHandlers:
 
     Parameters
     ----------
-    deaf
+    uninterruptible
         Code objects of functions that no signal may interrupt. A signal during such a function is deferred.
     board
         Board whose motors a signal stops, or None.
     """
 
-    def __init__(self, deaf: frozenset[CodeType] = frozenset(), board: Board | None = None) -> None:
-        self.deaf = deaf
+    def __init__(self, uninterruptible: frozenset[CodeType] = frozenset(), board: Board | None = None) -> None:
+        self.uninterruptible = uninterruptible
         self._board = board
         self._before: dict[int, Any] = {}
         self._waiting: int | None = None
@@ -273,7 +273,7 @@ class SignalHandlers:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         at = frame
-        while at is not None and at.f_code not in self.deaf:
+        while at is not None and at.f_code not in self.uninterruptible:
             at = at.f_back
         if self._deferring or at is not None:
             self._waiting = number
@@ -466,32 +466,32 @@ def shut_down(board: Board) -> list[str]:
     If neither 0 V nor disabled amplifiers nor the expiry is confirmed, the motors may still have current. The watchdog
     is then not stopped and the board not closed, so that the watchdog can still act.
     """
-    troubles: list[str] = []
-    _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), troubles)
-    zero = _try_step("writing 0 V", lambda: board.write((0.0, 0.0)), troubles)
-    off = _try_step("disabling the amplifiers", lambda: board.enable(False), troubles)
-    _try_step("stopping the task", board.stop, troubles)
+    errors: list[str] = []
+    _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), errors)
+    zero = _try_step("writing 0 V", lambda: board.write((0.0, 0.0)), errors)
+    off = _try_step("disabling the amplifiers", lambda: board.enable(False), errors)
+    _try_step("stopping the task", board.stop, errors)
     # A user-defined board may lack let_expire().
     let_expire = getattr(board, "let_expire", None)
     expired = False
     if not (zero and off) and let_expire is not None:
         results: list[bool] = []
-        _try_step("waiting for the watchdog", lambda: results.append(let_expire()), troubles)
+        _try_step("waiting for the watchdog", lambda: results.append(let_expire()), errors)
         expired = any(results)
         if expired:
-            troubles.append("the watchdog was let expire instead, which puts 0 V out")
+            errors.append("the watchdog was let expire instead, which puts 0 V out")
     if not (zero or off or expired):
-        troubles.append(MOTORS_LIVE_MESSAGE)
-        return troubles
-    _try_step("stopping the watchdog", board.stop_watchdog, troubles)
-    _try_step("closing the board", board.close, troubles)
-    return troubles
+        errors.append(MOTORS_LIVE_MESSAGE)
+        return errors
+    _try_step("stopping the watchdog", board.stop_watchdog, errors)
+    _try_step("closing the board", board.close, errors)
+    return errors
 
 
-def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
+def _try_step(name: str, step: Callable[[], None], errors: list[str]) -> bool:
     """Run a shutdown step, once more if it is interrupted, and return whether it succeeded.
 
-    If it failed, an error message is appended to `troubles`.
+    If it failed, an error message is appended to `errors`.
     """
     for _ in (1, 2):
         try:
@@ -503,7 +503,7 @@ def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
             break
         else:
             return True
-    troubles.append(f"{name} failed: {why}")
+    errors.append(f"{name} failed: {why}")
     return False
 
 

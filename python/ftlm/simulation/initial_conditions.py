@@ -433,5 +433,5 @@ def needs_history(
     finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
     if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > START_SETTINGS.white_inflation:
         return start_score(many, terms[1], few) + START_SETTINGS.history_margin < start_score(few, terms[0], few)
-    doubt = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
-    return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, doubt)
+    significance_level = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
+    return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, significance_level)

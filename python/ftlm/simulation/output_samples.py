@@ -311,14 +311,14 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
     structure = model.structure
     if structure.initial != "auto" or not structure.is_linear or not has_memory(structure):
         return []
-    looked = (
+    candidates = (
         (run.name, _start_residuals(structure, run))
         for run in runs
         if rest_evidence(run, structure) is None and resolve_initial_conditions(run, structure) == "rest"
     )
     return [
         name
-        for name, residuals in looked
+        for name, residuals in candidates
         if residuals is not None and _is_reportable(residuals) and _requires_history([residuals])
     ]
 

@@ -39,7 +39,7 @@ def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record
     return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
-def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
+def simulate_record(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
     """Return simulated block-pulse means by output, and coefficients of initial terms by output and exponent.
 
     `rec` is one of the :func:`comparison_records`. The coefficients are fitted to the measured outputs by least

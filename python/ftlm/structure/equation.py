@@ -209,8 +209,8 @@ class Friction:
 
         Parameters must be fixed. Without a Stribeck term, fs is 0 and vs is 1.
         """
-        more = self.stribeck
-        near = (0.0, 1.0) if more is None else (more.strength or 0.0, float(more.speed))
+        stribeck_term = self.stribeck
+        near = (0.0, 1.0) if stribeck_term is None else (stribeck_term.strength or 0.0, float(stribeck_term.speed))
         return (self.strength or 0.0, *near)
 
     @property
@@ -224,23 +224,29 @@ class Friction:
     @property
     def identified_coefficients(self) -> dict[str, float]:
         """Values of friction parameters that were free and have been fixed, by name."""
-        more = self.stribeck
+        stribeck_term = self.stribeck
         pairs = [(self.name, self.coefficient)]
-        if more is not None:
-            pairs += [(more.name, more.coefficient), (more.speed_name, more.speed)]
+        if stribeck_term is not None:
+            pairs += [(stribeck_term.name, stribeck_term.coefficient), (stribeck_term.speed_name, stribeck_term.speed)]
         return {name: float(value) for name, value in pairs if name is not None}
 
     @property
     def numbers(self) -> list[float]:
         """Coulomb coefficient, then coefficient and speed of a Stribeck term; no parameter may be free."""
-        more = self.stribeck
-        return [float(v) for v in (self.coefficient, *(() if more is None else (more.coefficient, more.speed)))]
+        stribeck_term = self.stribeck
+        return [
+            float(v)
+            for v in (
+                self.coefficient,
+                *(() if stribeck_term is None else (stribeck_term.coefficient, stribeck_term.speed)),
+            )
+        ]
 
     def with_numbers(self, values: Sequence[float]) -> Friction:
         """Return the friction with other parameter values, which have the sequence of :attr:`numbers`."""
         coefficient, *near = values
-        more = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
-        return replace(self, coefficient=coefficient, more=more)
+        stribeck_term = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
+        return replace(self, coefficient=coefficient, more=stribeck_term)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free parameters fixed to values; the others stay free."""

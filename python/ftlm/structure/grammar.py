@@ -154,7 +154,7 @@ class EquationParser(TokenReader):
             return self
         self.left = self._sum(is_lhs=True)
         self._expect("=")
-        if self._sees("0", "the end"):
+        if self._next_is("0", "the end"):
             self._take()
         else:
             self.right = self._sum()
@@ -196,7 +196,7 @@ class EquationParser(TokenReader):
         """Parse a product, or a number times a sum in parentheses, and return its terms."""
         factor = self._numbers(sign)
         name: str | None = None
-        if self._sees("(") and not self._is_expression_group():
+        if self._next_is("(") and not self._is_expression_group():
             self._take()
             inner = self._sum(closed=True)
             self._expect(")")
@@ -212,7 +212,7 @@ class EquationParser(TokenReader):
                     f"{self._peek()[1]} at character {self._peek()[2] + 1} follows the coefficient {name}; write "
                     "numbers first"
                 )
-            if self._sees("(") and self._is_plain_sum():
+            if self._next_is("(") and self._is_plain_sum():
                 raise self._multiplied_sum(name, at)
         begin = self._peek()[2]
         order, operand = self._operand()
@@ -240,7 +240,7 @@ class EquationParser(TokenReader):
         """Parse numbers at the start of a product, and return `factor` times these numbers."""
         while self._peek()[0] == "number":
             factor *= float(self._take()[1])
-            while self._sees("/") and self._peek(1)[0] == "number":
+            while self._next_is("/") and self._peek(1)[0] == "number":
                 factor = self._divisors(factor)
             self._accept("*")
         return factor
@@ -284,7 +284,7 @@ class EquationParser(TokenReader):
     def _take_printed_offset(self) -> bool:
         """Parse and store an offset in parentheses, as a structure prints it; return False for any other term."""
         for kind, phrase in OFFSET_PHRASES.items():
-            if self._sees("(") and self._peek(1)[0] == "name":
+            if self._next_is("(") and self._peek(1)[0] == "name":
                 values = [self._peek(k)[1] for k in range(2, 3 + len(phrase))]
                 if values == [*phrase, ")"]:
                     if self.offset:
@@ -306,7 +306,7 @@ class EquationParser(TokenReader):
             if not depth or kind == "end":
                 return offset
 
-    def _is_curved(self, end: int) -> bool:
+    def _has_power_or_function(self, end: int) -> bool:
         """Whether the next `end` tokens contain a power or a function."""
         return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
 
@@ -317,7 +317,7 @@ class EquationParser(TokenReader):
             value = self._peek(k)[1]
             depth += (value == "(") - (value == ")")
             signs += depth == 1 and k > 1 and value in "+-"
-        return signs > 0 and not self._is_curved(end) and self._peek(end)[1] not in ("^", "*")
+        return signs > 0 and not self._has_power_or_function(end) and self._peek(end)[1] not in ("^", "*")
 
     def _is_expression_group(self) -> bool:
         """Whether parentheses after a number are a factor of a non-linear term, not a sum to multiply out.
@@ -328,9 +328,9 @@ class EquationParser(TokenReader):
         end = self._closing_distance()
         if self._peek(end)[1] in ("^", "*"):
             return True
-        if not self._is_curved(end):
+        if not self._has_power_or_function(end):
             return False
-        if self._sees("(", "(") and self._closing_distance(1) == end - 1:
+        if self._next_is("(", "(") and self._closing_distance(1) == end - 1:
             return True
         depth, pure = 0, False
         for k in range(end):
@@ -349,7 +349,7 @@ class EquationParser(TokenReader):
         """Parse a term after its coefficient; return (order, signal), or (order, expression) of a non-linear term."""
         begin = self._position
         operator = self._operator()
-        if operator is not None and self._sees("("):
+        if operator is not None and self._next_is("("):
             shape = self._group()
             if self._peek()[1] in ("^", "*"):
                 raise self._error(
@@ -374,7 +374,7 @@ class EquationParser(TokenReader):
         if derivative is not None and not derivative[1]:
             self._position += derivative[2]
             return derivative[0]
-        if not self._sees("D"):
+        if not self._next_is("D"):
             return None
         self._take()
         return self._order() if self._accept("^") else Order(1.0)
@@ -435,7 +435,7 @@ class EquationParser(TokenReader):
                 raise self._error(
                     f"the order {order} at character {at + 1} is free inside a non-linear term; give its value"
                 )
-            if derived and self._sees("^"):
+            if derived and self._next_is("^"):
                 whole = self._readable[at : self._peek()[2]].strip()
                 raise self._error(
                     f"a power of {whole} at character {self._peek()[2] + 1} has two meanings; write ({whole})^…"
@@ -535,18 +535,18 @@ class EquationParser(TokenReader):
 
     def _time_argument(self, signal: str) -> None:
         """Parse ``(t)`` or ``(t - 0.06 s)`` after a signal, and store the delay of the signal."""
-        if not (self._sees("(", "t") and self._peek(2)[1] in ")-+"):
+        if not (self._next_is("(", "t") and self._peek(2)[1] in ")-+"):
             self._check_delay(signal, 0.0)
             return
         self._position += 2
         delay: Value = 0.0
-        if self._sees("+") and self._peek(1)[0] == "number":
+        if self._next_is("+") and self._peek(1)[0] == "number":
             self._take()
             delay = -float(self._take()[1])
         elif self._accept("-"):
             delay = self._delay(signal)
         # A printed model has the unit s after a delay.
-        self._position += self._sees("s")
+        self._position += self._next_is("s")
         self._expect(")")
         self._check_delay(signal, delay)
 
@@ -575,9 +575,9 @@ class EquationParser(TokenReader):
             name = self._take()[1]
             self._accept("*")
         # The exponential factor of Stribeck friction stands before sign(D y).
-        end = self._closing_distance(1) if self._sees("exp", "(") else 0
+        end = self._closing_distance(1) if self._next_is("exp", "(") else 0
         has_factor = end > 0 and self._peek(end + (self._peek(end)[1] == "*"))[1] == "sign"
-        if not has_factor and not self._sees("sign", "("):
+        if not has_factor and not self._next_is("sign", "("):
             self._position = begin
             return False
         near = self._stribeck_factor() if has_factor else None
@@ -691,7 +691,7 @@ class EquationParser(TokenReader):
         if kind != "name":
             raise self._syntax_error("the name of a signal")
         self._take()
-        if self._sees("(", "s", ")"):
+        if self._next_is("(", "s", ")"):
             self._position += 3
         self.plain.add(value)
         return value
@@ -769,7 +769,7 @@ class EquationParser(TokenReader):
         for sign in self._signs():
             product = self._factor()
             while self._peek()[0] in ("number", "name") or self._peek()[1] in ("(", "*", "/"):
-                if self._sees("/"):
+                if self._next_is("/"):
                     divisor = self._divisors(1.0)
                     product = [(divisor * c, name, order) for c, name, order in product]
                 else:
@@ -784,7 +784,7 @@ class EquationParser(TokenReader):
         if kind == "number":
             self._take()
             inner: SymbolicPolynomial = [(float(value), None, Order())]
-        elif value == "sqrt" and self._sees("sqrt", "(", "s", ")"):
+        elif value == "sqrt" and self._next_is("sqrt", "(", "s", ")"):
             self._position += 4
             return [(1.0, None, Order(0.5))]
         elif kind == "name" and value not in FUNCTION_NAMES:

@@ -157,12 +157,12 @@ def replace_nonlinearities(
 
 
 def check_nonlinearities(
-    limits: Sequence[InputNonlinearity], delays: Mapping[str, object], late: Mapping[str, object]
+    limits: Sequence[InputNonlinearity], delays: Mapping[str, object], free_delays: Mapping[str, object]
 ) -> None:
     """Raise ModelError for a combination of non-linearities and delays of an input that cannot be estimated.
 
     These are two non-linearities of one kind, more than one free parameter, a free limit with a fixed delay, and a free
-    dead zone with a saturation. `delays` are the fixed delays and `late` the free delays, by input.
+    dead zone with a saturation. `delays` are the fixed delays and `free_delays` the free delays, by input.
     """
     for k, limit in enumerate(limits):
         if any((o.signal, o.law) == (limit.signal, limit.law) for o in limits[:k]):
@@ -171,7 +171,7 @@ def check_nonlinearities(
             continue
         name, words = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is free"
         other = next((o for o in limits if o.signal == name and o is not limit), None)
-        if name in late or (other is not None and other.free is not None):
+        if name in free_delays or (other is not None and other.free is not None):
             second = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.law]
             raise ModelError(
                 f"{words}, and so is its {second}; only one parameter of an input can be estimated: give the other one"

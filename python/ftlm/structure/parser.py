@@ -120,8 +120,8 @@ def equation(
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
     if coupling is None:
-        rubs = len(equations) > 1 and any(e.friction is not None for e in equations)
-        coupling = "simulated" if rubs else "measured"
+        has_friction = len(equations) > 1 and any(e.friction is not None for e in equations)
+        coupling = "simulated" if has_friction else "measured"
     structure = (
         Structure(
             equations=tuple(equations),

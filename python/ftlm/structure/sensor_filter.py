@@ -74,7 +74,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return int(bottom - top + 1e-9)
 
     @property
-    def holds_answers(self) -> bool:
+    def has_impulse_transient(self) -> bool:
         """Whether the transient of the filter is a sum of impulse responses: no zeros and only integer orders."""
         whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
         return whole and not any(order for coefficient, order in self.numerator if coefficient)

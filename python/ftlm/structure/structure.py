@@ -233,12 +233,12 @@ class Structure:
         These are several equations with measured coupling, a filtered input, a coefficient law on a friction parameter,
         and a history as initial conditions.
         """
-        rubbing = [self.equations[i].output for i in self.friction_equations]
-        words = f"the equation of {rubbing[0]} has friction"
+        friction_outputs = [self.equations[i].output for i in self.friction_equations]
+        words = f"the equation of {friction_outputs[0]} has friction"
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, but the structure has {len(self.equations)} equations with measured coupling, which are "
-                f"not simulated together; give the equation of {rubbing[0]} a structure of its own, or "
+                f"not simulated together; give the equation of {friction_outputs[0]} a structure of its own, or "
                 f"use {parameter('coupling', 'simulated')}"
             )
         if self.all_filtered:
@@ -309,7 +309,7 @@ class Structure:
         sensor = self.sensor_filter
         if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
             return 0
-        if not (self.all_filtered or sensor.holds_answers):
+        if not (self.all_filtered or sensor.has_impulse_transient):
             through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
                 f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run has "
@@ -416,15 +416,15 @@ class Structure:
         """
         check_known("order", orders, self.order_names)
         numbers: dict[str, float] = {}
-        lattices = dict(self.order_values)
+        grids = dict(self.order_values)
         for name, spec in orders.items():
             values = parse_values(name, spec)
             if isinstance(values, float):
                 numbers[name] = values
             else:
-                lattices[name] = values
+                grids[name] = values
         equations = tuple(e.with_orders(numbers) for e in self.equations)
-        return replace(self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers})
+        return replace(self, equations=equations, order_values={n: v for n, v in grids.items() if n not in numbers})
 
     def with_coefficients(self, values: Mapping[str, float]) -> Structure:
         """Return the structure with some free coefficients fixed to values.
@@ -493,8 +493,8 @@ class Structure:
     @property
     def free_inputs(self) -> tuple[FreeInputParameter, ...]:
         """Parameters of inputs to estimate: free delays, then free saturations and dead zones."""
-        late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
-        return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
+        delay_parameters = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
+        return tuple([*delay_parameters, *(limit.free for limit in self.limits if limit.free is not None)])
 
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
         """Return the structure with free delays and limits fixed to values by name, such as ``delay_u``, ``sat_u``."""

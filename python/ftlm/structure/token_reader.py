@@ -80,7 +80,7 @@ class TokenReader:
         self._position += 1
         return token
 
-    def _sees(self, *values: str) -> bool:
+    def _next_is(self, *values: str) -> bool:
         """Whether the next tokens are the given texts."""
         return all(self._peek(k)[1] == value for k, value in enumerate(values))
 
@@ -123,9 +123,9 @@ class TokenReader:
     def _signs(self) -> Iterator[float]:
         """Yield the sign of each term of a sum, up to the first token that cannot continue it."""
         is_first = True
-        while is_first or self._sees("+") or self._sees("-"):
+        while is_first or self._next_is("+") or self._next_is("-"):
             is_first, sign = False, 1.0
-            while self._sees("+") or self._sees("-"):
+            while self._next_is("+") or self._next_is("-"):
                 sign *= -1.0 if self._take()[1] == "-" else 1.0
             yield sign
 

@@ -209,9 +209,9 @@ class AutomaticSelection:
         fits = self._fit_integer_orders()
         if fits:
             # High orders overfit under colored noise, so the best form of each order is validated, whatever its BIC.
-            leaders = _best_of_each_order(fits)
-            near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in leaders]
-            leading = [f for f in fits if f.form in leaders]
+            best_by_order = _best_of_each_order(fits)
+            near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in best_by_order]
+            leading = [f for f in fits if f.form in best_by_order]
             best = self._validate([*leading, *near[: VALIDATED_CANDIDATES - len(leading)]])
             every = _rank([*fits, *self._fit_fractional_forms(fits, best)])
             least = min(f.bic for f in every if f.form is not None)

@@ -167,8 +167,8 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
     runs = list(folds.runs)
     runs += [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in runs)]
     subsets: dict[str, ScreenedSubset] = {}
-    for ground in base_models(inside, tuple(runs)):
-        for one in score_subsets(ground, folds, pool):
+    for base in base_models(inside, tuple(runs)):
+        for one in score_subsets(base, folds, pool):
             key = signature(inside.build(one.change.variant))
             if key not in subsets or one.score < subsets[key].score:
                 subsets[key] = one
@@ -223,11 +223,11 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
             for offset in (True,) if structure.offset == "constant" else offsets:
                 variant = Variant(frozenset(n for n, _ in free), tuple(sorted(whole.items())), offset)
                 present = [replace(t, order=Order(p)) for t, p in terms_present]
-                ground = base_model(variant, present, top, free)
-                key = "" if ground is None else signature(ground.structure)
-                if ground is not None and key not in keys:
+                base = base_model(variant, present, top, free)
+                key = "" if base is None else signature(base.structure)
+                if base is not None and key not in keys:
                     keys.add(key)
-                    yield ground
+                    yield base
 
 
 def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[float | None]:
@@ -257,21 +257,21 @@ def _decimation(runs: Sequence[Run]) -> int:
 
 
 def score_subsets(
-    ground: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
+    base: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
 ) -> list[ScreenedSubset]:
     """Return subsets of the columns of a base model with scores from their residuals on validation data.
 
     The coefficients of output terms are those at the given `points`, or on a grid that is refined around the best ones.
     """
-    problem = FreeProblem.of(ground.structure)
-    grid = Objective(problem, ground.runs, [1.0], decimation=_decimation(ground.runs))
+    problem = FreeProblem.of(base.structure)
+    grid = Objective(problem, base.runs, [1.0], decimation=_decimation(base.runs))
     # Computed once here, because the threads share them.
     experiments, ends = grid.experiments, np.cumsum([0, *(count for _, count in grid.counts)]).tolist()
-    places = [problem.coefficients.index(f"column{k}") for k in range(len(ground.columns))]
+    places = [problem.coefficients.index(f"column{k}") for k in range(len(base.columns))]
 
     def products_at(point: tuple[float, ...]) -> Floats | None:
         """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
-        values = ground.coefficients(point)
+        values = base.coefficients(point)
         iterate = Iterate([], [values.get(n, 0.0) for n in problem.coefficients], "", {})
         try:
             outcome = minimize_cost(problem, experiments, iterate, evaluations=1, plain=True).outcome
@@ -286,22 +286,20 @@ def score_subsets(
         return [products_at(point) for point in points]
 
     def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
-        stable = [p for p in points if ground.is_stable(p)]
+        stable = [p for p in points if base.is_stable(p)]
         chunks = [stable[k : k + POINTS_PER_TASK] for k in range(0, len(stable), POINTS_PER_TASK)]
-        grounds = [g for part in pool.map_items(one, chunks) for g in part]
-        return [(p, g) for p, g in zip(stable, grounds, strict=True) if g is not None]
+        gram_matrices = [g for part in pool.map_items(one, chunks) for g in part]
+        return [(p, g) for p, g in zip(stable, gram_matrices, strict=True) if g is not None]
 
-    solutions = all_of(list(ground.grid_points()) if points is None else points)
-    judge = SubsetScorer.of(
-        ground, folds, [float(np.nanvar(r[ground.structure.outputs[0]])) for r in ground.runs], ends
-    )
+    solutions = all_of(list(base.grid_points()) if points is None else points)
+    scorer = SubsetScorer.of(base, folds, [float(np.nanvar(r[base.structure.outputs[0]])) for r in base.runs], ends)
     spacing = (LOG_FREQUENCY_SPACING, math.log(DAMPING_FACTORS[1] / DAMPING_FACTORS[0]))
     for zoom in range(GRID_REFINEMENTS + 1):
         if not solutions:
             return []
         products = Products([p for p, _ in solutions], np.array([g for _, g in solutions]))
-        scores = judge.score_all(products)
-        if zoom == GRID_REFINEMENTS or points is not None or not ground.own:
+        scores = scorer.score_all(products)
+        if zoom == GRID_REFINEMENTS or points is not None or not base.own:
             break
         spacing = (spacing[0] / 2, spacing[1] / 2)
         points_before = {p for p, _ in solutions}
@@ -315,23 +313,23 @@ def score_subsets(
         solutions += all_of([p for p in dict.fromkeys(near) if p not in points_before])
     out = []
     for subset, verdict in scores.items():
-        change = _change(ground, subset)
+        change = _change(base, subset)
         if change is not None:
-            values = ground.coefficients(products.points[verdict.points[-1]])
-            values |= {ground.columns[k].coefficient: c for k, c in zip(subset, verdict.coefficients, strict=True)}
+            values = base.coefficients(products.points[verdict.points[-1]])
+            values |= {base.columns[k].coefficient: c for k, c in zip(subset, verdict.coefficients, strict=True)}
             out.append(ScreenedSubset(change, values, verdict.score))
     return out
 
 
-def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
+def _change(base: BaseModel, subset: Sequence[int]) -> Change | None:
     """Return the change that adds a subset of columns to a structure; None if the result is invalid."""
-    columns = [ground.columns[k] for k in subset]
-    whole = {**ground.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
-    coefficients = ground.variant.coefficients | {c.coefficient for c in columns}
-    variant = replace(ground.variant, coefficients=frozenset(coefficients)).with_integer_orders(whole)
-    if not ground.inside.is_valid(variant):
+    columns = [base.columns[k] for k in subset]
+    whole = {**base.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
+    coefficients = base.variant.coefficients | {c.coefficient for c in columns}
+    variant = replace(base.variant, coefficients=frozenset(coefficients)).with_integer_orders(whole)
+    if not base.inside.is_valid(variant):
         return None
-    return Change(describe_structure(ground.inside.build(variant)), variant)
+    return Change(describe_structure(base.inside.build(variant)), variant)
 
 
 @dataclass(frozen=True)
@@ -368,7 +366,7 @@ class SubsetScorer:
     sizes: Floats
 
     @classmethod
-    def of(cls, ground: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
+    def of(cls, base: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
         """Return the scorer of a base model and its folds.
 
         `spread` are the variances of the output in each run, and `ends` are the boundaries of the runs among the
@@ -376,12 +374,12 @@ class SubsetScorer:
         """
 
         def place(run: Run) -> int:
-            return next(k for k, r in enumerate(ground.runs) if r is run)
+            return next(k for k, r in enumerate(base.runs) if r is run)
 
         fit_parts = [tuple(place(r) for r in f.runs) for f in folds.parts]
         sizes = np.array([v * (b - a) for v, (a, b) in zip(spread, itertools.pairwise(ends), strict=True)])
         return cls(
-            ground.columns,
+            base.columns,
             (*fit_parts, tuple(place(r) for r in folds.runs)),
             tuple(place(f.validation_run) for f in folds.parts),
             sizes,
@@ -420,13 +418,13 @@ class SubsetScorer:
         count = math.prod(1 + len(c) for c in choices.values()) - 1
         out: dict[tuple[int, ...], SubsetScore] = {}
 
-        def judge(subsets: Iterable[tuple[int, ...]]) -> None:
+        def score_missing(subsets: Iterable[tuple[int, ...]]) -> None:
             for subset in subsets:
                 if subset not in out:
                     out[subset] = self.score_subset(values, pooled, subset)
 
         if count <= MAX_EXHAUSTIVE_SUBSETS:
-            judge(
+            score_missing(
                 tuple(sorted(k for k in subset if k is not None))
                 for subset in itertools.product(*([None, *c] for c in choices.values()))
                 if any(k is not None for k in subset)
@@ -442,6 +440,6 @@ class SubsetScorer:
                 if not set(places) & set(subset)
                 for k in places
             }
-            judge(sorted(wider))
+            score_missing(sorted(wider))
             candidate_subsets = sorted(wider, key=lambda s: (out[s].score, s))[:width]
         return out

@@ -92,25 +92,27 @@ class NestedStructures:
         """
         out: dict[str, str | None] = {}
         for item in self.structure.equations:
-            rubs = item.friction
-            if rubs is None:
+            friction = item.friction
+            if friction is None:
                 continue
             own = f"friction of {item.output}"
-            if isinstance(rubs.coefficient, str):
+            if isinstance(friction.coefficient, str):
                 out[own] = None
-            if rubs.stribeck is not None and isinstance(rubs.stribeck.coefficient, str):
+            if friction.stribeck is not None and isinstance(friction.stribeck.coefficient, str):
                 out[f"{own} near rest"] = own if own in out else None
         return out
 
-    def _with_frictions(self, item: Equation, rubs: frozenset[str]) -> Equation:
+    def _with_frictions(self, item: Equation, frictions: frozenset[str]) -> Equation:
         """Return an equation with all mandatory friction terms and the given optional friction terms."""
         friction, own, choices = item.friction, f"friction of {item.output}", self.frictions
         if friction is None:
             return item
-        if own in choices and own not in rubs:
+        if own in choices and own not in frictions:
             return replace(item, coulomb=UNSET)
         near = f"{own} near rest"
-        return replace(item, coulomb=replace(friction, more=UNSET)) if near in choices and near not in rubs else item
+        return (
+            replace(item, coulomb=replace(friction, more=UNSET)) if near in choices and near not in frictions else item
+        )
 
     @property
     def without_optional_friction(self) -> Structure:
@@ -345,8 +347,8 @@ def signature(structure: Structure) -> str:
             for t in item.terms
         )
         parts.append(f"{item.output} {'free' if item.order.is_single else item.order} {terms}")
-    rubs = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
-    rest = (structure.offset, structure.initial, structure.coupling, rubs)
+    frictions = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
+    rest = (structure.offset, structure.initial, structure.coupling, frictions)
     return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
 
 

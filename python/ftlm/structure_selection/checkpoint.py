@@ -51,14 +51,14 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
     validation: bytes
 
     @classmethod
-    def of(cls, runs: Sequence[Run], candidates: object, judges: Sequence[Run], words: str) -> Request:
-        """Return the request of a selection; `judges` are the validation runs, `words` describe the validation."""
+    def of(cls, runs: Sequence[Run], candidates: object, validation_runs: Sequence[Run], words: str) -> Request:
+        """Return the request of a selection; `words` describe the validation."""
         return cls(
             ALGORITHM_VERSION,
             __version__,
             _digest([_run_content(r) for r in runs]),
             _digest(candidates),
-            _digest([words, [_run_content(r) for r in judges]]),
+            _digest([words, [_run_content(r) for r in validation_runs]]),
         )
 
     def difference(self, other: Request) -> str | None:

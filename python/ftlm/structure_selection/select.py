@@ -202,21 +202,21 @@ def select(
     every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
-    sought = automatic_problems(folds.runs, delay, driven_by) if isinstance(candidates, str) else []
+    problems_by_output = automatic_problems(folds.runs, delay, driven_by) if isinstance(candidates, str) else []
     searched = [candidates] if isinstance(candidates, Structure) else []
     idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
     if idle:
         raise ModelError(f"{idle[0]} has no free parameter; name a coefficient or an order, or use model.compare(runs)")
-    if delay and not sought:
+    if delay and not problems_by_output:
         raise ModelError(f"{parameter('delay')} is used with 'auto'; give the delays to ftlm.equation instead")
-    if driven_by and not sought:
+    if driven_by and not problems_by_output:
         raise ModelError(f"{parameter('driven_by')} is used with 'auto'; give the terms to ftlm.equation instead")
     if delay and (unknown := [n for n in delay if n not in folds.runs[0].inputs]):
         raise ModelError(
             f"{parameter('delay')}: {unknown[0]!r} is not an input{nearest(unknown[0], folds.runs[0].inputs)}; the "
             f"runs have {', '.join(folds.runs[0].inputs)}"
         )
-    automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in sought]
+    automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in problems_by_output]
     for structure in (*searched, *every.values(), *automatic):
         # Raise here once, instead of a failure of every candidate.
         prepare(
@@ -227,28 +227,30 @@ def select(
             gaps=True,
         )
     if store is None:
-        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, sought)
+        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, problems_by_output)
     request = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
     with Store(store, request) as open_store:
-        return _run_selection(CandidateEvaluator(folds, workers, progress, store=open_store), searched, every, sought)
+        return _run_selection(
+            CandidateEvaluator(folds, workers, progress, store=open_store), searched, every, problems_by_output
+        )
 
 
 def _run_selection(
     work: CandidateEvaluator,
     searched: Sequence[Structure],
     every: Mapping[str, Structure],
-    sought: Sequence[OutputProblem],
+    problems_by_output: Sequence[OutputProblem],
 ) -> Selection:
-    """Return the selection among the structures `every`, those nested in `searched`, or automatic ones for `sought`."""
-    if sought:
-        selection = _select_automatically(work, sought)
+    """Return the selection among the structures `every`, those nested in `searched`, or automatic ones."""
+    if problems_by_output:
+        selection = _select_automatically(work, problems_by_output)
         winner = selection.trials[selection.chosen]
         poor = winner.unstable or winner.validation_fit < MIN_VALIDATION_FIT
-        duration = _piece_duration(sought) if poor and not work.folds.unseen_runs else None
+        duration = _piece_duration(problems_by_output) if poor and not work.folds.unseen_runs else None
         if duration is None:
             return selection
         folds = Folds.of_pieces(work.folds.runs, duration)
-        problems = [replace(p, runs=folds.runs, initial="caputo") for p in sought]
+        problems = [replace(p, runs=folds.runs, initial="caputo") for p in problems_by_output]
         split = _select_automatically(replace(work, folds=folds, trials=[]), problems)
         return split if split.trials[split.chosen].validation_fit > winner.validation_fit else selection
     for structure in searched:
@@ -258,20 +260,24 @@ def _run_selection(
     return _identify_choice(work, _choose(work, prefers_integer_orders=False))
 
 
-def _select_automatically(work: CandidateEvaluator, sought: Sequence[OutputProblem]) -> Selection:
+def _select_automatically(work: CandidateEvaluator, problems_by_output: Sequence[OutputProblem]) -> Selection:
     """Choose an automatic structure for each output, and identify the chosen equations together."""
     choices = []
-    for problem in sought:
+    for problem in problems_by_output:
         work.trials = []
         AutomaticSelection(problem, work).run()
         choices.append(_choose(work, prefers_integer_orders=True))
     return _identify_choice(work, choices[0] if len(choices) == 1 else _combine_choices(work, choices))
 
 
-def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
+def _piece_duration(problems_by_output: Sequence[OutputProblem]) -> float | None:
     """Return the duration [s] of the pieces into which runs of an unstable plant are divided; None for other plants."""
     forms = [IntegerOrderForm(n, n - 1) for n in range(1, MAX_ORDER + 1)]
-    tests = [least_squares_piece_test(p.runs, form.structure(p), p.runs[0].units) for p in sought for form in forms]
+    tests = [
+        least_squares_piece_test(p.runs, form.structure(p), p.runs[0].units)
+        for p in problems_by_output
+        for form in forms
+    ]
     return min((t for t in tests if t is not None), key=lambda t: t.residual).seconds if any(tests) else None
 
 
@@ -323,8 +329,8 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
     An input has a single delay in a structure. If the chosen equations have different delays of an input, the best
     candidates without free delays are combined instead. Raise ConvergenceError if the combination cannot be fitted.
     """
-    agreed = _have_common_delays([c.winner for c in choices])
-    if not agreed:
+    has_common_delays = _have_common_delays([c.winner for c in choices])
+    if not has_common_delays:
         choices = [_without_free_delays(choice) for choice in choices]
     winners = [c.winner for c in choices]
     structures = [w.structure for w in winners]
@@ -343,7 +349,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
         describe_structure(combination), combination, work.fit_candidate(combination, [start]), fine=True
     )
     reason = " ".join(c.reason for c in choices)
-    if not agreed:
+    if not has_common_delays:
         reason += (
             " The outputs do not have the same delay, and an input has one: the equations have no free delay. Select "
             "each output on its own for its delay."

@@ -233,8 +233,8 @@ def initial_guesses(
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
         at = whole.get(name, 0.5 * (low + high))
         usual[name] = [min(max(at + shift, low), high) for shift in INITIAL_ORDER_SHIFTS]
-    rubs = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
-    usual |= {n: [0.0] for n in problem.coefficients if n not in rubs}
+    friction_names = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
+    usual |= {n: [0.0] for n in problem.coefficients if n not in friction_names}
     usual |= {
         i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in INITIAL_INPUT_FRACTIONS] for i in problem.inputs
     }

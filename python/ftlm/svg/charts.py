@@ -66,11 +66,11 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
         raise DataError(f"a histogram needs two finite values at least, not {finite.size}; give a longer run")
     # Twice the number of bars of Sturges' rule. The range is symmetric about the mean and includes all outliers.
     mean, deviation = float(np.mean(finite)), float(np.std(finite))
-    reach = float(np.max(np.abs(finite - mean)))
-    if reach <= max(1e-12 * abs(mean), MIN_DIFFERENCE):
-        reach = 0.1 * abs(mean) if abs(mean) > MIN_DIFFERENCE else 1.0
+    half_range = float(np.max(np.abs(finite - mean)))
+    if half_range <= max(1e-12 * abs(mean), MIN_DIFFERENCE):
+        half_range = 0.1 * abs(mean) if abs(mean) > MIN_DIFFERENCE else 1.0
     bars = min(MAX_BARS, 2 * math.ceil(math.log2(finite.size)) + 1)
-    edges = mean + np.linspace(-reach, reach, bars + 1)
+    edges = mean + np.linspace(-half_range, half_range, bars + 1)
     counts, _ = np.histogram(finite, edges)
     width = edges[1] - edges[0]
     at = np.linspace(edges[0], edges[-1], 121)
@@ -155,7 +155,7 @@ class BarChart(Figure):
         return [(name, as_floats(name, values, gaps=True)) for name, values in self.groups]
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def axis_limits(self) -> tuple[float, float]:
         """Lower and upper limit of the value axis."""
         finite = np.concatenate([v[np.isfinite(v)] for _, v in self.tables])
         end = self.high if self.high is not None else float(np.max(finite, initial=self.low))
@@ -172,10 +172,10 @@ class BarChart(Figure):
         left, value = 10 + max(map(text_width, shown)), 52.0
         top = 8.0 + 18.0 * (len(tables) > 1)
         w, step = width - left - value, BAR_HEIGHT_PX * len(tables) + 8
-        low, high = self.ends
-        across = ticks(low, high, 4 if narrow else 8)
+        low, high = self.axis_limits
+        x_ticks = ticks(low, high, 4 if narrow else 8)
         plot = PlotArea(left, top, w, step * len(names), (low, high, 0.0, 1.0))
-        grid, axis = plot.grid(across, None)
+        grid, axis = plot.grid(x_ticks, None)
         bars, texts = [], []
         for i, name in enumerate(shown):
             texts.append(svg_text(left - 6, top + step * i + BAR_HEIGHT_PX * len(tables) / 2 + 6, name, "end"))
@@ -191,7 +191,7 @@ class BarChart(Figure):
             texts += [_shade(k + 1, place, 3, 14, 10), svg_text(place + 19, 12, name, "start")]
             place += 19 + text_width(name) + 16
         bottom = top + plot.height
-        pairs = zip(across.values, across.labels, strict=True)
+        pairs = zip(x_ticks.values, x_ticks.labels, strict=True)
         texts += [svg_text(float(plot.x_pixels(v)), bottom + 15, label, "middle") for v, label in pairs]
         texts.append(svg_text(left + w, bottom + 32, self.x_label, "end"))
         parts = [grid, *bars, axis, text_group(texts)]
@@ -266,7 +266,7 @@ class PlaneChart(Figure):
         return None if line is None else line[np.isfinite(line)]
 
     @property
-    def corners(self) -> tuple[complex, complex]:
+    def plot_corners(self) -> tuple[complex, complex]:
         """Lower left and upper right corner of the plotted region, which may cut off parts of the curve."""
         if self.line is None:
             far = float(np.max(np.abs(self.values), initial=0.0)) or 1.0
@@ -276,9 +276,9 @@ class PlaneChart(Figure):
         pad = LOCUS_MARGIN_SHARE * (max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0)
         return low - complex(pad, pad), high + complex(pad, pad)
 
-    def sector_outline(self, reach: float) -> list[complex]:
-        """Return the corners of the shaded sector, which extends beyond the square of half-width `reach` around 0."""
-        edge = 8 * reach
+    def sector_outline(self, half_range: float) -> list[complex]:
+        """Return the corners of the shaded sector, which extends beyond the square of half-width `half_range`."""
+        edge = 8 * half_range
         arm = edge * complex(math.cos(self.sector), math.sin(self.sector))
         # The two corners on the right keep the outline outside the visible square for every half-angle.
         return [0, arm.conjugate(), edge * (1 - 1j), edge * (1 + 1j), arm]
@@ -286,35 +286,35 @@ class PlaneChart(Figure):
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup: grid, axes through zero, points and clipped curves."""
         width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
-        low, high = self.corners
-        upward = ticks(low.imag, high.imag, 5)
-        left, top = max(30.0, 10 + max(map(text_width, upward.labels))), 26.0 if self.line is None else 48.0
+        low, high = self.plot_corners
+        y_ticks = ticks(low.imag, high.imag, 5)
+        left, top = max(30.0, 10 + max(map(text_width, y_ticks.labels))), 26.0 if self.line is None else 48.0
         w, spread = width - left - 14.0, high - low
         # Equal scale [px per unit] on both axes.
         scale = min(w / spread.real, PLANE_HEIGHT_PX / spread.imag)
         h = max(scale * spread.imag, 90.0)
         corner = (low + high) / 2 - complex(w, h) / scale / 2
         frame = corner.real, corner.real + w / scale, corner.imag, corner.imag + h / scale
-        across, upward = ticks(*frame[:2], 4 if narrow else 8), ticks(*frame[2:], max(2, round(h / 48)))
+        x_ticks, y_ticks = ticks(*frame[:2], 4 if narrow else 8), ticks(*frame[2:], max(2, round(h / 48)))
         plot = PlotArea(left, top, w, h, frame)
         box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
         view = " ".join(f"{v:.1f}" for v in box.values())
         x, y = _places(plot, [0])[0]
         through = faint_path(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
         curves = self._crosses(plot) if self.line is None else self._locus(plot, self.line)
-        texts = plot.labels((across, upward), (self.x_label, self.y_label), width)
+        texts = plot.labels((x_ticks, y_ticks), (self.x_label, self.y_label), width)
         if self.line is not None:
             texts += [stroke_path(1, [(left, 12.0), (left + 20, 12.0)]), svg_text(left + 26, 16, "model", "start")]
             texts += [_dot(left + 90, 12.0), svg_text(left + 100, 16, "measured", "start")]
         inside = element("svg", [through, *curves], **box, viewBox=view)
-        parts = [*plot.grid(across, upward), inside, text_group(texts)]
+        parts = [*plot.grid(x_ticks, y_ticks), inside, text_group(texts)]
         return svg(width, round(top + h + 44), self.title, self._describe(), parts, narrow=narrow)
 
     def _describe(self) -> str:
         values = self.values
         if self.line is not None:
-            ends = f"from {_complex_text(values[0])} to {_complex_text(values[-1])}"
-            return f"Locus in the complex plane. {values.size} measured points {ends}, and the model's curve."
+            range_text = f"from {_complex_text(values[0])} to {_complex_text(values[-1])}"
+            return f"Locus in the complex plane. {values.size} measured points {range_text}, and the model's curve."
         inside = int(np.sum(np.abs(np.angle(values)) < self.sector))
         listed = ", ".join(map(_complex_text, values.tolist()))
         return f"{values.size} points in the plane: {listed or 'none'}. {inside} in the shaded sector."
@@ -391,8 +391,8 @@ class Landscape(Figure):
     @property
     def title(self) -> str:  # type: ignore[override]
         """Title of the chart, with the names of both orders."""
-        across, upward = map(symbol, self.names)
-        return f"Score over {across} and {upward}"
+        x_name, y_name = map(symbol, self.names)
+        return f"Score over {x_name} and {y_name}"
 
     @cached_property
     def valid_scores(self) -> Floats:
@@ -410,8 +410,8 @@ class Landscape(Figure):
 
     def _best_orders(self) -> str:
         row, column = self.best
-        across, upward = map(symbol, self.names)
-        return f"{across} = {self.x[column]:g}, {upward} = {self.y[row]:g}"
+        x_name, y_name = map(symbol, self.names)
+        return f"{x_name} = {self.x[column]:g}, {y_name} = {self.y[row]:g}"
 
     @property
     def caption(self) -> str:  # type: ignore[override]
@@ -428,10 +428,9 @@ class Landscape(Figure):
 
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
-        ends = float(np.nanmin(self.valid_scores)), float(np.nanmax(self.valid_scores))
-        described = (
-            f"Heat map of {self.score}. Best {number(ends[0])} at {self._best_orders()}; worst {number(ends[1])}."
-        )
+        score_range = float(np.nanmin(self.valid_scores)), float(np.nanmax(self.valid_scores))
+        best_score, worst_score = map(number, score_range)
+        described = f"Heat map of {self.score}. Best {best_score} at {self._best_orders()}; worst {worst_score}."
         best = self.best
         width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
         rows, columns = self.scores.shape
@@ -441,7 +440,7 @@ class Landscape(Figure):
         w, h = width - left - max(14.0, LETTER_WIDTH_PX * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
         cell_w, cell_h, bottom = w / columns, h / rows, top + h
         out = []
-        for i, row in enumerate(_classes(self.scores, *ends).tolist()):
+        for i, row in enumerate(_classes(self.scores, *score_range).tolist()):
             j = 0
             # Adjacent cells of a row with equal color are drawn as one rectangle.
             for step, alike in groupby(row):
@@ -454,16 +453,16 @@ class Landscape(Figure):
             x, y = centre
             out.append(element("circle", cx=x, cy=y, r=7, fill="none", stroke=colour, stroke_width=thickness))
         fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER_WIDTH_PX * longest + 14))))
-        across, upward = self.names
+        x_name, y_name = self.names
         size = 20.0 if narrow else 26.0
         column_labels, row_labels = _label_indices(columns, fit), _label_indices(rows, min(rows, 7))
         texts = [
             *(svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in column_labels),
             *(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end") for k in row_labels),
-            svg_text(4, top - 12, f"order {symbol(upward)}", "start"),
-            svg_text(left + w, bottom + 34, f"order {symbol(across)}", "end"),
-            svg_text(left, bottom + 76, f"score {number(ends[0], 3)}", "start"),
-            svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(ends[1], 3), "end"),
+            svg_text(4, top - 12, f"order {symbol(y_name)}", "start"),
+            svg_text(left + w, bottom + 34, f"order {symbol(x_name)}", "end"),
+            svg_text(left, bottom + 76, f"score {number(score_range[0], 3)}", "start"),
+            svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(score_range[1], 3), "end"),
         ]
         out.append(text_group(texts))
         out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT_COLORS)]
@@ -562,8 +561,8 @@ class CorrelationMap(Figure):
         left = 10 + max(map(text_width, labels))
         cell = min((width - left - 8) / count, MAX_CELL_PX)
         # Column names that are wider than a cell are rotated by 90 degrees.
-        turned = max(map(text_width, labels)) > cell - 4
-        top = 8 + (max(map(text_width, labels)) if turned else 16)
+        rotated = max(map(text_width, labels)) > cell - 4
+        top = 8 + (max(map(text_width, labels)) if rotated else 16)
         out, texts = [], []
         for i in range(count):
             for j in range(count):
@@ -588,7 +587,7 @@ class CorrelationMap(Figure):
             x = left + (k + 0.5) * cell
             turn = f"translate({x + 4:.1f} {top - 6:.1f}) rotate(-90)"
             upright = element("text", [label], x=0, y=0, transform=turn)
-            marks.append(upright if turned else svg_text(x, top - 6, label, "middle"))
+            marks.append(upright if rotated else svg_text(x, top - 6, label, "middle"))
         foot = top + count * cell + 12
         size = 18.0 if narrow else 22.0
         for k, colour in enumerate(CORRELATION_COLORS):

@@ -218,9 +218,9 @@ class LineChart(Figure):
         """
         if not self.lines:
             raise DataError("a chart needs at least one line; give (name, values) pairs")
-        across = as_floats("x", self.x, gaps=True).copy()
+        x_values = as_floats("x", self.x, gaps=True).copy()
         drawn, notes = [], []
-        x = _logarithms(across) if self.log_x else across
+        x = _logarithms(x_values) if self.log_x else x_values
         bands: Iterable[Any] = (*self.bands, *(None for _ in self.lines))
         for (name, values), style, band in zip(self.lines, line_styles(n for n, _ in self.lines), bands, strict=False):
             y = as_floats(f"line {name!r}", values, gaps=True).copy()
@@ -228,7 +228,7 @@ class LineChart(Figure):
                 raise DataError(f"line {name!r} has shape {y.shape}, x {x.shape}; give arrays of one length")
             bad = ~(np.isfinite(y) & np.isfinite(x)) | (np.abs(y) > MAX_DRAWN_VALUE)
             if np.any(bad) and name not in self.dots:
-                first = across[int(np.argmax(bad))]
+                first = x_values[int(np.argmax(bad))]
                 where = f" (first at {self.x_label} = {first:.4g})" if np.isfinite(first) else ""
                 notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
             y[bad] = np.nan
@@ -288,36 +288,36 @@ class LineChart(Figure):
         bottom, top = limits(neutral, 0.0)
         reach = MAX_STRAY_HEIGHTS * (top - bottom)
         floor, ceiling = bottom - reach, top + reach
-        strays = []
+        exceeding = []
         for y, line in zip(every, lines, strict=True):
             if y.size and (np.min(y) < floor or np.max(y) > ceiling):
                 middle = (bottom + top) / 2
-                strays.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
-        return max(low, floor), min(high, ceiling), strays
+                exceeding.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
+        return max(low, floor), min(high, ceiling), exceeding
 
     @property
     def note(self) -> str:
         """Caption, followed by sentences on values that are not drawn and on lines that exceed the axis."""
-        strays = [
+        exceeding = [
             f"{name} leaves the axis (to {number(10.0**far if self.log_y else far, 3)})."
             for name, far in self._y_limits[2]
         ]
-        return " ".join(part for part in (self.caption, *self.content[1], *strays) if part)
+        return " ".join(part for part in (self.caption, *self.content[1], *exceeding) if part)
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
         """Return the ticks of the horizontal axis and of the vertical axis."""
         x_low, x_high, y_low, y_high = self.frame
-        across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
-        return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
+        x_ticks = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
+        return x_ticks, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
         lines = self.content[0]
         width, height = (NARROW_WIDTH_PX, 240) if narrow else (self.width, self.height)
-        across, upward = self.ticks(narrow=narrow)
+        x_ticks, y_ticks = self.ticks(narrow=narrow)
         named = [line for line in lines if line.name]
         legend = _legend(named, width) if narrow else []
-        left = max(30.0, 10 + max(map(text_width, upward.labels)))
+        left = max(30.0, 10 + max(map(text_width, y_ticks.labels)))
         # The space on the right of the lines contains a gap, a line sample and the label.
         side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
         right = 14.0 if narrow or not named else 34 + side
@@ -325,14 +325,14 @@ class LineChart(Figure):
         if narrow:
             height += int(top - 26)
         plot = PlotArea(left, top, width - left - right, height - top - 40.0, self.frame)
-        texts = plot.labels((across, upward), (self.x_label, self.y_label), width)
+        texts = plot.labels((x_ticks, y_ticks), (self.x_label, self.y_label), width)
         if not any(np.isfinite(line.y).any() for line in lines):
             middle = plot.left + plot.width / 2, plot.top + plot.height / 2
             texts.append(svg_text(*middle, "no finite value to draw", "middle"))
         if named:
             texts += _legend_marks(legend) if narrow else _end_labels(named, plot)
-        parts = [*plot.grid(across, upward), self._curves(plot, narrow=narrow), text_group(texts)]
-        data = {} if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
+        parts = [*plot.grid(x_ticks, y_ticks), self._curves(plot, narrow=narrow), text_group(texts)]
+        data = {} if self.log_x or self.log_y or self.stems else _zoomable(plot, x_ticks, y_ticks)
         if self.slider and not (narrow or self.log_x or self.log_y):
             # The slider has fewer positions on a page with many charts, whose lines have fewer points.
             values = [(line.name, line.style, line.y) for line in lines]
@@ -397,11 +397,11 @@ def _describe_line(line: _Line, log_y: bool) -> str:
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
-def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> dict[str, str]:
+def _zoomable(plot: PlotArea, x_ticks: Ticks, y_ticks: Ticks) -> dict[str, str]:
     """Return SVG attributes for the zoom script: axis limits, plot area [px], and powers of ten of the tick labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
-    return {"data_frame": frame, "data_plot": place, "data_powers": f"{across.power} {upward.power}"}
+    return {"data_frame": frame, "data_plot": place, "data_powers": f"{x_ticks.power} {y_ticks.power}"}
 
 
 def _outline(line: _Line, plot: PlotArea, points: int) -> str:
@@ -468,7 +468,7 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
     return "".join(parts).replace(" -", "-")
 
 
-def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
+def _line_sample(line: _Line, x: float, y: float, length: int) -> Markup:
     """Return a short sample of a line as SVG markup for its label: `length` [px] from (x, y), or a dot."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
     return element("path", **_stroke(line.style, dots=line.dots), d=f"M{at:.1f} {y:.1f}h{reach}")
@@ -495,7 +495,7 @@ def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
             places[k] = min(places[k], places[k + 1] - LINE_HEIGHT_PX)
     out = []
     for i, y in zip(order, places, strict=True):
-        out.append(_swatch(lines[i], x + 8, y, 16))
+        out.append(_line_sample(lines[i], x + 8, y, 16))
         out.append(svg_text(x + 28, y + 4, truncate_text(lines[i].name, MAX_LABEL_CHARACTERS), "start"))
     return out
 
@@ -516,7 +516,7 @@ def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
     out = []
     for line, x, row in entries:
         y = 8.0 + LINE_HEIGHT_PX * row
-        out.append(_swatch(line, x, y, 20))
+        out.append(_line_sample(line, x, y, 20))
         out.append(svg_text(x + 26, y + 4, truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS), "start"))
     return out
 

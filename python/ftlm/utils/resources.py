@@ -136,9 +136,9 @@ def estimate_duration(seconds: float, threads: int) -> float:
     return seconds * machine_slowdown() / (1.0 + PARALLEL_EFFICIENCY * (max(threads, 1) - 1))
 
 
-def duration_bounds(seconds: float, came_to: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
+def duration_bounds(seconds: float, factors: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
     """Return the (shortest, longest) expected duration [s]: the estimate `seconds` times each of the two factors."""
-    return came_to[0] * seconds, came_to[1] * seconds
+    return factors[0] * seconds, factors[1] * seconds
 
 
 def output_error_cost(samples: int, numbers: int) -> float:

@@ -41,12 +41,12 @@ def is_rest(samples: Floats) -> bool:
 
 def estimate_noise(samples: Floats) -> float:
     """Return the standard deviation of white noise on a smooth signal, from the median of second differences."""
-    bends = np.diff(samples, 2)
-    bends = bends[~np.isnan(bends)]
-    if bends.size == 0:
+    differences = np.diff(samples, 2)
+    differences = differences[~np.isnan(differences)]
+    if differences.size == 0:
         # No three adjacent samples are present, so missing samples are dropped.
-        bends = np.diff(samples[~np.isnan(samples)], 2)
-    return robust_deviation(bends) / float(np.sqrt(6.0))
+        differences = np.diff(samples[~np.isnan(samples)], 2)
+    return robust_deviation(differences) / float(np.sqrt(6.0))
 
 
 #: Orders of the differences from which the noise is estimated, and minimum number of differences of an order.
@@ -65,11 +65,11 @@ def white_noise(samples: Floats) -> float:
     start = samples[:NOISE_SAMPLES]
     least = estimate_noise(start)
     for order in DIFFERENCE_ORDERS:
-        bends = np.diff(start, order)
-        bends = bends[~np.isnan(bends)]
-        if bends.size < MIN_DIFFERENCES:
+        differences = np.diff(start, order)
+        differences = differences[~np.isnan(differences)]
+        if differences.size < MIN_DIFFERENCES:
             break
-        least = min(least, robust_deviation(bends) / math.sqrt(math.comb(2 * order, order)))
+        least = min(least, robust_deviation(differences) / math.sqrt(math.comb(2 * order, order)))
     return least
 
 

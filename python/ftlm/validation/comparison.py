@@ -33,7 +33,7 @@ from ftlm.simulation.output_samples import (
     measured_samples,
     runs_in_motion,
 )
-from ftlm.simulation.simulate import comparison_records, respond
+from ftlm.simulation.simulate import comparison_records, simulate_record
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.structure import Structure, offset_exponents
 from ftlm.svg.html_page import Table
@@ -337,8 +337,8 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
     times = [compared_times(run, model.structure) for run in runs]
     result = _pooled_comparison(model, runs, parts, m, times, sampled=True)
     findings = list(result.findings)
-    if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
-        findings.append(make_finding("sampling_coarse", run=", ".join(restless)))
+    if unconverged_runs := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
+        findings.append(make_finding("sampling_coarse", run=", ".join(unconverged_runs)))
     if moving := runs_in_motion(model, runs):
         findings.append(make_finding("simulated_from_rest", run=", ".join(moving)))
     return replace(result, findings=tuple(findings))
@@ -360,7 +360,7 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
     pairs = zip(comparison_records(several, model, m), records(several, model.structure, m), strict=True)
     parts = []
     for free, full in pairs:
-        responses, initial = respond(model, free)
+        responses, initial = simulate_record(model, free)
         parts.append(_run_errors(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
     middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
     return _pooled_comparison(model, several, parts, m, middles, sampled=False)
@@ -474,14 +474,16 @@ def _run_errors(
     """
     (step, means, sensor), inputs, powers = full.core(), list(full.inputs), full.start
     core = step, np.nan_to_num(means) if model.structure.has_nonlinear_terms else means, sensor
-    missed = {
+    equation_residuals = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
         # An equation with friction has no equation error, because noise determines the sign of a measured velocity
         # at rest. An output with gaps or with an undefined non-linear term has none either.
         if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
-    return _RunErrors(full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, missed)
+    return _RunErrors(
+        full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, equation_residuals
+    )
 
 
 def _pooled_comparison(
@@ -490,10 +492,10 @@ def _pooled_comparison(
     """Return a comparison with the errors of each run, and with the errors pooled over all runs."""
     equation_error, output_error = _pooled_errors(parts)
     # Single runs may have equation errors although the pooled one is undefined.
-    rubbed = {e.output for e in model.equations if e.friction is not None}
+    friction_outputs = {e.output for e in model.equations if e.friction is not None}
     gaps = {name for run in runs for name in run.missing_samples}
-    unequated = {
-        o: FRICTION_REASON if o in rubbed else MISSING_SAMPLES_REASON if o in gaps else UNDEFINED_TERM_REASON
+    missing_reasons = {
+        o: FRICTION_REASON if o in friction_outputs else MISSING_SAMPLES_REASON if o in gaps else UNDEFINED_TERM_REASON
         for o, f in equation_error.items()
         if f is UNKNOWN_METRICS
     }
@@ -513,7 +515,7 @@ def _pooled_comparison(
         times,
         sampled,
         offsets if model.structure.offset != "none" or any(offsets) else (),
-        unequated,
+        missing_reasons,
     )
 
 
@@ -553,17 +555,17 @@ def near_identity_findings(
         # Negated so that NaN counts as bad. An undefined equation error is no evidence against the model.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
         worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not unknown
-        useless = not output.nr <= MAX_NORMALIZED_RESIDUAL
+        has_poor_fit = not output.nr <= MAX_NORMALIZED_RESIDUAL
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
             listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
             numbers = {"orders": listed, "alpha": alpha, "nr": output.nr, "equation_nr": equation.nr}
             findings.append(make_finding("equation_says_identity", output=name, **numbers))
-        elif worse and useless:
+        elif worse and has_poor_fit:
             findings.append(
                 make_finding("simulation_worse_than_equation_error", output=name, nr=output.nr, equation_nr=equation.nr)
             )
-        elif useless:
+        elif has_poor_fit:
             findings.append(make_finding("explains_little", output=name, nr=output.nr))
     return findings
 
@@ -648,7 +650,7 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
     title = "Both errors"
     rows: list[list[Cell]] = []
     headings: dict[int, str] = {}
-    unequated: dict[str, str] = {}
+    missing_reasons: dict[str, str] = {}
 
     def add(heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics]) -> None:
         headings[len(rows)] = heading
@@ -666,14 +668,14 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
 
     for label, comparison in compared:
         runs = comparison.per_run
-        unequated |= comparison.without_equation_error
+        missing_reasons |= comparison.without_equation_error
         if len(runs) > 1:
             add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
         for name, equation, output in runs:
             add(f"{label}: {name}", equation, output)
-    reasons = [f"{words}." for words in describe_missing_equation_errors(unequated)]
+    reasons = [f"{words}." for words in describe_missing_equation_errors(missing_reasons)]
     own = 1 + len(_METRIC_LABELS)
-    if unequated and all(cell is None for row in rows for cell in row[1:own]):
+    if missing_reasons and all(cell is None for row in rows for cell in row[1:own]):
         # Four empty columns would push the others off a narrow screen.
         shown_rows: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
         single = (("", 1), ("output error (simulation)", 4))
@@ -682,7 +684,7 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
         )
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
-        "close to one another; only the simulation shows what the model knows."
+        "close to one another; only the simulation shows how well the model predicts."
     )
     groups = (("", 1), ("equation error", 4), ("output error (simulation)", 4))
     return Table(

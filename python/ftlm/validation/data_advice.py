@@ -186,12 +186,12 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     No finding is given if quantization, saturation or rest without an input explains the interval.
     """
     y = run[name]
-    still = np.diff(y) == 0
-    starts, lengths = _true_intervals(still)
+    is_unchanged = np.diff(y) == 0
+    starts, lengths = _true_intervals(is_unchanged)
     if not lengths.size:
         return
     # Coarse quantization or stiction gives many constant intervals; a dead channel only one or two.
-    if float(np.mean(still)) > 0.3 and np.median(lengths) > 1:
+    if float(np.mean(is_unchanged)) > 0.3 and np.median(lengths) > 1:
         return
     at = int(np.argmax(lengths))
     first, rows = int(starts[at]), int(lengths[at]) + 1
@@ -282,8 +282,8 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
     for n in run.inputs:
         jump = np.abs(np.diff(run[n]))
         # A pulse of one sample in an input may cause a pulse in a fast output.
-        pulsed = (jump > 0.2 * np.ptp(run[n])) & (np.ptp(run[n]) > 0)
-        out &= ~(pulsed[:-1] & pulsed[1:])
+        is_pulse = (jump > 0.2 * np.ptp(run[n])) & (np.ptp(run[n]) > 0)
+        out &= ~(is_pulse[:-1] & is_pulse[1:])
     rows = np.flatnonzero(out) + 1
     if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
         return
@@ -316,8 +316,8 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
             # A measured current follows its command, which jumps.
             continue
         # Both slopes oppose the jump: the quantity continued while its counter restarted.
-        stays = max(abs(slope_before), abs(slope_after)) < 0.5 * abs(steps[at])
-        if stays and slope_before * steps[at] < 0 and slope_after * steps[at] < 0:
+        slope_is_small = max(abs(slope_before), abs(slope_after)) < 0.5 * abs(steps[at])
+        if slope_is_small and slope_before * steps[at] < 0 and slope_after * steps[at] < 0:
             rows.append(at + 1)
     if not rows:
         return

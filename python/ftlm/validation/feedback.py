@@ -148,7 +148,7 @@ def feedback_test(
     if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE * longest):
         if _has_clock(changes):
             return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
-        return FeedbackTest("undecided", f"{levels} levels: a relay and a command look alike", rows=longest)
+        return FeedbackTest("undecided", f"{levels} levels: a relay and a command are indistinguishable", rows=longest)
     count = sum(c.size for c in changes)
     dense = 2 * count >= longest
     if not dense and count < MIN_CHANGES:
@@ -445,13 +445,13 @@ class _Innovations:
         # Without feedback, past outputs cannot explain most of the innovation of a rough input.
         if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
             return result("found")
-        doubt = ""
+        objection = ""
         if _local_color(clipped) > 1:
-            doubt = "its innovations are not white"
+            objection = "its innovations are not white"
         elif _local_past(clipped, self.past[:, :2]) > 1:
-            doubt = "its innovations depend on its past in parts of the run, as those of a sweep"
-        if doubt and ratio <= PLACEBO_RATIO_IN_DOUBT:
-            return result("undecided", doubt)
+            objection = "its innovations depend on its past in parts of the run, as those of a sweep"
+        if objection and ratio <= PLACEBO_RATIO_IN_DOUBT:
+            return result("undecided", objection)
         if ratio <= 1 or count * share * self.scale**2 < MIN_FEEDBACK_POWER:
             if now > 1:
                 return result("undecided", at_once)
@@ -466,8 +466,8 @@ class _Innovations:
         last = min(end - begin for begin, end in self.places) // 3
         far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)).tolist() if last > first else []
         placebo = max((self._ratio(k, clipped)[0] for k in far), default=1.0)
-        if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if doubt else PLACEBO_RATIO * placebo):
-            return result("undecided", doubt or f"outputs far in the past explain as much (ratio {placebo:.2g})")
+        if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if objection else PLACEBO_RATIO * placebo):
+            return result("undecided", objection or f"outputs far in the past explain as much (ratio {placebo:.2g})")
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:

@@ -371,8 +371,8 @@ def run_residual_tests(
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
     for run, sampled in zip(runs, free, strict=True):
         with np.errstate(invalid="ignore"):
-            missed = measured_samples(model, run, sampled.refinement) - sampled.outputs
-        for name, series in zip(model.outputs, missed, strict=True):
+            residuals_by_output = measured_samples(model, run, sampled.refinement) - sampled.outputs
+        for name, series in zip(model.outputs, residuals_by_output, strict=True):
             residuals[name].append(np.ascontiguousarray(series[1:-1]))
     read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
     inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
@@ -392,9 +392,9 @@ def run_residual_tests(
         signs: list[Floats] = []
         if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
-            moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
-            signs = _signs_of_motion(moves)
-            slope = math.inf if item.order.constant > 1.0 else sign_tanh_slope(moves)
+            motion = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
+            signs = _signs_of_motion(motion)
+            slope = math.inf if item.order.constant > 1.0 else sign_tanh_slope(motion)
             outputs[name] = _test_direction(outputs[name], signs, lags, slope)
         if sensitivities is not None and outputs[name].has_colored_correlation:
             own = sensitivities().get(name, [])
