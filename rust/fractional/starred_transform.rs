@@ -1,4 +1,4 @@
-//! Starred transforms of samples, computed from Laplace transforms by Poisson's summation formula.
+//! The starred transforms of samples, computed from Laplace transforms by Poisson's summation formula.
 //!
 //! Samples f(kh) of a signal f with Laplace transform F have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n
 //! F(s + 2πi n/h). The sample at a jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier
@@ -35,7 +35,7 @@ const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
-/// Starred transform Σ f(kh) e^{−skh} of uniform samples f(kh), on the line Re s = σ.
+/// The starred transform Σ f(kh) e^{−skh} of uniform samples f(kh), on the line Re s = σ.
 pub(crate) struct StarredTransform {
     /// Sampling interval h \[s\].
     step: f64,

@@ -113,7 +113,7 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
 /// Singular value decomposition of a matrix, given by its columns.
 #[non_exhaustive]
 pub struct SingularValues {
-    /// Left singular vectors, each as long as the columns.
+    /// The left singular vectors, each as long as the columns.
     pub left: Vec<Vec<f64>>,
     /// Singular values in descending order. Their count is the smaller of the number and the length of the columns.
     pub values: Vec<f64>,

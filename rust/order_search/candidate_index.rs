@@ -18,7 +18,7 @@ pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
     pub(crate) grid: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// Unused part of the memory limit \[bytes\].
+    /// The unused part of the memory limit \[bytes\].
     pub(crate) spare_bytes: u64,
     /// Column of the regressor, by block of the order grid, then by term, then by grid value of the order of the term.
     /// A block has one order α of the equation.

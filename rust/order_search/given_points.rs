@@ -39,7 +39,7 @@ pub struct Points {
     inputs: Vec<bool>,
     norm: Norm,
     samples: usize,
-    /// Cached columns, one per record: the kernel for a term of the output, the fractional integral of any other
+    /// The cached columns, one per record: the kernel for a term of the output, the fractional integral of any other
     /// signal.
     cache: HashMap<Key, Vec<Vec<f64>>>,
 }

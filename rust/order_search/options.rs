@@ -79,7 +79,7 @@ pub enum Estimator {
     LeastSquares,
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
-    /// Refined instrumental variables with instruments from the noise-free signals of the records.
+    /// Estimation by refined instrumental variables, with instruments from the noise-free signals of the records.
     InstrumentalVariables(InstrumentalSettings),
 }
 

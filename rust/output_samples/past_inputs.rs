@@ -2,8 +2,8 @@
 //!
 //! Before the first sample, each equation has an unknown zero-mean Gaussian input. It is piecewise constant on octaves
 //! of time, over [`PAST_LENGTHS`] lengths of the run. Its variance, relative to the response to the inputs of the run,
-//! maximizes the marginal likelihood (empirical Bayes). Without the prior, free initial terms would absorb errors of the
-//! model. Initial values by Caputo's definition and levels of the outputs have no prior.
+//! maximizes the marginal likelihood (empirical Bayes). Without the prior, free initial terms would absorb errors of
+//! the model. Initial values by Caputo's definition and levels of the outputs have no prior.
 
 use std::sync::Arc;
 
@@ -23,8 +23,8 @@ use crate::signal::statistics::{inner, mean, variance_inflation};
 
 /// Length of the past that is modeled, in lengths of the run.
 const PAST_LENGTHS: usize = 4;
-/// Standard deviations of past inputs to choose from. With 1, their response at the first sample is as large as the root
-/// mean square of the response to the inputs of the run.
+/// Standard deviations of past inputs to choose from. With 1, their response at the first sample is as large as the
+/// root mean square of the response to the inputs of the run.
 const PAST_INPUT_SIZES: [f64; 6] = [0.0, 0.03, 0.1, 0.3, 1.0, 3.0];
 /// Ratio to the largest singular value below which a singular value of responses is rounding.
 const MIN_SINGULAR_VALUE_RATIO: f64 = 1e-10;
@@ -42,8 +42,8 @@ struct WeightedColumns {
 impl OutputSimulation {
     /// Return the posterior mean of the initial terms that represent past inputs: (exponent, coefficient) by equation.
     ///
-    /// `exponents` are those of all powers of time by equation, `free` those without a prior. With `has_level`, the level
-    /// of each output is a further term without a prior, with the exponent ∞. None if a response is not finite.
+    /// `exponents` are those of all powers of time by equation, `free` those without a prior. With `has_level`, the
+    /// level of each output is a further term without a prior, with the exponent ∞. None if a response is not finite.
     ///
     /// # Errors
     /// As [`OutputSimulation::refine`]; [`Error::Length`] for exponents of another number of equations.
@@ -55,14 +55,17 @@ impl OutputSimulation {
     /// use ftlm::recording::{Channel, Recording, Role};
     /// // D^0.5 y = −y after a unit step of an unknown input, which lasted 2 s and ended at the first sample.
     /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 0, order: 0.0 }] };
-    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 14, long_record_intervals: 1 << 14, memory: 1 << 30 };
+    /// let (tolerance, max_pulses) = (1e-6, 1 << 14);
+    /// let options = Refinement { tolerance, max_pulses, long_record_intervals: 1 << 14, memory: 1 << 30 };
     /// let decay = |t: f64| t.exp() * libm::erfc(t.sqrt());
     /// let y: Vec<f64> = (0..200).map(|k| 0.05 * f64::from(k)).map(|t| decay(t) - decay(t + 2.0)).collect();
     /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", y.clone(), Role::Output)], vec![0])?;
-    /// let simulation = OutputSimulation::new(run.into(), vec![Equation::new(structure, vec![-1.0])?], Vec::new(), None)?;
+    /// let plant = vec![Equation::new(structure, vec![-1.0])?];
+    /// let simulation = OutputSimulation::new(run.into(), plant, Vec::new(), None)?;
     /// let exponents = [vec![0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0]];
     /// let terms = simulation.fit_past_inputs(&exponents, &[vec![0.0]], false, options, &Stop::default())?;
-    /// let fit = simulation.refine(&InitialTerms::Given(terms.unwrap_or_default()), options, &Stop::default())?.samples;
+    /// let terms = InitialTerms::Given(terms.unwrap_or_default());
+    /// let fit = simulation.refine(&terms, options, &Stop::default())?.samples;
     /// assert!(fit.outputs[0].iter().zip(&y).all(|(fitted, y)| (fitted - y).abs() < 2e-3));
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -239,8 +242,8 @@ impl WeightedColumns {
 
 /// Posterior mean of the coefficients of columns in a target, under independent normal priors of one variance.
 ///
-/// The variance of the prior maximizes the marginal likelihood. What the columns do not explain is noise, whose variance
-/// is increased for autocorrelation.
+/// The variance of the prior maximizes the marginal likelihood. The part of the target that the columns do not explain
+/// is noise, whose variance is increased for autocorrelation.
 fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
     let SingularValues { left, values, right } = decompose(columns)?;
     let along: Vec<f64> = left.iter().map(|u| inner(u, target)).collect();
@@ -275,7 +278,7 @@ fn not_decomposed() -> Error {
     Error::Internal { what: "singular values of responses to past inputs that do not converge".into() }
 }
 
-/// Left singular vectors and singular values above rounding.
+/// The left singular vectors and singular values above rounding.
 fn significant(all: SingularValues) -> (Rows, Vec<f64>) {
     let least = MIN_SINGULAR_VALUE_RATIO * all.values.first().copied().unwrap_or(0.0);
     all.left.into_iter().zip(all.values).filter(|(_, value)| *value > least).unzip()

@@ -164,7 +164,9 @@ def two_modes_run(seed: int, level: float, trend: float = 0.0) -> ftlm.Run:
     """A run of the plant with 2 % noise, an output level, and a trend [1/s]; its inputs move from the first sample."""
     g = np.random.default_rng(seed)
     u = np.repeat(g.uniform(-2.0, 2.0, 100), 25)
-    y = held([MODES[n] for n in ("b2", "b1", "b0")], [1.0, *(MODES[n] for n in ("a3", "a2", "a1", "a0"))], u, 0.01)
+    y = hold_response(
+        [MODES[n] for n in ("b2", "b1", "b0")], [1.0, *(MODES[n] for n in ("a3", "a2", "a1", "a0"))], u, 0.01
+    )
     y = y + 0.02 * np.std(y) * g.standard_normal(y.size) + level + trend * 0.01 * np.arange(y.size)
     return ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
 

@@ -27,7 +27,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
-    """Measured frequency response from one input to one output; :meth:`from_arrays` creates it from arrays.
+    """Frequency response as measured from one input to one output; :meth:`from_arrays` creates it from arrays.
 
     Parameters
     ----------

@@ -218,7 +218,7 @@ _ROW_INDEX_UNIT = "sequence"
 
 @dataclass(frozen=True)
 class TableDialect:
-    """Detected layout and position of a table in a text.
+    """Layout and position of a table in a text.
 
     Parameters
     ----------

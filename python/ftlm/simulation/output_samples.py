@@ -1,4 +1,4 @@
-"""Simulated output samples, and the choice of the initial conditions of a run by them."""
+"""Simulation of output samples, and the choice of the initial conditions of a run by them."""
 
 from __future__ import annotations
 

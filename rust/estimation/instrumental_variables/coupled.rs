@@ -69,9 +69,9 @@ enum FreeCoefficient {
 /// Solutions and row-major covariance matrices, one each per equation. The matrices are omitted unless requested.
 type StepResult = (Vec<Solution>, Vec<Vec<f64>>);
 
-/// Simulated outputs, weights and cost at one set of coefficients.
+/// The simulated outputs, weights and cost at one set of coefficients.
 struct Iterate {
-    /// Simulated outputs, indexed by record, equation and sample.
+    /// The simulated outputs, indexed by record, equation and sample.
     responses: Vec<Vec<Vec<f64>>>,
     /// Weight 1/σ² of each output, where σ is the standard deviation of its output error.
     weights: Vec<f64>,

@@ -173,7 +173,7 @@ struct CoupledProblem<'a> {
     structures: &'a [Structure],
     fixed: &'a [Vec<Option<f64>>],
     exponents: &'a [Vec<f64>],
-    /// Excluded initial terms, per equation.
+    /// The excluded initial terms, per equation.
     dropped: Vec<Dropped>,
     /// Spectra that do not change between iterations, indexed by equation and record.
     spectra: Vec<Vec<EquationSpectra<'a>>>,

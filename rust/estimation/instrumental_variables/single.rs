@@ -31,7 +31,7 @@ pub struct InstrumentSource<'a> {
     pub initial: Vec<&'a Kernel>,
     /// Spectrum of the measured output.
     pub target: &'a Kernel,
-    /// Measured output.
+    /// The measured output.
     pub output: &'a [f64],
 }
 
@@ -246,7 +246,7 @@ pub fn step(
     Ok((solution, covariance))
 }
 
-/// Prefiltered regressors and target of one record.
+/// The prefiltered regressors and target of one record.
 struct FilteredRegression {
     phi: Vec<Vec<f64>>,
     target: Vec<f64>,

@@ -58,7 +58,7 @@ impl InstrumentalSettings {
 /// Coefficients of one equation: those of its terms, then those of its initial terms record by record.
 pub type Solution = Vec<f64>;
 
-/// Excluded initial terms of one equation, as pairs of record index and exponent index.
+/// The excluded initial terms of one equation, as pairs of record index and exponent index.
 pub type Dropped = Vec<(usize, usize)>;
 
 /// Return the equations with the given structures and the term coefficients of the solutions.

@@ -44,7 +44,7 @@ const MAX_COST_RATIO: f64 = 2.0;
 pub struct OutputScale {
     /// Standard deviation of the output: root of the mean variance over all runs.
     pub deviation: f64,
-    /// Estimated standard deviation of the white noise of the output.
+    /// The estimated standard deviation of the white noise of the output.
     pub noise: f64,
 }
 
@@ -91,7 +91,7 @@ impl OutputScale {
 pub enum Initialization {
     /// Multistart from automatic initial guesses, or the candidates of an earlier one, plus given initial guesses.
     Multistart {
-        /// Given initial guesses, each with the values of all free parameters.
+        /// The given initial guesses, each with the values of all free parameters.
         known: Vec<Vec<f64>>,
         /// Candidates of an earlier multistart. None runs a new multistart.
         candidates: Option<Vec<Candidate>>,
@@ -205,7 +205,7 @@ impl<'a> FitProblem<'a> {
     }
 }
 
-/// Estimated orders and coefficients of equations by name, and the fit that yields them.
+/// The estimated orders and coefficients of equations by name, and the fit that yields them.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct EquationFit {

@@ -153,7 +153,7 @@ impl<'a> Objective<'a> {
         Self { requires_stability: true, ..self.clone() }
     }
 
-    /// Sampled runs.
+    /// The sampled runs.
     #[must_use]
     pub fn experiments(&self) -> &[Experiment] {
         &self.experiments

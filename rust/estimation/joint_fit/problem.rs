@@ -191,7 +191,7 @@ pub struct OptimizationResult {
     pub iterate: Iterate,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Weighted residuals, ordered by run, then by output, then by sample.
+    /// The weighted residuals, ordered by run, then by output, then by sample.
     pub residuals: Vec<f64>,
     /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,

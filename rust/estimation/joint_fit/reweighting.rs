@@ -18,7 +18,7 @@ const MIN_DEVIATION: f64 = 1e-300;
 /// Loss function of the residuals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Loss {
-    /// Squared residuals (least squares).
+    /// The squared residuals (least squares).
     Squares,
     /// Huber's loss.
     Huber,

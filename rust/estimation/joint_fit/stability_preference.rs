@@ -124,7 +124,7 @@ fn is_unstable(free: &ParameterSet, candidate: &Candidate) -> bool {
     free.problem.is_unstable(&candidate.result.iterate.point)
 }
 
-/// Known factor of each free autoregressive coefficient in its term, by name of the coefficient.
+/// The known factor of each free autoregressive coefficient in its term, by name of the coefficient.
 fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     let own = free.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
     own.filter_map(|term| match &term.coefficient {

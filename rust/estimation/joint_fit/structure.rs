@@ -44,7 +44,7 @@ pub struct ParametricTerm {
     pub order: Order,
     /// Coefficient, free or fixed.
     pub coefficient: Coefficient,
-    /// Known factor of the coefficient.
+    /// The known factor of the coefficient.
     pub factor: f64,
 }
 
@@ -202,7 +202,7 @@ pub struct ParametricStructure {
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<ParametricEquation>,
-    /// Given lower and upper bounds of free orders, by name.
+    /// The given lower and upper bounds of free orders, by name.
     pub bounds: BTreeMap<String, (f64, f64)>,
     /// True if simulated outputs enter the other equations, false if measured outputs do.
     pub coupled: bool,

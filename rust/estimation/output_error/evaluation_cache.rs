@@ -72,7 +72,7 @@ pub(crate) struct EvaluationCache {
     pub(crate) total: usize,
     /// Spectra of inputs without a free parameter, by signal and by the flag of a negative integration order.
     input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
-    /// Weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
+    /// The weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 

@@ -253,7 +253,7 @@ impl Experiment {
         (0..self.compared_count()).map(move |k| weight * shares.map_or(1.0, |shares| shares[k]))
     }
 
-    /// Weighted measured values of the compared samples, with all outputs concatenated.
+    /// The weighted measured values of the compared samples, with all outputs concatenated.
     pub(crate) fn measured_samples(&self) -> Vec<f64> {
         let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
             self.weights_of(i).zip(self.compared_values(values)).map(|(w, v)| w * v).collect()
@@ -301,7 +301,7 @@ impl Experiment {
         (jump(&acted.0), jump(&acted.1))
     }
 
-    /// Weighted values of the outputs at the compared samples, computed from their pulse means.
+    /// The weighted values of the outputs at the compared samples, computed from their pulse means.
     ///
     /// All outputs are concatenated.
     pub(crate) fn weighted_samples(&self, response: &[Vec<f64>]) -> Vec<f64> {
@@ -320,7 +320,7 @@ impl Experiment {
         samples
     }
 
-    /// Weighted corrections of the samples, with all outputs concatenated; zero for filtered outputs.
+    /// The weighted corrections of the samples, with all outputs concatenated; zero for filtered outputs.
     pub(crate) fn weighted_corrections(&self, values: &[Vec<f64>]) -> Vec<f64> {
         let mut out = Vec::with_capacity(values.len() * self.compared_count());
         for (i, row) in values.iter().enumerate() {

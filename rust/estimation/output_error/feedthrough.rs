@@ -116,7 +116,7 @@ impl Feedthrough {
         gains.map(mixed).collect()
     }
 
-    /// Weighted correction of the compared samples, with all outputs concatenated.
+    /// The weighted correction of the compared samples, with all outputs concatenated.
     pub(crate) fn weighted_correction(&self, experiment: &Experiment) -> Vec<f64> {
         experiment.weighted_corrections(&self.values)
     }

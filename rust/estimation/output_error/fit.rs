@@ -97,7 +97,7 @@ struct OutputErrorProblem<'a> {
     experiments: &'a [Experiment],
     /// Initial coefficients in the scaled unit of time.
     start: Vec<f64>,
-    /// Scaled unit of time, in which steps of the coefficients are relative.
+    /// The scaled unit of time, in which steps of the coefficients are relative.
     time_unit: TimeUnit,
     /// True if a stable model must not become unstable.
     requires_stability: bool,

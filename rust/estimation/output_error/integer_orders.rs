@@ -619,7 +619,7 @@ impl ExactSimulation<'_> {
         self.equations[i].companion.output(terms.map(|&(k, nu)| (nu + shift, coefficient(k))))
     }
 
-    /// Unweighted samples of the output of equation `i` from zero initial conditions.
+    /// The unweighted samples of the output of equation `i` from zero initial conditions.
     fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];

@@ -75,7 +75,7 @@ impl Coordinate {
 /// Monomial of the free coefficients: factor·Π c_i^{n_i}.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Monomial {
-    /// Fixed factor.
+    /// The fixed factor.
     pub factor: f64,
     /// Index and power of each free coefficient that occurs.
     pub powers: Vec<(usize, i32)>,

@@ -12,7 +12,7 @@ const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
 /// Difference below which two exponents of s are merged. They are distinguishable only above ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;
-/// Computed number of zeros in the right half-plane above which the equation counts as unstable.
+/// Number of computed zeros in the right half-plane above which the equation counts as unstable.
 ///
 /// A zero on the imaginary axis counts 1/2.
 const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;

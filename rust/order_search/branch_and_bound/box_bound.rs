@@ -226,7 +226,7 @@ pub(super) struct SliceTables<'a> {
     own: Option<usize>,
     /// Coefficients of the projection of the output on the fixed-order columns.
     pub(super) base_coefficients: Vec<f64>,
-    /// Squared norm of the residual of the output after projection on the fixed-order columns.
+    /// The squared norm of the residual of the output after projection on the fixed-order columns.
     unexplained: f64,
     /// Product ⟨t, r⟩ and denominator ‖t‖(1 − Σ c g), by group of test vectors t. Here r is the residual of the output
     /// after projection on the fixed-order columns. The sum is over these columns with coefficient c and kernel matrix

@@ -93,7 +93,7 @@ pub(crate) struct NormalEquations {
     terms: Normal,
     /// Equations of each record for its initial terms. Empty for zero initial conditions.
     record_equations: Vec<Normal>,
-    /// Fixed coefficients by term, `None` for a free coefficient.
+    /// The fixed coefficients by term, `None` for a free coefficient.
     fixed: Vec<Option<f64>>,
     /// Indices of the terms with a free coefficient.
     free: Vec<usize>,

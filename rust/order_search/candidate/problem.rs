@@ -39,7 +39,7 @@ pub(crate) struct Problem {
     index: Index,
     /// Bank of regressors of each record.
     banks: Vec<Bank>,
-    /// Measured output of each record.
+    /// The measured output of each record.
     targets: Vec<Vec<f64>>,
     pub(crate) equations: NormalEquations,
     /// Gram matrix without weights and prior. Present if candidates are ranked by squared equation error.

@@ -429,7 +429,7 @@ struct RecordVectors {
     vectors: Vec<Vec<f64>>,
     /// Product of the test vector with each transposed kernel matrix, orthogonalized.
     first_order_terms: Vec<Vec<f64>>,
-    /// Orthogonalized kernels of the output terms as series.
+    /// The orthogonalized kernels of the output terms as series.
     series: Vec<Vec<f64>>,
 }
 

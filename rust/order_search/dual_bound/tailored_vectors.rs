@@ -68,7 +68,7 @@ pub(crate) struct NormCache {
     own: Vec<Weighted>,
     /// Index of the test vector that excluded the most recent candidate.
     last_vector: usize,
-    /// Cached norms for the test vectors, found by the output columns of a candidate. `None` disables the cache.
+    /// The cached norms for the test vectors, found by the output columns of a candidate. `None` disables the cache.
     norms: Option<Vec<Option<CachedNorm>>>,
 }
 

@@ -50,7 +50,7 @@ pub(crate) struct Block {
     pub(crate) alpha: f64,
     /// Index of the first candidate with this α.
     pub(crate) start: u64,
-    /// Allowed combinations of orders for each signal.
+    /// The allowed combinations of orders for each signal.
     pub(crate) tuples: Vec<GroupTuples>,
 }
 

@@ -83,7 +83,7 @@ impl Table {
     }
 }
 
-/// Coupled equations of an order search, with the data that their candidates share.
+/// The coupled equations of an order search, with the data that their candidates share.
 pub struct CoupledSearch<'a> {
     grid: Cow<'a, OrderLawGrid>,
     options: Options,

@@ -627,7 +627,7 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
     Cow::Owned(interpolate_gaps(&with_missing).into_owned())
 }
 
-/// Measured output as input of a filter, linear between samples.
+/// The measured output as input of a filter, linear between samples.
 fn measured_input(experiment: &Experiment) -> SourceInput<'_> {
     SourceInput { samples: output_samples(experiment), between: Intersample::Linear, delay: 0.0, before: 0.0 }
 }

@@ -48,7 +48,7 @@ pub struct Interval {
 }
 
 impl Interval {
-    /// Unbounded interval, without a refit.
+    /// An unbounded interval, without a refit.
     pub(super) fn whole_line() -> Self {
         Self { low: f64::NEG_INFINITY, high: f64::INFINITY, points: Vec::new(), evaluations: 0 }
     }
