@@ -124,7 +124,9 @@ def test_a_run_that_does_not_start_at_rest_is_refused():
         outputs = {n: x[:rows] for n, x in (rest | angles).items()}
         return ftlm.Run.from_arrays(step=run.step, inputs={"I1": run["I1"][:rows]}, outputs=outputs, name="mine")
 
-    with pytest.raises(ftlm.DataError, match=r"run 'mine': theta12 starts at 0.5 rad, not at 0; .* slice it"):
+    with pytest.raises(
+        ftlm.DataError, match=r"run 'mine': theta12 starts at 0.5 rad, not at 0; .* cut the run where it rests, .*"
+    ):
         ftlm.energies(made(theta12=0 * t + 0.5))
     with pytest.raises(ftlm.DataError, match=r"theta11 moves by 0.2 rad in its first step"):
         ftlm.energies(made(theta11=2.0 * t))

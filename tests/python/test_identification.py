@@ -539,8 +539,8 @@ def test_settings_that_mean_nothing_are_refused_by_every_method(small_run, struc
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_no_structure_and_no_run_is_refused(small_run, structure, method):
-    with pytest.raises(ftlm.ModelError, match="structure is str; use ftlm"):
-        ftlm.identify(small_run, WORDS, method=method)
+    with pytest.raises(ftlm.ModelError, match="structure is int; give the text"):
+        ftlm.identify(small_run, 1, method=method)
     with pytest.raises(ftlm.ModelError, match=r"use ftlm.select\(runs, 'auto'\).best"):
         ftlm.identify(small_run, "auto", method=method)
     with pytest.raises(ftlm.DataError, match="no run is given; give at least one"):

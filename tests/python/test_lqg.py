@@ -329,7 +329,7 @@ def test_what_is_no_model_or_no_loop_is_refused_by_name():
             control.lqg(wrong, max_deviation=DEAR, max_input=1.0)
         with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
             control.observer(wrong, process_noise=1.0)
-        with pytest.raises(ftlm.ModelError, match=r"design is a .*, not a PidDesign or an LqgDesign"):
+        with pytest.raises(ftlm.ModelError, match=r"design is an? .*, not a PidDesign or an LqgDesign"):
             control.inverse_dynamics(wrong, control.point_to_point(0.3, 0.5))
 
 

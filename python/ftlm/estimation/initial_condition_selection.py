@@ -242,7 +242,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     def is_preferred(joint: JointFit) -> bool:
         return fits_better(joint, best, margin)
 
-    for initial in INITIAL_CONDITIONS_WITH_LEVEL:
+    # From rest, motion has been judged before.
+    for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" else None]:
         request = replace(structure, initial=initial, offset="level")
         try:
             # With integer orders, automatic guesses cost little and lead to the best optimum.
@@ -264,7 +265,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bool) -> Fit:
     """Return a fit under other initial conditions than those that the first samples suggested, with its findings.
 
-    Its model keeps the requested initial conditions, because other runs may start differently.
+    Its model keeps the requested initial conditions, because other runs may start differently. It keeps the new ones if
+    rest was rejected, because a comparison with the same runs would choose rest again.
     """
     initial = None if fit.joint is None else fit.joint.initial
     names = ", ".join(run.name for run in fit.task.runs)
@@ -274,6 +276,8 @@ def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bo
     if fit.task.structure.offset == "level" and structure.offset != "level":
         verb = "rested" if initial == "rest" else "moved"
         findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=verb))
+    if is_rest_rejected and initial != "rest":
+        return replace(fit, findings=findings)
     model = replace(fit.model, structure=replace(fit.model.structure, initial=structure.initial))
     return replace(fit, model=model, findings=findings)
 
