@@ -44,7 +44,7 @@ def machine(samples: int) -> ftlm.Run:
 def searched(run: ftlm.Run, **options: object) -> Callable[[], object]:
     """A search on the largest power of two of pulses that a run holds."""
     m = 1 << int(math.log2(run["y"].size - 1))
-    lattice = ftlm.order_grid(increment=0.2)
+    lattice = ftlm.order_grid(increment=0.2, alpha=(1.05, 2.0))
     return lambda: ftlm.search_orders(run, ftlm.equation(LINK), lattice, m=m, **options)
 
 

@@ -62,7 +62,7 @@ def search(path, progress=None):
     return ftlm.search_orders(
         run(),
         ftlm.equation(EQUATION, initial="rest"),
-        ftlm.order_grid(increment=0.1),
+        ftlm.order_grid(increment=0.1, alpha=(1.05, 2.0)),
         pruning=False,
         m=2048,
         coefficients="least-squares",

@@ -131,7 +131,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
 def test_what_cannot_be_had_is_said(run, words, options, said):
     given = {"order_grid": LATTICE, "m": 128} | options
     if "3 u" in words and "order_grid" not in options:
-        given["order_grid"] = ftlm.order_grid(increment=0.1)
+        given["order_grid"] = ftlm.order_grid(increment=0.1, alpha=(1.05, 2.0))
     with pytest.raises(ModelError, match=said):
         ftlm.certify_orders(run, ftlm.equation(words, initial="rest"), **given)
 

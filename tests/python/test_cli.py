@@ -709,6 +709,9 @@ def test_search_writes_a_report_of_its_table_profiles_and_validation(tmp_path: P
     assert "Score over α" in part
     document = json.loads(run_command("search", *words, "--validation", "1.csv", "--json", cwd=tmp_path).stdout)
     assert document["validation"]["output_error"]["y"]["fit"] == pytest.approx(float(fit[1]), abs=0.01)
+    written = run_command("search", *words, "-o", "s.json", cwd=tmp_path)
+    assert (written.returncode, written.stdout) == (0, plain.stdout)
+    assert ftlm.load_model(tmp_path / "s.json").orders == {"alpha": pytest.approx(0.8, abs=0.05)}
     again = run_command("search", *words, "--report", "s.html", cwd=tmp_path)
     assert again.returncode != 0
     assert "--force" in again.stderr

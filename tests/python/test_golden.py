@@ -105,10 +105,10 @@ def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
     path = tmp_path / "now.ftlm"
     if name == "law":
         structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
-        lattice, options = ftlm.order_grid(increment=0.05), {"m": 32}
+        lattice, options = ftlm.order_grid(increment=0.05, alpha=(1.05, 2.0)), {"m": 32}
     else:
         structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b u", initial="rest")
-        lattice = ftlm.order_grid(increment=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
+        lattice = ftlm.order_grid(increment=0.05, alpha=(1.05, 2.0), beta=(0.0, 1.0), mu=(0.0, 1.0))
         options = {"m": 32, "pruning": False}
     ftlm.search_orders(run, structure, lattice, prior_covariance=1.0, threads=1, top=5, store=path, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")

@@ -250,7 +250,10 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.integrate([1.0, 2.0], np.nan, step=STEP), "order = nan is not finite"),
         (lambda: PAIR.score([[0.5, 0.1]], limit=np.nan), "limit=nan is not a number"),
         (lambda: kernels.pulse_means([1.0]), "samples|pulse"),
-        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(5), prior_covariance=1.0), r"\(4, 2\), m has shape \(5,\)"),
+        (
+            lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(5), prior_covariance=1.0),
+            r"\(4, 2\), m has shape \(5,\)",
+        ),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), 0, prior_covariance=1.0), "p = 0"),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=-1.0), "prior"),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=[1.0] * 3), "prior_covariance"),

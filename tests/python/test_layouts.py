@@ -585,6 +585,13 @@ def test_a_column_of_marks_for_missing_numbers_is_named(tmp_path):
     assert "no column of numbers is 'u' (line 2: 'off' is not a number)" in ftlm.open_file(words).problem
 
 
+@pytest.mark.parametrize("words", [("True", "False"), ("true", "false"), ("TRUE", "FALSE")])
+def test_boolean_cells_are_numbers(tmp_path, words):
+    cells = "".join(f"{k},{words[k % 2]},{k}\n" for k in range(5))
+    run = ftlm.load(write(tmp_path, "t,u,y\n" + cells), **SIGNALS)
+    assert run["u"].tolist() == [1.0, 0.0, 1.0, 0.0, 1.0]
+
+
 # --- how numbers are written ------------------------------------------------------------------------------------------
 
 

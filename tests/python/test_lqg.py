@@ -265,7 +265,7 @@ def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
 
 
 REFUSED = [
-    ({"max_deviation": {}}, "max_deviation = {} is not a mapping"),
+    ({"max_deviation": {}}, r"max_deviation = {} is not a mapping .* to deviations; give such as \{'hub': 0.01\}"),
     ({"max_deviation": [0.1]}, "is not a mapping"),
     ({"max_deviation": {"hub + bent": 0.1}}, "did you mean 'bend'"),
     (

@@ -14,7 +14,6 @@ import ftlm
 from ftlm import _core
 from ftlm.data.sampling import grid_positions, interpolate_gaps
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.model_checks import quantization_step
 from ftlm.estimation.objective import Iterate, Objective, covariance_of
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.output_samples import simulate_samples
@@ -26,6 +25,7 @@ from ftlm.utils.statistics import (
     fit_whitening_filter,
     huber_excess,
     is_white,
+    quantization_step,
 )
 from ftlm.validation.comparison import simulate_runs
 
@@ -199,7 +199,8 @@ def test_rows_that_a_regular_time_lacks_are_missing(tmp_path) -> None:
     kept[[30, 31, 90, 200]] = False
     t = np.arange(ROWS) * STEP
     given = {"outputs": {"y": y[kept]}, "time": t[kept]}
-    with pytest.raises(ftlm.DataError, match=r"gap of 0.3 s where 0.1 s is usual, .* missing='hold'"):
+    words = r"gap of 0.3 s .* use missing='weight'; .* no input changed there, missing='hold'"
+    with pytest.raises(ftlm.DataError, match=words):
         ftlm.Run.from_arrays(inputs={"u": u[kept]}, **given)
     with pytest.raises(ftlm.DataError, match=r"4 rows are missing in a regular grid of 0.1 s, the first before row 30"):
         ftlm.Run.from_arrays(inputs={"u": u[kept]}, missing="weight", **given)
@@ -227,7 +228,10 @@ def test_empty_cells_may_be_missing(tmp_path) -> None:
     path = tmp_path / "run.csv"
     path.write_text("t,u,y\n0,1,0\n0.1,1,\n0.2,,2\n0.3,0,3\n0.4,0,4\n")
     columns = {"inputs": ["u"], "outputs": ["y"]}
-    with pytest.raises(ftlm.DataError, match=r"column 'u', line 4: empty cell, .* missing='weight' or missing='hold'"):
+    with pytest.raises(
+        ftlm.DataError,
+        match=r"column 'u', line 4: empty cell, .* missing='weight' \(outputs and times\) or missing='hold'",
+    ):
         ftlm.load(path, **columns)
     with pytest.raises(ftlm.DataError, match=r"column 'u', line 4: empty cell"):
         ftlm.load(path, missing="weight", **columns)
@@ -551,6 +555,49 @@ def test_coarse_steps_of_an_output_are_named() -> None:
     assert quantization_step(np.array([0.0, 0.3, 0.9, 1.5])) == pytest.approx(0.3)
     assert quantization_step(np.random.default_rng(1).standard_normal(500)) == 0.0
     assert quantization_step(np.ones(4)) == 0.0
+
+
+@pytest.mark.parametrize("rows", [100, 400, 2500, 100_000])
+def test_a_quantization_step_is_found_only_where_samples_are_multiples_of_it(rows) -> None:
+    for seed in range(100 if rows < 100_000 else 10):
+        noise = np.random.default_rng(seed).standard_normal(rows)
+        for samples in (noise, noise.astype(np.float32).astype(float), 5.0 + np.sin(0.01 * np.arange(rows)) + noise):
+            assert quantization_step(samples) == 0.0
+    motion = np.sin(0.01 * np.arange(rows)) + 0.01 * np.cumsum(noise)
+    for step in (2 * np.pi / 512, 2 * np.pi / 4096, 2 * np.pi / 65536, 1e-3, 10 / 4096):
+        for offset in (0.0, 1.2345, 100.0):
+            for scale in (1.0, np.pi / 180, 1e-3):
+                found = quantization_step(scale * (np.round(motion / step) * step + offset))
+                assert found == pytest.approx(scale * step, rel=1e-6)
+    single = (np.round(motion / 0.01) * 0.01 + 1.2345).astype(np.float32).astype(float)
+    assert quantization_step(single) == pytest.approx(0.01, rel=1e-5)
+
+
+def test_missing_times_are_interpolated(tmp_path) -> None:
+    u, y = noisy(4)
+    t = np.arange(ROWS) * STEP
+    t[[30, 31, 90]] = np.nan
+    given = {"inputs": {"u": u}, "outputs": {"y": y}, "time": t}
+    with pytest.raises(ftlm.DataError, match="time: NaN, first at row 30, 3 in all"):
+        ftlm.Run.from_arrays(**given)
+    run = ftlm.Run.from_arrays(**given, missing="weight")
+    assert (run.length, run.step) == (ROWS, pytest.approx(STEP))
+    assert any("3 of 400 rows have no value, the first is row 30; they were inter" in w for w in run.warnings)
+    path = tmp_path / "run.csv"
+    rows = "\n".join(f"{'' if np.isnan(a) else a},{b},{c}" for a, b, c in zip(t, u, y, strict=True))
+    path.write_text(f"t,u,y\n{rows}\n")
+    for policy in ("weight", "hold"):
+        np.testing.assert_array_equal(ftlm.load(path, inputs=["u"], outputs=["y"], missing=policy)["y"], y)
+    t[0] = np.nan
+    with pytest.raises(ftlm.DataError, match="time: NaN, first at row 0"):
+        ftlm.Run.from_arrays(**given, missing="weight")
+
+
+def test_rows_added_to_a_gap_with_their_inputs_leave_the_model_unbiased() -> None:
+    u, y = noisy(4)
+    y[100:150] = np.nan
+    found = ftlm.identify(run_of(u, y, missing="weight"), ftlm.equation(FREE))
+    assert all(abs(found.coefficients[n] - v) < 4 * found.standard_errors[n] for n, v in TRUTH.items())
 
 
 @pytest.mark.slow

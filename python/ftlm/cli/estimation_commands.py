@@ -259,6 +259,7 @@ def search(
     weighting: MultiInnovationOptions,
     m: int | None = None,
     threads: int | None = None,
+    out: OptionalOutputJson = None,
     report: OptionalOutputPage = None,
     validation: str | None = None,
     validation_window: str | None = None,
@@ -308,7 +309,7 @@ def search(
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 result = run_job(replace(job, progress=progress), store=open_store, number=number)
             results[name] = with_verdict(result, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
-    if report is None and not others:
+    if out is None and report is None and not others:
         show_by_output(results, as_json=as_json)
         return
     best = identification_of_searches(results, runs, target, settings, every, m=m)
@@ -321,6 +322,8 @@ def search(
     if checked is not None and not as_json:
         fits = ", ".join(f"{o} {fit:.4g} %" for o, fit in checked.fit.items())
         print_text(f"validation on {', '.join(r.name for r in others)}: fit {fits}; {checked.verdict}")
+    if out is not None:
+        best.model.save(out, force=force)
     if report is not None:
         best.report(report, validation=others or None, force=force)
 

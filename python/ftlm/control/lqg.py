@@ -601,8 +601,7 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
             f"{setting('max_deviation')} {short_repr(max_deviation)} is not a mapping from outputs, or sums of them, "
-            "to "
-            "deviations; give such as {{names[0]!r}: 0.01}"
+            f"to deviations; give such as {{{names[0]!r}: 0.01}}"
         )
     return [
         (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))

@@ -27,6 +27,7 @@ from ftlm.data.sampling import (
     fill_input_gaps,
     grid_positions,
     has_too_few_values,
+    interpolate_gaps,
     masked_rows_error,
     missing_mask,
     regular_step,
@@ -162,8 +163,8 @@ class RunArguments:
             raise DataError(
                 f"{self.time_label}: {plural(count, 'row', 'are')} missing in a regular grid of {step:.6g} s, the "
                 f"first before row "
-                f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
-                f"the inputs over them with {parameter('missing', 'hold')}"
+                f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or, "
+                f"only if no input changed there, hold the inputs over them with {parameter('missing', 'hold')}"
             )
         whole = times[0] + uniform_times(int(places[-1]) + 1, step)
         whole[places] = times
@@ -241,12 +242,16 @@ class RunArguments:
                     f"{parameter('time_unit', self.time_unit)} is the unit of numbers, but {self.time_label} has "
                     f"dates; omit {parameter('time_unit')}"
                 )
-            times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)
+            gaps = check_missing_policy(self.missing) != "refuse"
+            times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label, gaps=gaps)
             lengths = {self.time_label: times.size, **lengths}
             times = times * TIME_UNITS[self.time_unit]
             single = dtype.kind == "f" and dtype.itemsize < 8
             precision = float(np.finfo(dtype if single else np.float64).eps)
-            notes = (dated[1],) if dated is not None and dated[1] else ()
+            notes: tuple[str, ...] = (dated[1],) if dated is not None and dated[1] else ()
+            if gaps and (unknown := missing_mask(times)).any() and not (unknown[0] or unknown[-1]):
+                times = interpolate_gaps(times)
+                notes += (describe_missing(self.time_label, unknown, "they were interpolated"),)
             clock = _TimeAxis(times, None, precision * float(np.abs(times).max()), notes)
         check_lengths(lengths)
         return clock

@@ -171,7 +171,8 @@ class Run:
             Treatment of missing values: NaN, None in a list, masked values, gaps in a regular `time`. ``"refuse"``:
             DataError. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and
             validation; other methods raise. ``"hold"``: in addition, missing inputs take their last value (linear
-            interpolation for ``"foh"``). `warnings` lists the missing samples.
+            interpolation for ``"foh"``). Both interpolate missing values of `time`, except the first and the last.
+            `warnings` lists the missing samples.
 
         Returns
         -------

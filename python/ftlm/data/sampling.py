@@ -287,9 +287,9 @@ def regular_step(
         if gaps.size:
             what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
             way_out = (
-                f"load the part before or after it with {parameter('window')}, let the rows be missing with "
-                f"{parameter('missing', 'hold')}, or put the inputs on a regular grid with "
-                f"{parameter('resample', Placeholder('STEP'))}"
+                f"load the part before or after it with {parameter('window')}; or add its rows, with the inputs and "
+                f"empty outputs, and use {parameter('missing', 'weight')}; or, only if no input changed there, "
+                f"{parameter('missing', 'hold')} or {parameter('resample', Placeholder('STEP'))}"
             )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
         share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
@@ -572,8 +572,8 @@ def has_too_few_values(values: Floats) -> bool:
 def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
     """Return a sentence on the number of missing samples of the signal `thing`, with their treatment `what`."""
     first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
-    rows = "row has" if count == 1 else "rows have"
-    return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
+    verb = "has" if count == 1 else "have"
+    return f"{thing}: {count} of {is_missing.size} rows {verb} no value, the first is row {first}; {what}"
 
 
 #: Maximum delay of a default search: in samples, and as a fraction of the length of the run.

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
+from ftlm.errors import ModelError
 from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
 from ftlm.structure.circuit import Circuit, impedance_and_derivatives
+from ftlm.utils.parameters import parameter
+from ftlm.utils.statistics import chi_squared_99
 from ftlm.utils.validation import Complex, Floats
 
 #: Number of points (time constants and impedance ratios) at which initial guesses are tried, and range of the impedance
@@ -23,8 +26,15 @@ START_POINTS, RATIO_DECADES = 400, 2.0
 MIN_EXPONENT, START_EXPONENTS = 0.05, (0.6, 1.0)
 #: Minimum and maximum parameter in SI units.
 PARAMETER_RANGE = (1e-18, 1e18)
-#: Maximum half-width of an interval of a logarithm: beyond it a parameter is not identifiable.
-MAX_LOG_WIDTH = 700.0
+#: Relative standard error of a positive parameter above which its interval is a profile-likelihood interval, because
+#: a normal distribution of the logarithm is then inaccurate.
+MAX_WALD_RELATIVE_ERROR = 0.2
+#: Number of fits that bracket one bound of a profile-likelihood interval and that bisect the bracket, tolerance of the
+#: bound relative to its distance from the estimate, and ratio of the ends above which a bracket is wide.
+MAX_PROFILE_FITS, PROFILE_TOLERANCE, WIDE_RATIO = 40, 0.01, 10.0
+
+#: Function that returns the optimum of a problem from an initial guess as (variables of the optimizer, cost).
+Optimizer = Callable[["CircuitProblem", Floats], tuple[Floats, float]]
 
 
 class CircuitProblem(ResponseProblem):
@@ -73,7 +83,8 @@ class CircuitProblem(ResponseProblem):
         intervals = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
-                ratio = float(np.exp(np.minimum(widths[name] / value, MAX_LOG_WIDTH)))
+                with np.errstate(over="ignore"):
+                    ratio = float(np.exp(widths[name] / value))
                 intervals[name] = (value / ratio, value * ratio)
             else:
                 intervals[name] = (intervals[name][0], min(intervals[name][1], MAX_EXPONENT))
@@ -105,13 +116,21 @@ class CircuitProblem(ResponseProblem):
         """
         rows, limits, words = [], [], []
         for k, name in enumerate(self.names):
-            low, high = self.bounds.get(name, (-math.inf, math.inf))
-            least, most = PARAMETER_RANGE if self.is_log[k] else (MIN_EXPONENT, MAX_EXPONENT)
-            for sign, end in ((1.0, min(high, most)), (-1.0, max(low, least))):
+            low, high = admissible_range(name, self.bounds)
+            for sign, end in ((1.0, high), (-1.0, low)):
                 rows.append(sign * (np.arange(len(self.names)) == k))
                 limits.append(sign * (math.log(end) if self.is_log[k] else end))
                 words.append(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}")
         return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
+
+    def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
+        """Return the names of the parameters on a bound of the user, as opposed to a limit of the element."""
+        names = []
+        for k in active_constraints:
+            name, side = self.names[k // 2], 1 - k % 2
+            if admissible_range(name, self.bounds)[side] != admissible_range(name, {})[side]:
+                names.append(name)
+        return names
 
     def default_start(self) -> dict[str, float]:
         """Return the best automatic initial guess by name, in SI units."""
@@ -191,6 +210,126 @@ class CircuitProblem(ResponseProblem):
                 guesses.append((cost, inside))
         guesses.sort(key=lambda pair: pair[0])
         return [values for _, values in guesses[:MAX_STARTS]]
+
+
+def admissible_range(name: str, bounds: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Return (lowest, highest) value of a circuit parameter within its bounds and the limits of its element."""
+    least, most = (MIN_EXPONENT, MAX_EXPONENT) if name.endswith("_alpha") else PARAMETER_RANGE
+    low, high = bounds.get(name, (least, most))
+    return max(low, least), min(high, most)
+
+
+def check_admissible(values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> None:
+    """Raise ModelError if a fixed value is not admissible, or if bounds exclude every admissible value but one."""
+    for name, value in values.items():
+        least, most = admissible_range(name, {})
+        # An element of the value 0 is absent.
+        if not (least <= value <= most or (value == 0 and not name.endswith("_alpha"))):
+            raise ModelError(
+                f"{parameter('fixed', {name: value})} is not admissible: {name} lies between {least:g} and {most:g}; "
+                "fix it within this range, or leave it free"
+            )
+    for name, (low, high) in bounds.items():
+        least, most = admissible_range(name, {})
+        low_inside, high_inside = admissible_range(name, bounds)
+        if not low_inside < high_inside:
+            raise ModelError(
+                f"bounds of {name}, {low:g} to {high:g}, leave no range: {name} lies between {least:g} and {most:g}; "
+                f"give bounds that overlap this range, or fix the value with {parameter('fixed')}"
+            )
+
+
+def profile_intervals(
+    problem: CircuitProblem,
+    records: Sequence[FrequencyData],
+    best: tuple[Floats, float],
+    standard: Mapping[str, float],
+    noise: float,
+    factor: float,
+    optimize: Optimizer,
+) -> tuple[dict[str, tuple[float, float]], list[tuple[str, str]]]:
+    """Return profile-likelihood intervals of imprecise positive parameters, and those not distinguishable from a limit.
+
+    A bound of an interval is 0 or infinite if the data do not reject an element without this parameter.
+
+    Parameters
+    ----------
+    problem, records
+        Estimation problem and its measured impedances.
+    best
+        Optimum: variables of the optimizer and cost.
+    standard
+        Standard errors by name, in SI units.
+    noise
+        Variance of a residual.
+    factor
+        Quantile of the 95 % interval in standard errors.
+    optimize
+        Function that fits the other parameters.
+
+    Returns
+    -------
+    dict, list
+        (low, high) by name, and (name, limit) of each parameter whose limit, "0" or "infinity", is not rejected at
+        99 %.
+    """
+    values, least_cost = best
+    weights = [r.weight for r in problem.records]
+    intervals, absent = {}, []
+    estimates = dict(zip(problem.names, problem.in_seconds(values).tolist(), strict=True))
+    for k, name in enumerate(problem.names):
+        estimate, error = estimates[name], standard.get(name, math.nan)
+        if not problem.is_log[k] or not error > MAX_WALD_RELATIVE_ERROR * estimate:
+            continue
+        warm = np.delete(values, k)
+
+        def rise(value: float, name: str = name, warm: Floats = warm) -> float:
+            """Return twice the decrease of the log likelihood if the parameter has this value."""
+            circuit = problem.circuit.with_values({name: value})
+            _, cost = optimize(CircuitProblem(circuit, records, weights, problem.bounds), warm)
+            return max(cost - least_cost, 0.0) / max(noise, 1e-300)
+
+        ends = []
+        for side, (absence, words) in enumerate(((0.0, "0"), (math.inf, "infinity"))):
+            limit, end = PARAMETER_RANGE[side], admissible_range(name, problem.bounds)[side]
+            at_end = rise(end)
+            if end == limit and math.isfinite(error) and at_end <= chi_squared_99(1):
+                absent.append((name, words))
+            is_open = at_end <= factor**2
+            reached = absence if end == limit else end
+            ends.append(reached if is_open else _crossing(rise, estimate, end, factor**2, error * factor))
+        intervals[name] = (ends[0], ends[1])
+    return intervals, absent
+
+
+def _crossing(rise: Callable[[float], float], inside: float, outside: float, level: float, distance: float) -> float:
+    """Return the value between `inside` and `outside` at which `rise` reaches `level`, by bracketing and bisection.
+
+    `distance` is the expected distance from `inside`. A wide bracket is bisected geometrically.
+    """
+    sign = math.copysign(1.0, outside - inside)
+    estimate = inside
+    if min(distance, inside) <= 0 or not math.isfinite(distance):
+        distance = inside
+    for _ in range(MAX_PROFILE_FITS):
+        trial = inside + sign * distance
+        if not min(estimate, outside) < trial < max(estimate, outside):
+            break
+        if rise(trial) > level:
+            outside = trial
+            break
+        inside, distance = trial, 2.0 * distance
+    for _ in range(MAX_PROFILE_FITS):
+        is_wide = max(inside, outside) > WIDE_RATIO * min(inside, outside)
+        distance = min(max(abs(inside - estimate), 1e-2 * outside), max(inside, outside))
+        if not is_wide and abs(outside - inside) <= PROFILE_TOLERANCE * distance:
+            break
+        trial = math.sqrt(inside * outside) if is_wide else 0.5 * (inside + outside)
+        if rise(trial) > level:
+            outside = trial
+        else:
+            inside = trial
+    return outside
 
 
 def _positive_least_squares(table: Floats, goal: Floats) -> Floats:

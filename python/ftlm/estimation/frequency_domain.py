@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm import _core
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
-from ftlm.estimation.circuit_problem import CircuitProblem
+from ftlm.estimation.circuit_problem import CircuitProblem, check_admissible, profile_intervals
 from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.model_checks import (
@@ -34,6 +34,7 @@ from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
+from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration
 from ftlm.utils.statistics import ROUNDING_RESIDUAL_RATIO, chi_squared_99, is_white
@@ -172,8 +173,9 @@ def _identify_circuit(
         )
     check_known("fixed parameter", fixed or {}, circuit.names)
     circuit = circuit.with_values({n: real_number(n, v) for n, v in (fixed or {}).items()})
-    check_known("bound of", bounds or {}, circuit.free_names)
     check_intervals(bounds or {})
+    check_known("bound of", bounds or {}, circuit.free_names)
+    check_admissible(circuit.values, bounds or {})
     if not circuit.free_names:
         raise ModelError(f"no parameter of {circuit} is free; leave {parameter('fixed')} out")
     labeled = [replace(r, output=r.output or "U", input=r.input or "I", unit=r.unit or "Ω") for r in records]
@@ -234,7 +236,7 @@ def _fit_response(
     if not fits:
         raise ConvergenceError(
             "no initial guess has a finite response: the order grid is empty or singular; widen "
-            f"{parameter('orders')}, or give {parameter('start')}"
+            f"{parameter('orders')} or {parameter('bounds')} above 0, or give {parameter('start')}"
         )
     first = min(fits, key=lambda f: f.cost)
     reached = sum(
@@ -469,6 +471,15 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
     return ResponseFit(optimum, cost, status == "converged", active)
 
 
+def _optimum_and_cost(problem: ResponseProblem, values: Floats) -> tuple[Floats, float]:
+    """Return the parameters and the cost of a fit; without free parameters, the cost alone is computed."""
+    if not problem.names:
+        residuals, _ = problem.residuals(values, jacobian=False)
+        return values, float(residuals @ residuals)
+    fit = _fit(problem, values)
+    return fit.values, fit.cost
+
+
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
     """Fit a problem, starting from the optimum of another problem that has the same parameters."""
     return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
@@ -525,25 +536,27 @@ def _result(
     rising = _frequency_order(records)
     residual_values = problem.residuals(best.values)[0][rising]
     series = _series(records, residual_values)
-    free = residual_values.size - values.size
+    pinned = problem.on_user_bound(best.active_constraints)
+    kept = np.array([n not in pinned for n in problem.names], dtype=bool)
+    names = tuple(n for n in problem.names if n not in pinned)
+    free = residual_values.size - len(names)
     chi = best.cost / free
     too_large = kind == "deviation" and best.cost > chi_squared_99(free)
     findings: list[Finding] = []
 
     def covariance_at(end: ResponseFit) -> Floats:
         residuals, jacobian = problem.residuals(end.values)
-        steep = problem.jacobian_in_seconds(end.values, jacobian)[rising]
+        steep = problem.jacobian_in_seconds(end.values, jacobian)[rising][:, kept]
         if kind == "deviation" and not too_large:
             return covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
         return covariance_of(steep.T, _series(records, residuals[rising]), end.cost)
 
     def errors_of(covariance: Floats) -> dict[str, float]:
-        return dict(zip(problem.names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
+        return dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
 
     covariance = covariance_at(best)
     white = exact or all(is_white(e, min(WHITENESS_LAGS, max(e.size // 4, 1))) for e in series)
     factor = float(_student(free)) if kind != "deviation" or too_large else NormalDist().inv_cdf(0.975)
-    names = problem.names
     standard = errors_of(covariance)
     if too_large:
         findings.append(make_finding("deviations_exceeded", ratio=math.sqrt(chi)))
@@ -551,24 +564,39 @@ def _result(
         findings.append(make_finding("response_not_white"))
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
-    findings += [make_finding("response_on_bound", bound=bound) for bound in active_bounds]
     likelihood_differences = [
         (end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in ends
     ]
     optima = [
-        (problem.in_seconds(end.values), difference, errors_of(covariance_at(end)))
+        (problem.in_seconds(end.values)[kept], difference, errors_of(covariance_at(end)))
         for end, difference in likelihood_differences
         if difference <= SECOND_OPTIMUM_LOG_LIKELIHOOD
     ]
-    findings += second_optimum_findings(problem.names, values, standard, optima)
-    findings += _identifiability_findings(problem, values, standard)
-    values_by_name = dict(zip(names, values.tolist(), strict=True))
+    findings += second_optimum_findings(names, values[kept], standard, optima)
+    values_by_name = dict(zip(problem.names, values.tolist(), strict=True))
+    intervals = problem.intervals(values, {n: factor * standard.get(n, math.nan) for n in problem.names})
+    intervals = {n: intervals[n] for n in names}
     model: Model | Circuit
+    absent: list[tuple[str, str]] = []
     if isinstance(problem, CircuitProblem):
         model = problem.circuit.with_values(values_by_name)
+        noise = 1.0 if kind == "deviation" and not too_large else chi
+        own, absent = profile_intervals(
+            problem, records, (best.values, best.cost), standard, noise, factor, _optimum_and_cost
+        )
+        intervals |= own
+        for name, limit in absent:
+            low, high = (format_bound(v, ".3g") for v in own[name])
+            findings.append(make_finding("parameter_at_limit", parameter=name, limit=limit, low=low, high=high))
     else:
         model = _model(problem, records, values_by_name, values, covariance, standard, findings)
-    intervals = problem.intervals(values, {n: factor * e for n, e in standard.items()})
+    reported = [name for name, _ in absent]
+    findings += [
+        make_finding("response_on_bound", bound=bound)
+        for bound in active_bounds
+        if bound.partition(" ")[0] not in reported
+    ]
+    findings += _identifiability_findings(problem, {n: values_by_name[n] for n in names if n not in reported}, standard)
     return FrequencyIdentification(
         model,
         tuple(records),
@@ -622,13 +650,15 @@ def _series(records: Sequence[FrequencyData], residuals: Floats) -> list[Floats]
     return [*np.split(residuals[:half], ends[:-1]), *np.split(residuals[half:], ends[:-1])]
 
 
-def _identifiability_findings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[Finding]:
+def _identifiability_findings(
+    problem: ResponseProblem, values: Mapping[str, float], standard: Mapping[str, float]
+) -> list[Finding]:
     """Return findings on parameters that the data determine poorly or not at all."""
-    unidentifiable = [n for n, e in standard.items() if not math.isfinite(e)]
+    unidentifiable = [n for n in values if not math.isfinite(standard[n])]
     out = []
     if unidentifiable:
         out.append(make_finding("response_not_separately_identifiable", parameter=", ".join(unidentifiable)))
-    for name, value in zip(problem.names, values.tolist(), strict=True):
+    for name, value in values.items():
         error = standard[name]
         is_uncertain = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
         if math.isfinite(error) and is_uncertain:

@@ -276,9 +276,10 @@ class FrequencyIdentification:
         Weighting of the residuals: ``"deviation"``, ``"relative"`` or ``"uniform"``.
     values, standard_errors, intervals
         Estimates of orders, coefficients and delays [s], their standard errors, and their 95 % intervals (low, high),
-        by name. The standard error of a parameter that is not identifiable is infinite.
+        by name. The standard error of a parameter that is not identifiable is infinite. A circuit parameter on a bound
+        of the user has neither error nor interval; one that is not distinguishable from 0 has the lower bound 0.
     names, covariance
-        Names of the parameters, and their covariance matrix in this order.
+        Names of the parameters with an error, and their covariance matrix in this order.
     chi_squared
         Mean square of the residuals divided by the stated standard deviations; about 1 for a correct model. None if no
         standard deviations are stated.

@@ -32,7 +32,7 @@ from ftlm.simulation.initial_conditions import (
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
-from ftlm.utils.statistics import chi_squared, is_white, robust_deviation
+from ftlm.utils.statistics import chi_squared, is_white, quantization_step, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_findings
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
@@ -58,8 +58,6 @@ MIN_OUTLIER_POWER_FRACTION = 0.5
 ROWS_OF_ONE_SPEED = 25
 #: Quantization step, in noise standard deviations, above which quantization dominates the residuals.
 QUANTIZATION_NOISE_RATIO = 2.0
-#: Maximum deviation of a value from a multiple of the quantization step, as a fraction of the step.
-QUANTIZATION_STEP_TOLERANCE = 0.01
 #: Minimum change per sampling interval that counts as motion, as a fraction of the range or largest change of the
 #: output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
@@ -412,19 +410,6 @@ def _quantization_findings(runs: Sequence[Run], structure: Structure, output: st
         return []
     step, run = max(coarse, key=lambda pair: pair[0])
     return [make_finding("quantised", run=run.name, output=output, step=step, noise=noise)]
-
-
-def quantization_step(values: Floats) -> float:
-    """Return the step of which all differences between values are multiples; 0 if there is none."""
-    levels = np.unique(values)
-    gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
-    if gaps.size == 0:
-        return 0.0
-    # The smallest gap is the step with a rounding error. The mean of similar gaps reduces this error.
-    step = float(np.mean(gaps[gaps < 1.5 * gaps.min()]))
-    multiples = gaps / step
-    return step if float(np.abs(multiples - np.rint(multiples)).max()) < QUANTIZATION_STEP_TOLERANCE else 0.0
 
 
 def correlation_findings(joint: JointFit) -> list[Finding]:

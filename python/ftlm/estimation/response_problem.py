@@ -94,6 +94,10 @@ class ResponseProblem:
         """Return the same problem for other measured responses and weights."""
         return ResponseProblem(self.structure, records, weights)
 
+    def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
+        """Return an empty list: bounds of coefficients are imposed by :func:`fit_within_bounds`."""
+        return []
+
     def default_start(self) -> dict[str, float]:
         """Return default values of orders and coefficients by name, which complete a user's initial guess."""
         usual = dict.fromkeys(self.coefficients, 1.0)

@@ -466,19 +466,19 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
     if names is None:
         names = fit.problem.orders or fit.names
     if not isinstance(names, Iterable):
-        raise ModelError(f"names is {type_name(names)}; give a list of names of {', '.join(fit.names)}")
+        raise ModelError(f"parameters is {type_name(names)}; give a list of {', '.join(fit.names)}")
     name_list = list(names)
     for k, name in enumerate(name_list):
         if not isinstance(name, str) or name not in fit.names:
             near = nearest(name, fit.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
+                f"parameters[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
                 f"{', '.join(fit.names)}"
             )
         if name in name_list[:k]:
-            raise ModelError(f"names has {name!r} twice; give each once")
+            raise ModelError(f"parameters has {name!r} twice; give each once")
     if not name_list:
-        raise ModelError("names is empty; give the parameters of interest, or leave it out for all orders")
+        raise ModelError("parameters is empty; give those of interest, or leave it out for all orders")
     return tuple(fit.names.index(n) for n in name_list)
 
 

@@ -26,6 +26,8 @@ THOUSANDS_SEPARATORS = {"point": "[.]", "comma": "[,]", "space": "[ \u00a0\u202f
 _FORTRAN_NUMBER_PATTERN = re.compile(
     r"\s*[+-]?(?:(?:\d+[.]\d*|[.]\d+)[dD][+-]?\d{1,3}|\d+[dD][+-]\d{1,3})\s*", re.ASCII
 )
+#: Numbers of case-folded Boolean cells, equal to those of Boolean columns of other formats.
+_TRUTH_VALUES = {"true": 1.0, "false": 0.0}
 #: Case-folded cell texts that mean a missing value.
 _MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", "--", "---"))
 
@@ -60,7 +62,7 @@ def may_group(cell: str, mark: str, *, comma: bool) -> bool:
 
 
 def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
-    """Return the number in a cell; raise ValueError if there is none.
+    """Return the number in a cell, 1 for true and 0 for false; raise ValueError if there is none.
 
     Underscores between digits, which Python accepts, are rejected. With decimal commas, a point is also rejected unless
     `mark` is a point, as thousands separator.
@@ -70,6 +72,9 @@ def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> 
     if "_" in cell or (comma and "." in cell):
         raise ValueError(cell)
     text = cell.replace(",", ".") if comma else cell
+    truth = _TRUTH_VALUES.get(text.strip().casefold())
+    if truth is not None:
+        return truth
     try:
         return float(text)
     except ValueError:

@@ -46,8 +46,8 @@ _MAX_UNPACKED_BYTES = 1 << 30
 def _fill_hint() -> str:
     """Return the remedy in error messages on cells without a number."""
     return (
-        f"fill or remove these rows yourself, or let them be missing with {parameter('missing', 'weight')} or "
-        f"{parameter('missing', 'hold')}"
+        f"fill or remove these rows yourself, or let them be missing with {parameter('missing', 'weight')} (outputs "
+        f"and times) or {parameter('missing', 'hold')} (inputs, too)"
     )
 
 

@@ -216,7 +216,7 @@ def run_from_tables(
 
     given_inputs = gather(selection.inputs, blank=policy == "hold")
     given_outputs = gather(selection.outputs, blank=policy != "refuse")
-    clock = _clock(selection, pool, used_columns, options)
+    clock = _clock(selection, pool, used_columns, options, policy)
     name = options.name
     if name is None:
         stem = base_name(tables[0].path)
@@ -259,7 +259,9 @@ class _TimeColumn:
     notes: tuple[str, ...] = ()
 
 
-def _clock(selection: ColumnSelection, pool: ColumnTable, columns: list[Column], options: LoadOptions) -> _TimeColumn:
+def _clock(
+    selection: ColumnSelection, pool: ColumnTable, columns: list[Column], options: LoadOptions, policy: MissingPolicy
+) -> _TimeColumn:
     unit_option = options.time_unit
     if selection.step is not None:
         if unit_option is not None:
@@ -283,7 +285,7 @@ def _clock(selection: ColumnSelection, pool: ColumnTable, columns: list[Column],
     facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
     if column.timestamps is None:
         unit, notes = time_unit_of(time_header(column), label, unit_option)
-        return _TimeColumn(column.numbers(), unit, label, column.name, facts + notes)
+        return _TimeColumn(column.numbers(blank=policy != "refuse"), unit, label, column.name, facts + notes)
     if unit_option is not None:
         raise DataError(
             f"{parameter('time_unit', unit_option)} is the unit of numbers, but {label} has dates or times of day; "

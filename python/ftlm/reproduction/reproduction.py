@@ -249,7 +249,7 @@ def reproduce(
     simulated = square is None
     others, lattice = _other_arms(arms, records), OrderGrid(increment=increment, alpha=GRID_ALPHA)
     for each in (increment, real_number("rivals_increment", rivals_increment)):
-        OrderGrid(increment=each).values(published_structure(1))
+        OrderGrid(increment=each, alpha=GRID_ALPHA).values(published_structure(1))
     if square is None and sine is not None:
         raise ModelError("a sine run is given without a square run; give both, or neither")
     omitted = []

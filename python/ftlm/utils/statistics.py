@@ -49,6 +49,47 @@ def estimate_noise(samples: Floats) -> float:
     return robust_deviation(differences) / float(np.sqrt(6.0))
 
 
+#: Machine precisions at which samples may have been rounded: single precision, tested first because its own grid is not
+#: a quantization, and double precision.
+SAMPLE_PRECISIONS = (float(np.finfo(np.float32).eps), float(np.finfo(np.float64).eps))
+#: Maximum number of quantization steps in the range of a signal: that of a converter of 24 bits.
+MAX_QUANTIZATION_STEPS = 2**24
+#: Rounding error of a sample in units of the precision of the largest one, and minimum quantization step in units of
+#: that error. Below this step, any samples are multiples of it within rounding.
+ROUNDING_UNITS, MIN_QUANTUM_ERRORS = 4.0, 50.0
+
+
+def quantization_step(samples: Floats) -> float:
+    """Return the largest step of which all differences between finite samples are multiples; 0 if there is none.
+
+    The step is the greatest common divisor of the differences, by Euclid's algorithm with a tolerance for rounding. A
+    step near the rounding error, or far below the range, is no quantization.
+    """
+    values = np.unique(samples)
+    for precision in SAMPLE_PRECISIONS:
+        error = ROUNDING_UNITS * precision * float(np.abs(values).max(initial=0.0))
+        gaps = np.diff(values)
+        levels = values[np.concatenate([[True], gaps > error])]
+        if levels.size < 2:
+            continue
+        gaps = np.unique(np.diff(levels))
+        step = float(gaps[0])
+        least = max(MIN_QUANTUM_ERRORS * error, float(levels[-1] - levels[0]) / MAX_QUANTIZATION_STEPS)
+        while step > least:
+            counts = np.rint(gaps / step)
+            rest = np.abs(gaps - counts * step)
+            rest = rest[rest > error * (2.0 + counts)]
+            if not rest.size:
+                places = np.rint((levels - levels[0]) / step)
+                step = float(places @ (levels - levels[0])) / float(places @ places)
+                off = np.abs(levels - levels[0] - places * step)
+                if off.max() <= 2.0 * error:
+                    return step
+                break
+            step = float(rest.min())
+    return 0.0
+
+
 #: Orders of the differences from which the noise is estimated, and minimum number of differences of an order.
 DIFFERENCE_ORDERS, MIN_DIFFERENCES = range(2, 9), 8
 #: Maximum number of first samples from which the noise is estimated; more samples would only increase the time.

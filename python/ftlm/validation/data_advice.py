@@ -22,7 +22,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import attributes
 from ftlm.utils.linalg import orthonormal
 from ftlm.utils.parameters import parameter
-from ftlm.utils.statistics import estimate_noise, is_rest
+from ftlm.utils.statistics import estimate_noise, is_rest, quantization_step
 from ftlm.utils.validation import Floats
 from ftlm.validation.feedback import feedback_test
 
@@ -227,7 +227,7 @@ def _few_levels(x: Floats) -> bool:
     return bool(np.unique(x).size < max(12, 0.01 * x.size))
 
 
-def _quantum(y: Floats) -> float:
+def _smallest_change(y: Floats) -> float:
     changes = np.abs(np.diff(y))
     changes = changes[changes > 1e-12 * float(np.max(np.abs(y)))]
     return float(changes.min()) if changes.size else 0.0
@@ -242,7 +242,9 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
     end = first + rows
     step_after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
     at_extreme = y[first] in (y.min(), y.max())
-    return bool(at_extreme and rows < y.size and min(step_before, step_after) > max(4 * _quantum(y), 0.2 * typical))
+    return bool(
+        at_extreme and rows < y.size and min(step_before, step_after) > max(4 * _smallest_change(y), 0.2 * typical)
+    )
 
 
 def _saturation(run: Run, name: str) -> Iterator[Finding]:
@@ -250,12 +252,12 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
     levels = np.unique(y)
     if name in run.inputs and _few_levels(y):
         return  # A signal of few levels is at its extremes by design.
-    noise, quantum = estimate_noise(y), _quantum(y)
+    noise, least_change = estimate_noise(y), _smallest_change(y)
     code, role = ("saturation_input", "input") if name in run.inputs else ("saturation", "output")
     for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
         starts, lengths = _true_intervals(y == extreme)
         long = lengths >= MIN_CLIPPED_SAMPLES
-        if noise < 2 * quantum:
+        if noise < 2 * least_change:
             # If quantization exceeds the noise, only an interval that is entered steeply counts as clipped.
             steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
             clipped = int(np.sum(lengths[long][np.array(steep, dtype=bool)]))
@@ -483,8 +485,8 @@ class SignalFigures:
     noise
         Standard deviation of the measurement noise, estimated from second differences.
     quantum
-        Quantization step: the smallest nonzero change between samples. 0 if there is none, and for a zero-order-hold
-        input, whose values are exact commands.
+        Quantization step: the largest step of which all differences between samples are multiples. 0 if there is none,
+        and for a zero-order-hold input, whose values are exact commands.
     at_extremes
         Fraction of samples at the lowest or highest value. A large fraction shows saturation or a two-level signal.
     constant
@@ -591,8 +593,6 @@ def _figures(run: Run, name: str) -> SignalFigures:
     all_rows = run[name]
     x = drop_missing(all_rows)
     low, high, noise = float(x.min()), float(x.max()), estimate_noise(all_rows)
-    changes = np.abs(np.diff(x))
-    changes = changes[changes > 0]
     deviation = float(x.std())
     return SignalFigures(
         name=name,
@@ -604,7 +604,7 @@ def _figures(run: Run, name: str) -> SignalFigures:
         mean=float(x.mean()),
         deviation=deviation,
         noise=noise,
-        quantum=float(changes.min()) if changes.size and run.intersample.get(name) != "zoh" else 0.0,
+        quantum=0.0 if run.intersample.get(name) == "zoh" else quantization_step(x),
         at_extremes=float(np.mean((x == low) | (x == high))),
         constant=low == high,
         at_rest=is_rest(x),

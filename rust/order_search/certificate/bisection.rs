@@ -51,7 +51,7 @@ pub struct Certificate {
     pub lower_bound: f64,
     /// Smallest root mean square of the equation error found, infinite if none was found.
     pub best: f64,
-    /// Order α of the equation with the error `best`. If no such equation was found, the middle of the interval of α.
+    /// Order α of the equation with the error `best`. NaN if no such equation was found.
     pub order: f64,
     /// Orders ν of the terms of that equation, empty if none was found.
     pub orders: Vec<f64>,
@@ -187,7 +187,9 @@ impl CellBisection<'_> {
             let squares: f64 = records.iter().flat_map(|r| r.signal(self.region.output)).map(|y| y * y).sum();
             squares / records.iter().map(Record::m).sum::<usize>() as f64
         };
-        let (order, orders) = self.region.orders(&place).unwrap_or((f64::NAN, Vec::new()));
+        // Without a point whose error is finite, `place` is empty and there is no order.
+        let found = if best.is_finite() { self.region.orders(&place) } else { None };
+        let (order, orders) = found.unwrap_or((f64::NAN, Vec::new()));
         let root = |share: f64| if share.is_finite() { (share * mean).sqrt() } else { f64::INFINITY };
         let at_least = if proved.is_finite() { root(proved) * (1.0 - 1e-9) } else { 0.0 };
         Ok(Certificate { lower_bound: at_least, best: root(best), order, orders, cells: bounded, open_cells: open })

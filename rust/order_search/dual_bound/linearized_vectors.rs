@@ -485,7 +485,6 @@ impl NormAccumulator {
     /// Return the accumulated norm `so_far` with these values included. Infinite for [`Norm::L1`] if a value is not
     /// finite.
     fn accumulate(&self, so_far: f64, values: &[f64]) -> f64 {
-        // NaN must propagate.
         match self.of {
             Norm::L1 if values.iter().all(|v| v.is_finite()) => so_far.max(largest(values)),
             Norm::L1 => f64::INFINITY,
@@ -533,7 +532,20 @@ fn backwards(x: &[f64]) -> Vec<f64> {
     x.iter().rev().copied().collect()
 }
 
-/// Return the largest modulus of finite values. The result is meaningless if a value is NaN.
+/// Return the largest modulus of values; NaN if a value is NaN.
 fn largest<'a>(values: impl IntoIterator<Item = &'a f64>) -> f64 {
-    values.into_iter().fold(0.0, |top: f64, v| if v.abs() <= top { top } else { v.abs() })
+    values.into_iter().fold(0.0, |top: f64, v| if top.is_nan() || v.abs() <= top { top } else { v.abs() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::largest;
+
+    #[test]
+    fn the_largest_modulus_keeps_a_nan() {
+        assert!((largest(&[1.0, -3.0, 2.0]) - 3.0).abs() < f64::EPSILON);
+        for values in [[f64::NAN, 1.0, 2.0], [3.0, f64::NAN, 1.0], [1.0, 2.0, f64::NAN]] {
+            assert!(largest(&values).is_nan());
+        }
+    }
 }

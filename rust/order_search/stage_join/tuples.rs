@@ -172,7 +172,7 @@ impl Join {
     /// combinations: the first ones by index.
     pub(super) fn count_outcomes(&self, states: &[Vec<ScoreEntry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
         let mut counts = Counts::default();
-        let mut failures: Vec<(u64, Failure)> = Vec::new();
+        let mut failures = FirstFailures::new();
         for bucket in &self.buckets {
             let rows_of_bucket: [&[HalfRow]; 2] = std::array::from_fn(|h| &self.halves[h].rows[bucket.rows[h].clone()]);
             let class_counts: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
@@ -202,39 +202,82 @@ impl Join {
                 }
             }
             if failed {
-                self.list_failures(rows_of_bucket, states, &mut failures);
+                list_failures(rows_of_bucket, states, &mut failures);
             }
         }
-        failures.sort_unstable();
-        failures.truncate(MAX_LISTED_FAILURES);
-        (counts, failures)
+        (counts, failures.into_sorted())
+    }
+}
+
+/// Add the failed combinations of free orders in one bucket that may be among the first by index. `rows_of_bucket` are
+/// the rows of both halves, sorted by index.
+fn list_failures(rows_of_bucket: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2], failures: &mut FirstFailures) {
+    for first in rows_of_bucket[0] {
+        for second in rows_of_bucket[1] {
+            let index = first.index + second.index;
+            if index > failures.limit {
+                break;
+            }
+            let [a, b] = [(0, first), (1, second)].map(|(h, p)| states[h][p.combination as usize].class);
+            if let Class::Failed(failure) = a.combine(b) {
+                failures.push(index, failure);
+            }
+        }
+    }
+}
+
+/// Failed combinations of free orders with the lowest indices, in any order of arrival.
+struct FirstFailures {
+    entries: Vec<(u64, Failure)>,
+    /// Index above which a combination is not among the first.
+    limit: u64,
+}
+
+impl FirstFailures {
+    fn new() -> Self {
+        Self { entries: Vec::new(), limit: u64::MAX }
     }
 
-    /// Append index and reason of the failed combinations of free orders in one bucket that may be among the first by
-    /// index. `rows_of_bucket` are the rows of both halves, sorted by index.
-    fn list_failures(
-        &self,
-        rows_of_bucket: [&[HalfRow]; 2],
-        states: &[Vec<ScoreEntry>; 2],
-        failures: &mut Vec<(u64, Failure)>,
-    ) {
-        for first in rows_of_bucket[0] {
-            for second in rows_of_bucket[1] {
-                let index = first.index + second.index;
-                if failures.len() >= MAX_LISTED_FAILURES && index > failures[MAX_LISTED_FAILURES - 1].0 {
-                    break;
-                }
-                let [a, b] = [(0, first), (1, second)].map(|(h, p)| states[h][p.combination as usize].class);
-                if let Class::Failed(failure) = a.combine(b) {
-                    failures.push((index, failure));
-                    if failures.len() >= 8 * MAX_LISTED_FAILURES {
-                        failures.sort_unstable();
-                        failures.truncate(MAX_LISTED_FAILURES);
-                    }
+    fn push(&mut self, index: u64, failure: Failure) {
+        self.entries.push((index, failure));
+        if self.entries.len() >= 8 * MAX_LISTED_FAILURES {
+            self.truncate();
+        }
+    }
+
+    /// Keep the first entries, sorted by index.
+    fn truncate(&mut self) {
+        self.entries.sort_unstable();
+        self.entries.truncate(MAX_LISTED_FAILURES);
+        if self.entries.len() == MAX_LISTED_FAILURES {
+            self.limit = self.entries[MAX_LISTED_FAILURES - 1].0;
+        }
+    }
+
+    /// Return the first entries, sorted by index.
+    fn into_sorted(mut self) -> Vec<(u64, Failure)> {
+        self.truncate();
+        self.entries
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_failures_are_listed_in_any_order_of_arrival() {
+        // Index k of the permutation 0..2000 with the multiplier 1103, which is coprime to 2000.
+        for begin in [0, 500, 1999] {
+            let mut failures = FirstFailures::new();
+            for k in 0..2000_u64 {
+                let index = (begin + 1103 * k) % 2000;
+                if index <= failures.limit {
+                    failures.push(index, Failure::Diverged);
                 }
             }
+            let listed: Vec<u64> = failures.into_sorted().into_iter().map(|(index, _)| index).collect();
+            assert_eq!(listed, (0..MAX_LISTED_FAILURES as u64).collect::<Vec<_>>());
         }
-        failures.sort_unstable();
-        failures.truncate(MAX_LISTED_FAILURES);
     }
 }
