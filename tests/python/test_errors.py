@@ -109,7 +109,7 @@ BAD = {
         "order beta: interval 1:0 is empty",
         lambda: search(order_grid=ftlm.order_grid(beta=(1, 0))),
     ),
-    "lattice of a million steps": (MODEL, "order alpha: 1e-09:2:1e-09", lambda: ftlm.order_grid(increment=1e-9)),
+    "lattice of a million steps": (MODEL, "order alpha: 1.05:2:1e-09", lambda: ftlm.order_grid(increment=1e-9)),
     "nothing to search": (MODEL, "every order is a number", lambda: search(words="D^1.5 y = a y + b u")),
     # Pulses
     "m above what the data carry": (

@@ -297,12 +297,14 @@ def profile_intervals(
                 absent.append((name, words))
             is_open = at_end <= factor**2
             reached = absence if end == limit else end
-            ends.append(reached if is_open else _crossing(rise, estimate, end, factor**2, error * factor))
+            ends.append(reached if is_open else _bound_crossing(rise, estimate, end, factor**2, error * factor))
         intervals[name] = (ends[0], ends[1])
     return intervals, absent
 
 
-def _crossing(rise: Callable[[float], float], inside: float, outside: float, level: float, distance: float) -> float:
+def _bound_crossing(
+    rise: Callable[[float], float], inside: float, outside: float, level: float, distance: float
+) -> float:
     """Return the value between `inside` and `outside` at which `rise` reaches `level`, by bracketing and bisection.
 
     `distance` is the expected distance from `inside`. A wide bracket is bisected geometrically.

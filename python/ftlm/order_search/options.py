@@ -18,8 +18,8 @@ from ftlm.utils.validation import check_choice, check_integer, real_number, whol
 
 #: Increment of the order grid in the paper.
 DEFAULT_INCREMENT = 0.05
-#: Largest value of the highest order alpha in the default grid: an inertia. The smallest one is the increment.
-DEFAULT_MAX_ALPHA = 2.0
+#: Default interval of the highest order alpha of an equation: that of a flexible link is 2 or slightly less.
+DEFAULT_ALPHA_RANGE = (1.05, 2.0)
 
 
 @check_arguments
@@ -32,8 +32,7 @@ class OrderGrid:
     increment
         Increment of every order for which `orders` gives none.
     alpha
-        Interval (low, high) of the highest order of every equation; default all multiples of the increment up to 2. The
-        grid of the paper is (1.05, 2.0).
+        Interval (low, high) of the highest order of every equation.
     orders
         Values of other orders by name: a number, a tuple (low, high) or (low, high, increment), the text
         ``"low:high:increment"``, or a list. The name ``alpha`` stands for the highest order of every equation. Its
@@ -41,7 +40,7 @@ class OrderGrid:
     """
 
     increment: float = DEFAULT_INCREMENT
-    alpha: tuple[float, float] | None = None
+    alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE
     orders: Mapping[str, Values] = field(default_factory=dict)
 
     @check_arguments
@@ -66,17 +65,13 @@ class OrderGrid:
             elif name in structure.order_values:
                 values[name] = structure.order_values[name]
             elif name in highest:
-                values[name] = self._axis(name, self.orders.get("alpha", self._alpha_range()))
+                values[name] = self._axis(name, self.orders.get("alpha", self.alpha))
         fixed = [e.order.constant for e in structure.equations if not e.order.names]
         top = max([max(values[n]) for n in highest if n in values] + fixed, default=2.0)
         for name in free:
             if name not in values:
                 values[name] = order_axis(name, 0.0, min(top, MAX_ORDER), self.increment)
         return {name: values[name] for name in free}
-
-    def _alpha_range(self) -> tuple[float, float]:
-        """Return the interval of the highest order of every equation."""
-        return self.alpha or (min(self.increment, DEFAULT_MAX_ALPHA), DEFAULT_MAX_ALPHA)
 
     def _axis(self, name: str, spec: Values) -> tuple[float, ...]:
         if isinstance(spec, tuple) and len(spec) == 2:
@@ -87,7 +82,7 @@ class OrderGrid:
 
 @check_arguments
 def order_grid(
-    increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] | None = None, **orders: Values
+    increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
 ) -> OrderGrid:
     """Return the grid of an order search: interval of each order, and increment within the interval.
 
@@ -100,8 +95,7 @@ def order_grid(
     increment
         Positive increment of the grid; the paper uses 0.05.
     alpha
-        Interval (low, high) of the highest order alpha of every equation, within (0, 10]; default all multiples of the
-        increment up to 2. The paper's grid is ``alpha=(1.05, 2.0)``.
+        Interval (low, high) of the highest order alpha of every equation, within (0, 10].
     **orders
         Values of other orders by name; see :class:`OrderGrid`.
 
@@ -115,12 +109,8 @@ def order_grid(
     ModelError
         If the increment is not positive, or an interval is empty or out of range.
     """
-    if alpha is None:
-        grid = OrderGrid(real_number("increment", increment), None, dict(orders))
-        order_axis("alpha", *grid._alpha_range(), grid.increment)
-        return grid
     if not (isinstance(alpha, (tuple, list)) and len(alpha) == 2):
-        raise ModelError(f"alpha = {alpha!r} is not an interval; write (low, high), such as (0.5, 2.0)")
+        raise ModelError(f"alpha = {alpha!r} is not an interval; write (low, high), such as {DEFAULT_ALPHA_RANGE}")
     low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
         raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 10]; choose a positive order")

@@ -778,10 +778,9 @@ class StageWork:
         self.begin("orders by instrumental variables", "instrumental")
         grid = self.preset.order_grid
         axes = {}
-        highest = math.inf if grid.alpha is None else grid.alpha[1]
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
-            axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= highest]
+            axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
         method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=1)
         return self.identify_candidate("instrumental variables", self.on, self.measured, method)
 

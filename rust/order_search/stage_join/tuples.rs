@@ -226,7 +226,7 @@ fn list_failures(rows_of_bucket: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2],
     }
 }
 
-/// Failed combinations of free orders with the lowest indices, in any order of arrival.
+/// The failed combinations of free orders with the lowest indices, in any order of arrival.
 struct FirstFailures {
     entries: Vec<(u64, Failure)>,
     /// Index above which a combination is not among the first.
