@@ -33,7 +33,7 @@ impl<'a> NonuniformSignal<'a> {
         Ok(Self::new_unchecked(times, values, intersample))
     }
 
-    /// Signal whose sample times have been checked.
+    /// Return a signal without checking its sample times, which must ascend from 0.
     pub(crate) fn new_unchecked(times: &'a [f64], values: &'a [f64], intersample: Intersample) -> Self {
         Self { times: Cow::Borrowed(times), values: Cow::Borrowed(values), intersample }
     }

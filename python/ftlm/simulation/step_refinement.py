@@ -159,5 +159,8 @@ def _fit_past_inputs(
 def exact_samples(
     core: _core.OutputSimulation, terms: InitialTermsTuple
 ) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
-    """Return exact samples and initial terms of a model with integer orders; None if the model must be discretized."""
+    """Return exact samples (outputs, N) of a model with integer orders, and its initial terms (exponent, coefficient).
+
+    None if the model must be discretized.
+    """
     return core.exact_samples(terms, stop_flag())
