@@ -41,8 +41,8 @@ pub struct Record {
 impl Record {
     /// Build a record from pulse means. All signals must be finite and have the same nonzero length m.
     ///
-    /// `filter` is the series (m terms) of a known sensor filter that the signals passed. It is applied to initial
-    /// terms.
+    /// `filter` contains the m coefficients of the block-pulse series (discrete impulse response) of a known sensor
+    /// filter that the signals passed. It is applied to initial terms.
     ///
     /// # Errors
     /// [`Error::Length`] for wrong lengths, [`Error::NotFinite`] with the number of the signal, [`Error::OutOfRange`]

@@ -237,7 +237,7 @@ def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float
 
 @check_arguments
 def operational_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
-    """Return the fractional integration matrix of Haar wavelets, equation (37) of the paper.
+    """Return the fractional integration matrix of Haar wavelets, equation (37) of the paper that ftlm implements.
 
     It is computed from the matrix of block pulses by fast Haar transforms from both sides, in O(m^2) operations.
 

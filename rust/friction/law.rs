@@ -43,7 +43,8 @@ pub struct Pulse {
     pub phase: Phase,
 }
 
-/// Derivatives of velocities, gain and friction law of a pulse with respect to one parameter.
+/// Derivatives of the quantities that determine the motion of a body in one block pulse, with respect to one parameter:
+/// velocities, friction gain and parameters of the friction law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PulseDerivatives {
     /// Derivative of the velocity at the start of the pulse.

@@ -120,7 +120,7 @@ pub(crate) struct Screen<const L: usize> {
     norm_cache: NormCache,
     /// Positions in a row of candidates that the row bound does not exclude.
     open_positions: Vec<usize>,
-    /// State of the lookup of linearized test vectors.
+    /// Cache of the most recent lookup of test vectors that are linearized in the orders.
     lookup: VectorLookup,
     /// Path of the unstable-zero test that excluded the most recent candidate.
     path: usize,

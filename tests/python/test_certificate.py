@@ -113,7 +113,7 @@ def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
 @pytest.mark.parametrize(
     ("words", "options", "said"),
     [
-        ("D^alpha y = a D^beta y + 3 u", {}, "fixed coefficients, but 1 of the terms of y"),
+        ("D^alpha y = a D^beta y + 3 u", {}, "requires free coefficients, but the equation of y has 1 fixed one"),
         (WORDS, {"tolerance": 0}, "tolerance=0"),
         (WORDS, {"tolerance": "much"}, "tolerance"),
         (WORDS, {"tolerance": float("nan")}, "tolerance"),

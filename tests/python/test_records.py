@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import ftlm
 import oracles
 from ftlm import _core, kernels
-from ftlm.data.run import MAX_CACHED_RESULTS, as_runs
+from ftlm.data.runs import MAX_CACHED_RESULTS, as_runs
 from ftlm.simulation.discretization import (
     default_m,
     equation_tuple,

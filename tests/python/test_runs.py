@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ftlm.data.run import Run, check_compatible
+from ftlm.data.run import Run
+from ftlm.data.runs import check_compatible
 from ftlm.errors import DataError, FtlmError
 from ftlm.io.load import load
 

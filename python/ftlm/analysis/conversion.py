@@ -1,4 +1,4 @@
-"""Conversion of models from and to python-control, and to MATLAB with FOMCON and JSON."""
+"""Conversion of models from and to python-control, and export to MATLAB (with FOMCON) and to JSON."""
 
 from __future__ import annotations
 

@@ -13,7 +13,14 @@ import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.errors import ModelError
-from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
+from ftlm.estimation.response_problem import (
+    MAX_EXPONENT,
+    MAX_STARTS,
+    ConstraintText,
+    ResponseProblem,
+    ResponseRecord,
+    halton,
+)
 from ftlm.structure.circuit import Circuit, impedance_and_derivatives
 from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import chi_squared_99
@@ -108,7 +115,7 @@ class CircuitProblem(ResponseProblem):
             out.append((z, None if columns is None else np.stack(columns, axis=1)))
         return out
 
-    def constraints(self) -> tuple[Floats, Floats, list[str]]:
+    def constraints(self) -> tuple[Floats, Floats, list[ConstraintText]]:
         """Return (rows, limits, descriptions) of the linear constraints ``rows @ values <= limits``.
 
         They keep every parameter within its bounds, and exponents between 0.05 and 1. `values` are the variables of the
@@ -120,7 +127,7 @@ class CircuitProblem(ResponseProblem):
             for sign, end in ((1.0, high), (-1.0, low)):
                 rows.append(sign * (np.arange(len(self.names)) == k))
                 limits.append(sign * (math.log(end) if self.is_log[k] else end))
-                words.append(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}")
+                words.append(ConstraintText(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}", name))
         return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
 
     def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.data.sampling import MIN_RUN_SAMPLES
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify

@@ -19,7 +19,8 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.analysis.poles import steady_states
-from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs, as_runs
 from ftlm.data.sampling import ZERO_ORDER_HOLD, Intersample, drop_missing, longest_delay
 from ftlm.errors import FtlmError
 from ftlm.estimation.closed_loop import run_with_inputs

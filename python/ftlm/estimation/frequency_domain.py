@@ -23,7 +23,7 @@ from ftlm.estimation.model_checks import (
     second_optimum_findings,
 )
 from ftlm.estimation.objective import covariance_of
-from ftlm.estimation.response_problem import ResponseProblem, exponent_bound
+from ftlm.estimation.response_problem import ConstraintText, ResponseProblem
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.progress import Progress, ShareTracker
@@ -250,9 +250,9 @@ def _fit_response(
         best = _fit(problem, placed)
     tracker.advance_to(1.0)
     active_bounds = [words[k] for k in best.active_constraints]
-    at_limit = [n for n in problem.exponents if exponent_bound(n) in active_bounds]
+    at_limit = [bound for bound in active_bounds if bound.parameter in problem.exponents]
     if at_limit and not _is_bound_significant(problem, records, best, kind):
-        active_bounds = [text for text in active_bounds if text not in map(exponent_bound, at_limit)]
+        active_bounds = [bound for bound in active_bounds if bound not in at_limit]
     ends = [
         f if multistart_problem is problem else _fit_again(problem, multistart_problem, f)
         for f in _near_optima(fits, multistart_problem, kind)
@@ -527,7 +527,7 @@ def _result(
     best: ResponseFit,
     kind: str,
     reached: tuple[int, int],
-    active_bounds: list[str],
+    active_bounds: list[ConstraintText],
     *,
     exact: bool,
     ends: Sequence[ResponseFit] = (),
@@ -592,9 +592,9 @@ def _result(
         model = _model(problem, records, values_by_name, values, covariance, standard, findings)
     reported = [name for name, _ in absent]
     findings += [
-        make_finding("response_on_bound", bound=bound)
+        make_finding("response_on_bound", bound=bound.text)
         for bound in active_bounds
-        if bound.partition(" ")[0] not in reported
+        if bound.parameter is None or bound.parameter not in reported
     ]
     findings += _identifiability_findings(problem, {n: values_by_name[n] for n in names if n not in reported}, standard)
     return FrequencyIdentification(

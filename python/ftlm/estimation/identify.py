@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from ftlm.arm.flexible_link import FLEXIBLE_LINK
-from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.coefficient_bounds import Bounds

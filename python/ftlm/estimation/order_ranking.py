@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import fit_at_best_orders

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,9 +25,11 @@ MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 MAX_EXPONENT = 1.0
 
 
-def exponent_bound(name: str) -> str:
-    """Return a description of an impedance exponent's upper bound, for messages."""
-    return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
+class ConstraintText(NamedTuple):
+    """Description of a linear constraint for messages, and the only parameter that it concerns, if there is one."""
+
+    text: str
+    parameter: str | None = None
 
 
 def is_impedance(record: FrequencyData) -> bool:
@@ -246,20 +249,20 @@ class ResponseProblem:
         matrix = np.concatenate(rows) if rows else np.zeros((flat.size, 0), dtype=np.complex128)
         return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
-    def constraints(self) -> tuple[Floats, Floats, list[str]]:
+    def constraints(self) -> tuple[Floats, Floats, list[ConstraintText]]:
         """Return (rows, limits, descriptions) of the constraints ``rows @ values <= limits`` of orders and delays."""
         rows: list[Floats] = []
         limits: list[float] = []
-        words: list[str] = []
+        words: list[ConstraintText] = []
 
-        def keep(order: Order, most: float, text: str, sign: float = 1.0) -> None:
+        def keep(order: Order, most: float, text: str, sign: float = 1.0, *, name: str | None = None) -> None:
             row = np.zeros(len(self.names))
             for n, w in order.weights:
                 row[self._place[n]] += sign * w
             if np.any(row):
                 rows.append(row)
                 limits.append(most - sign * order.constant)
-                words.append(text)
+                words.append(ConstraintText(text, name))
 
         for item in self.structure.equations:
             keep(item.order, MAX_ORDER, f"the highest order of {item.output} is at most 10")
@@ -280,14 +283,15 @@ class ResponseProblem:
                 keep(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
                 keep(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
         for name in self.exponents:
-            keep(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, exponent_bound(name))
+            text = f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
+            keep(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, text, name=name)
         for free in self.structure.free_inputs:
             for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
                 row = np.zeros(len(self.names))
                 row[self._delay[free.signal]] = sign
                 rows.append(row)
                 limits.append(sign * end * self.unit)
-                words.append(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s")
+                words.append(ConstraintText(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s"))
         table = np.array(rows) if rows else np.zeros((0, len(self.names)))
         return table, np.array(limits), words
 

@@ -17,6 +17,7 @@ from ftlm.order_search.search import Job, make_job, run_job
 from ftlm.simulation.discretization import check_linear, named_signals
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_integer, real_number, short_repr
@@ -199,8 +200,8 @@ def _check_certifiable(job: Job) -> None:
     fixed_terms = [t for t in item.terms if t.fixed is not None]
     if fixed_terms:
         raise ModelError(
-            f"there is no certificate over all orders with fixed coefficients, but {len(fixed_terms)} of the terms of "
-            f"{item.output} have one (the first is {fixed_terms[0].fixed:g}); give these coefficients names"
+            f"a certificate over all orders requires free coefficients, but the equation of {item.output} has "
+            f"{plural(len(fixed_terms), 'fixed one')} (the first is {fixed_terms[0].fixed:g}); give each a name"
         )
 
 

@@ -294,7 +294,7 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
             if contents is None:
                 contents = _contents_of_requests(frame, corruption)
             elif isinstance(frame, Requests):
-                raise ModelError("the requests are stored twice")
+                raise ModelError("the definitions of the searches are stored twice")
             else:
                 if frame.search >= len(contents.sections):
                     raise ModelError(f"there is no search {frame.search}")

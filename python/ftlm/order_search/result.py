@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, texts, unique
+from ftlm.model.best_identification import BestIdentification
 from ftlm.model.model import Model
-from ftlm.model.model_access import BestIdentification
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame

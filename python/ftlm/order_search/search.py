@@ -16,7 +16,8 @@ import numpy as np
 from msgspec import UNSET
 
 from ftlm import _core
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.model.model import Model
 from ftlm.order_search.batches import (

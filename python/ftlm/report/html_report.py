@@ -15,7 +15,8 @@ from markupsafe import Markup
 
 from ftlm.analysis.frequency_response import linear_part
 from ftlm.analysis.poles import modes, steady_states
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart

@@ -80,7 +80,8 @@ class Demo:
     square, sine
         Estimation run and validation run of the simulated arm.
     stages
-        Results by joint number (stage), without a comparison of optimizers and without a weak prior.
+        Results by joint number (stage). The demonstration omits the comparison of optimizers and the fits with a weak
+        prior.
     files
         Paths of the written files.
     """

@@ -12,7 +12,8 @@ from typing import TypeAlias
 import numpy as np
 
 from ftlm import _core
-from ftlm.data.run import Run, Runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs
 from ftlm.data.sampling import make_read_only
 from ftlm.errors import DataError, ModelError
 from ftlm.simulation.initial_conditions import (

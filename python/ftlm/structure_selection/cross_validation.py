@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.estimators import fitted_model

@@ -11,8 +11,8 @@ from typing import Any
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation, Verdict
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, texts
+from ftlm.model.best_identification import BestIdentification
 from ftlm.model.model import Model
-from ftlm.model.model_access import BestIdentification
 from ftlm.model.parameter_estimates import Parameter
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial

@@ -10,7 +10,8 @@ from statistics import median
 
 import numpy as np
 
-from ftlm.data.run import Run, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify, identify_pieces

@@ -12,7 +12,8 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm import _core
-from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs, as_runs
 from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError
 from ftlm.findings import Finding, make_finding, texts

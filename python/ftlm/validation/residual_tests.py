@@ -13,7 +13,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ftlm import _core
-from ftlm.data.run import Run, Runs, as_runs
+from ftlm.data.run import Run
+from ftlm.data.runs import Runs, as_runs
 from ftlm.data.sampling import interpolate_gaps
 from ftlm.errors import DataError
 from ftlm.findings import Finding, make_finding, texts

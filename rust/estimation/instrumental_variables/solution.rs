@@ -116,7 +116,8 @@ impl RecordInstruments {
     }
 }
 
-/// Relative norm of an instrument outside the span of the previous ones below which it counts as dependent on them.
+/// An instrument counts as linearly dependent on the previous ones if its component outside their span has a norm of at
+/// most this fraction of its own norm.
 const RANK_TOLERANCE: f64 = 1e-13;
 
 /// Orthonormalize the instruments of all records in place.

@@ -377,7 +377,7 @@ impl Order {
         Self { constant, weights: Vec::new() }
     }
 
-    /// Return an order that is a single free order.
+    /// Return an order expression that consists only of the free order `name`.
     #[must_use]
     pub fn free(name: &str) -> Self {
         Self { constant: 0.0, weights: vec![(name.to_owned(), 1.0)] }

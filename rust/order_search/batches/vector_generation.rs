@@ -15,9 +15,10 @@ use crate::order_search::dual_bound::tailored_vectors::TailoredVector;
 use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Minimum number of candidates in the sample for tailored test vectors. The first pass uses this number. Later passes
-/// use a fraction of a large grid, because then few candidates are not excluded. The sample consists of blocks of
-/// consecutive candidates, because usually all candidates of a block are excluded or none.
+/// Minimum number of candidates in the sample from which test vectors are tailored. The first pass samples this number.
+/// Later passes sample the number of candidates of the grid divided by [`TAILORED_SAMPLE_RATIO`], if that is more,
+/// because most candidates are excluded by then. The sample consists of blocks of consecutive candidates, because
+/// usually all candidates of a block are excluded or none.
 const MIN_TAILORED_SAMPLE: u64 = 1 << 17;
 /// Ratio of the number of candidates of a large grid to the number in the sample for tailored test vectors.
 const TAILORED_SAMPLE_RATIO: u64 = 512;

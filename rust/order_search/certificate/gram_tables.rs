@@ -62,7 +62,8 @@ pub(super) struct GramTables {
     target: [Vec<f64>; EXPANSION_COLUMNS],
     /// Upper bounds of the norms of a regressor column and its derivatives by the order, by node.
     sizes: Vec<[f64; EXPANSION_COLUMNS]>,
-    /// Upper bound of the remainder of the Taylor expansion in the order, by node.
+    /// Upper bound of the remainder when a regressor column is expanded in a Taylor series in its order, by node. A node
+    /// is an order about which columns are expanded.
     rests: Vec<f64>,
 }
 
