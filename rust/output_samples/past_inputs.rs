@@ -1,9 +1,10 @@
 //! Initial terms that represent the past inputs of a run, under a Gaussian prior on these inputs.
 //!
-//! Before the first sample, each equation has an unknown zero-mean Gaussian input. It is piecewise constant on octaves
-//! of time, over [`PAST_LENGTHS`] lengths of the run. Its variance, relative to the response to the inputs of the run,
-//! maximizes the marginal likelihood (empirical Bayes). Without the prior, free initial terms would absorb errors of
-//! the model. Initial values by Caputo's definition and levels of the outputs have no prior.
+//! Initial terms are multiples of powers of time that are added to the right-hand sides of the equations, and levels of
+//! the outputs. Before the first sample, each equation has an unknown zero-mean Gaussian input, which is piecewise
+//! constant on octaves of time over [`PAST_LENGTHS`] lengths of the run. The size of these inputs, scaled by the
+//! response to the inputs of the run, maximizes the marginal likelihood (empirical Bayes). Without the prior, the
+//! initial terms would absorb errors of the model. Initial values by Caputo's definition and levels have no prior.
 
 use std::sync::Arc;
 
@@ -42,11 +43,13 @@ struct WeightedColumns {
 impl OutputSimulation {
     /// Return the posterior mean of the initial terms that represent past inputs: (exponent, coefficient) by equation.
     ///
-    /// `exponents` are those of all powers of time by equation, `free` those without a prior. With `has_level`, the
-    /// level of each output is a further term without a prior, with the exponent ∞. None if a response is not finite.
+    /// `exponents[i]` are the exponents of the powers of time in equation i, and `free[i]` those of them without a
+    /// prior. With `has_level`, the level of each output is a further term without a prior; it has the exponent ∞ and
+    /// belongs to the equation of the output. None if a response is not finite.
     ///
     /// # Errors
-    /// As [`OutputSimulation::refine`]; [`Error::Length`] for exponents of another number of equations.
+    /// As [`OutputSimulation::refine`]; [`Error::Length`] if `exponents` or `free` do not have
+    /// one entry per equation.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -129,8 +132,8 @@ impl OutputSimulation {
         Ok(Some(found))
     }
 
-    /// Responses of all outputs to unit inputs, by equation and octave of past time, at the compared samples. None if a
-    /// response is not finite.
+    /// Responses `[equation][octave]` to a unit input that acted in this equation during this octave of past time: one
+    /// row per output, at the sample times of the simulation. None if a response is not finite.
     fn past_responses(&self, options: Refinement, stop: &Stop) -> Result<Option<Vec<Vec<Rows>>>> {
         let (n, rows) = (self.equations.len(), self.recording.len());
         let past = PAST_LENGTHS * rows;
@@ -138,8 +141,8 @@ impl OutputSimulation {
         let octaves: Vec<usize> = std::iter::once(0).chain(octaves).chain([past]).collect();
         let rest = InitialTerms::Given(vec![Vec::new(); n]);
         let mut responses = Vec::with_capacity(n);
-        for driven in 0..n {
-            let simulation = self.unit_step(driven, rows + past)?;
+        for forced in 0..n {
+            let simulation = self.unit_step(forced, rows + past)?;
             let steps = match simulation.exact_samples(&rest, stop) {
                 Ok(None) => simulation.refine(&rest, options, stop).map(|refined| refined.samples.outputs),
                 Ok(Some(samples)) => Ok(samples.outputs),
@@ -159,16 +162,17 @@ impl OutputSimulation {
         Ok(Some(responses))
     }
 
-    /// Values of uniform samples, `rows` sampling intervals after the sample times of the simulation.
-    fn samples_after(&self, samples: &[f64], rows: usize) -> Vec<f64> {
-        let Some(times) = &self.times else { return samples[rows..rows + self.recording.len()].to_vec() };
+    /// Uniform samples, interpolated linearly at the sample times of the simulation plus `shift` sampling intervals.
+    fn samples_after(&self, samples: &[f64], shift: usize) -> Vec<f64> {
+        let Some(times) = &self.times else { return samples[shift..shift + self.recording.len()].to_vec() };
         let grid: Vec<f64> = (0..samples.len()).map(|k| self.recording.step() * k as f64).collect();
-        let later: Vec<f64> = times.iter().map(|time| time + self.recording.step() * rows as f64).collect();
+        let later: Vec<f64> = times.iter().map(|time| time + self.recording.step() * shift as f64).collect();
         later.iter().map(|time| interpolate(*time, &grid, samples)).collect()
     }
 
-    /// Simulation of a unit step in one equation, from rest, without the inputs of the run.
-    fn unit_step(&self, driven: usize, rows: usize) -> Result<Self> {
+    /// Simulation of `rows` uniform samples from rest, of a unit step that is added to the right-hand side of one
+    /// equation. The inputs of the run are zero.
+    fn unit_step(&self, forced: usize, rows: usize) -> Result<Self> {
         let outputs = self.recording.outputs();
         let own = |signal: usize, i: usize| {
             let output = outputs.iter().position(|output| *output == signal);
@@ -177,7 +181,7 @@ impl OutputSimulation {
         let equation = |(i, item): (usize, &Equation)| {
             let given = item.structure.terms.iter().zip(&item.coefficients);
             let given = given.filter_map(|(term, c)| own(term.signal, i).map(|signal| (Term { signal, ..*term }, *c)));
-            let forcing = (i == driven).then_some((Term { signal: outputs.len(), order: 0.0 }, 1.0));
+            let forcing = (i == forced).then_some((Term { signal: outputs.len(), order: 0.0 }, 1.0));
             let (terms, coefficients) = given.chain(forcing).unzip();
             Equation::new(Structure { output: i, order: item.structure.order, terms }, coefficients)
         };
@@ -198,8 +202,11 @@ impl OutputSimulation {
 }
 
 impl WeightedColumns {
-    /// Coefficients of all terms in a target. `driven` are the weighted samples of the response to the inputs, `groups`
-    /// the sum of squares of the first samples and the octave responses of each equation.
+    /// Coefficients of all terms, one per column, in a target: the weighted measured samples minus the response to the
+    /// inputs.
+    ///
+    /// `driven` are the weighted samples of the response to the inputs, None if it is zero. Each of `groups` belongs to
+    /// an equation: the sum of squares of the first samples of its octave responses, and these responses.
     fn fit(&self, target: &[f64], driven: Option<Vec<f64>>, groups: &[(f64, Rows)]) -> Result<Vec<f64>> {
         let space = decompose(&self.columns)?;
         let free: Rows = self.free.iter().map(|&k| self.columns[k].clone()).collect();
@@ -226,13 +233,13 @@ impl WeightedColumns {
             })
             .map(|(scale, octave)| {
                 let amounts = left.iter().zip(&values).map(|(u, value)| scale * inner(u, octave) / value);
-                sum_of_multiples(&right, &amounts.collect::<Vec<_>>(), self.columns.len())
+                linear_combination(&right, &amounts.collect::<Vec<_>>(), self.columns.len())
             })
             .collect();
         let shapes: Rows =
-            mixing.iter().map(|amounts| without(sum_of_multiples(&self.columns, amounts, target.len()))).collect();
-        let mut values = sum_of_multiples(&mixing, &posterior_mean(&shapes, &remainder)?, self.columns.len());
-        let explained = sum_of_multiples(&self.columns, &values, target.len());
+            mixing.iter().map(|amounts| without(linear_combination(&self.columns, amounts, target.len()))).collect();
+        let mut values = linear_combination(&mixing, &posterior_mean(&shapes, &remainder)?, self.columns.len());
+        let explained = linear_combination(&self.columns, &values, target.len());
         let left: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
         let offsets = minimum_norm_solution(&free, &left, MIN_SINGULAR_VALUE_RATIO).ok_or_else(not_decomposed)?;
         self.free.iter().zip(offsets).for_each(|(&k, value)| values[k] += value);
@@ -240,21 +247,22 @@ impl WeightedColumns {
     }
 }
 
-/// Posterior mean of the coefficients of columns in a target, under independent normal priors of one variance.
+/// Posterior mean of the coefficients of a linear regression of a target on columns, under independent normal priors of
+/// equal variance.
 ///
 /// The variance of the prior maximizes the marginal likelihood. The part of the target that the columns do not explain
 /// is noise, whose variance is increased for autocorrelation.
 fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
     let SingularValues { left, values, right } = decompose(columns)?;
     let along: Vec<f64> = left.iter().map(|u| inner(u, target)).collect();
-    let explained = sum_of_multiples(&left, &along, target.len());
+    let explained = linear_combination(&left, &along, target.len());
     let noise: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
     let variance = mean(&noise.iter().map(|v| v * v).collect::<Vec<_>>()) * variance_inflation(&noise);
     let ratios =
         |of: &dyn Fn(f64) -> f64| -> Vec<f64> { along.iter().zip(&values).map(|(a, value)| a * of(*value)).collect() };
     if variance.is_nan() || variance <= 0.0 {
         let exact = ratios(&|value| if value > 0.0 { 1.0 / value } else { 0.0 });
-        return Ok(sum_of_multiples(&right, &exact, columns.len()));
+        return Ok(linear_combination(&right, &exact, columns.len()));
     }
     let power = |size: f64, value: f64| (size * value).powi(2);
     let cost = |size: &f64| -> f64 {
@@ -266,10 +274,10 @@ fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
     };
     let best = PAST_INPUT_SIZES.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or(0.0);
     let means = ratios(&|value| best * best * value / (variance + power(best, value)));
-    Ok(sum_of_multiples(&right, &means, columns.len()))
+    Ok(linear_combination(&right, &means, columns.len()))
 }
 
-/// Singular values of columns of equal length.
+/// Singular value decomposition of the matrix with these columns.
 fn decompose(columns: &[Vec<f64>]) -> Result<SingularValues> {
     singular_values(columns).ok_or_else(not_decomposed)
 }
@@ -278,15 +286,15 @@ fn not_decomposed() -> Error {
     Error::Internal { what: "singular values of responses to past inputs that do not converge".into() }
 }
 
-/// The left singular vectors and singular values above rounding.
+/// The left singular vectors and singular values above rounding errors.
 fn significant(all: SingularValues) -> (Rows, Vec<f64>) {
     let least = MIN_SINGULAR_VALUE_RATIO * all.values.first().copied().unwrap_or(0.0);
     all.left.into_iter().zip(all.values).filter(|(_, value)| *value > least).unzip()
 }
 
-/// Sum of multiples of columns of a given length.
-fn sum_of_multiples(columns: &[Vec<f64>], amounts: &[f64], length: usize) -> Vec<f64> {
+/// Linear combination of columns, of a given length.
+fn linear_combination(columns: &[Vec<f64>], coefficients: &[f64], length: usize) -> Vec<f64> {
     let mut sum = vec![0.0; length];
-    columns.iter().zip(amounts).for_each(|(column, amount)| add_multiple(&mut sum, *amount, column));
+    columns.iter().zip(coefficients).for_each(|(column, c)| add_multiple(&mut sum, *c, column));
     sum
 }

@@ -17,7 +17,7 @@ MAX_CACHED_RESULTS = 8
 def check_compatible(runs: Iterable[Run]) -> None:
     """Raise DataError if there is no run, or if runs differ in inputs, outputs or units.
 
-    Runs may differ in step, length, intersample behavior and sequence of signals.
+    Runs may differ in step, length, intersample behavior, and in the order in which their signals are listed.
     """
     every = list(runs)
     if not every:
@@ -69,7 +69,7 @@ class Runs(tuple[Run, ...]):
         return Runs, (tuple(self),)
 
     def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
-        """Return the cached result for a key; if there is none, compute it by `make` and cache it.
+        """Return the cached items for a key; if there are none, collect the items of ``make()`` and cache them.
 
         The oldest result is removed when the cache is full.
         """

@@ -227,7 +227,7 @@ def admissible_range(name: str, bounds: Mapping[str, tuple[float, float]]) -> tu
 
 
 def check_admissible(values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> None:
-    """Raise ModelError if a fixed value is not admissible, or if bounds exclude every admissible value but one."""
+    """Raise ModelError if a fixed value is not admissible, or if bounds leave at most one admissible value."""
     for name, value in values.items():
         least, most = admissible_range(name, {})
         # An element of the value 0 is absent.
@@ -255,9 +255,10 @@ def profile_intervals(
     factor: float,
     optimize: Optimizer,
 ) -> tuple[dict[str, tuple[float, float]], list[tuple[str, str]]]:
-    """Return profile-likelihood intervals of imprecise positive parameters, and those not distinguishable from a limit.
+    """Return profile-likelihood intervals of imprecise parameters, and the parameters that may be 0 or infinite.
 
-    A bound of an interval is 0 or infinite if the data do not reject an element without this parameter.
+    A positive parameter is imprecise if its relative standard error exceeds `MAX_WALD_RELATIVE_ERROR`. A bound of its
+    interval is 0 or infinite if the data are compatible with this limit.
 
     Parameters
     ----------
@@ -270,15 +271,15 @@ def profile_intervals(
     noise
         Variance of a residual.
     factor
-        Quantile of the 95 % interval in standard errors.
+        Half-width of a 95 % interval divided by the standard error.
     optimize
         Function that fits the other parameters.
 
     Returns
     -------
     dict, list
-        (low, high) by name, and (name, limit) of each parameter whose limit, "0" or "infinity", is not rejected at
-        99 %.
+        (low, high) by name in SI units, and (name, limit) of each parameter whose limit, "0" or "infinity", is not
+        rejected at 99 %.
     """
     values, least_cost = best
     weights = [r.weight for r in problem.records]
@@ -290,7 +291,7 @@ def profile_intervals(
             continue
         warm = np.delete(values, k)
 
-        def rise(value: float, name: str = name, warm: Floats = warm) -> float:
+        def likelihood_ratio(value: float, name: str = name, warm: Floats = warm) -> float:
             """Return twice the decrease of the log likelihood if the parameter has this value."""
             circuit = problem.circuit.with_values({name: value})
             _, cost = optimize(CircuitProblem(circuit, records, weights, problem.bounds), warm)
@@ -299,20 +300,21 @@ def profile_intervals(
         ends = []
         for side, (absence, words) in enumerate(((0.0, "0"), (math.inf, "infinity"))):
             limit, end = PARAMETER_RANGE[side], admissible_range(name, problem.bounds)[side]
-            at_end = rise(end)
+            at_end = likelihood_ratio(end)
             if end == limit and math.isfinite(error) and at_end <= chi_squared_99(1):
                 absent.append((name, words))
             is_open = at_end <= factor**2
             reached = absence if end == limit else end
-            ends.append(reached if is_open else _bound_crossing(rise, estimate, end, factor**2, error * factor))
+            distance = error * factor
+            ends.append(reached if is_open else _bound_crossing(likelihood_ratio, estimate, end, factor**2, distance))
         intervals[name] = (ends[0], ends[1])
     return intervals, absent
 
 
 def _bound_crossing(
-    rise: Callable[[float], float], inside: float, outside: float, level: float, distance: float
+    function: Callable[[float], float], inside: float, outside: float, level: float, distance: float
 ) -> float:
-    """Return the value between `inside` and `outside` at which `rise` reaches `level`, by bracketing and bisection.
+    """Return the value between `inside` and `outside` at which `function` reaches `level`, by bracketing and bisection.
 
     `distance` is the expected distance from `inside`. A wide bracket is bisected geometrically.
     """
@@ -324,7 +326,7 @@ def _bound_crossing(
         trial = inside + sign * distance
         if not min(estimate, outside) < trial < max(estimate, outside):
             break
-        if rise(trial) > level:
+        if function(trial) > level:
             outside = trial
             break
         inside, distance = trial, 2.0 * distance
@@ -334,7 +336,7 @@ def _bound_crossing(
         if not is_wide and abs(outside - inside) <= PROFILE_TOLERANCE * distance:
             break
         trial = math.sqrt(inside * outside) if is_wide else 0.5 * (inside + outside)
-        if rise(trial) > level:
+        if function(trial) > level:
             outside = trial
         else:
             inside = trial

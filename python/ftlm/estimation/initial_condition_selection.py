@@ -80,6 +80,8 @@ def fit_with_offset_decision(
 class InitialConditionFits:
     """Functions that fit one structure under several initial conditions, and the last joint fit under each.
 
+    A joint fit estimates the parameters of all equations from all runs at once (output error).
+
     Parameters
     ----------
     estimate
@@ -110,9 +112,10 @@ class InitialConditionFits:
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
-        """Return a refit under other initial conditions, from the optimum of a fit if :attr:`complete` is given.
+        """Return a fit of a structure whose initial conditions differ from those of `fit`; None if not accepted.
 
-        The result is None if `accepts` rejects the refit.
+        It starts from the optimum of `fit` if :attr:`complete` is given, otherwise from automatic initial guesses.
+        `accepts` decides from the joint fit whether it is accepted.
         """
         joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
@@ -263,10 +266,10 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 
 
 def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bool) -> Fit:
-    """Return a fit under other initial conditions than those that the first samples suggested, with its findings.
+    """Return a fit with findings that report its initial conditions, which differ from those first chosen.
 
-    Its model keeps the requested initial conditions, because other runs may start differently. It keeps the new ones if
-    rest was rejected, because a comparison with the same runs would choose rest again.
+    Other runs may start differently, so the model is reset to the requested initial conditions of `structure`. If rest
+    was rejected, it keeps those of the fit, because a comparison with the same runs would choose rest again.
     """
     initial = None if fit.joint is None else fit.joint.initial
     names = ", ".join(run.name for run in fit.task.runs)
@@ -322,9 +325,9 @@ def _has_estimated_initial_conditions(fit: Fit) -> bool:
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if a constant in the equations explains the data as well as the initial terms do.
+    """Return a list with a finding if a constant in the equations explains the data as well as the initial terms.
 
-    A constant is part of the model, whereas initial terms hold for one run only.
+    Otherwise the list is empty. A constant is part of the model, whereas initial terms hold for one run only.
     """
     joint, structure = fit.joint, fit.task.structure
     if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):

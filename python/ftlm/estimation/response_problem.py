@@ -26,7 +26,7 @@ MAX_EXPONENT = 1.0
 
 
 class ConstraintText(NamedTuple):
-    """Description of a linear constraint for messages, and the only parameter that it concerns, if there is one."""
+    """Description of a linear constraint for messages, and the parameter that it bounds, None if there are several."""
 
     text: str
     parameter: str | None = None

@@ -145,7 +145,7 @@ def _fit_past_inputs(
 ) -> InitialTermsTuple | None:
     """Return initial terms that represent past inputs, under a prior on these inputs; None if a response is not finite.
 
-    `terms` are the names of the initial terms. Initial values by Caputo's definition have no prior.
+    Only the exponents of `terms` are used. Initial values by Caputo's definition have no prior.
     """
     names = initial_names(model, "caputo")
     free = [[exponent for output, exponent in names if output == o] for o in model.outputs]
