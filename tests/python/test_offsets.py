@@ -517,7 +517,7 @@ def test_a_level_is_not_taken_for_a_past():
     found = ftlm.identify(raised_motor(0), ftlm.equation(FIRST_ORDER))
     assert (found.settings["initial"], found.settings["offset"]) == ("rest", "level")
     assert found.comparison.offsets[0]["y"]["level"] == pytest.approx(5.0, abs=0.01)
-    assert any("an output level explains the runs better" in w for w in found.warnings)
+    assert "level_estimated" in [finding.code for finding in found.findings]
     for name, true in {"alpha": 1.0, "a": -1 / 0.15, "b": 8 / 0.15}.items():
         value = {**found.orders, **found.coefficients}[name]
         assert abs(value - true) < 3.5 * found.standard_errors[name]
