@@ -85,6 +85,22 @@ def test_the_estimated_delay_and_the_term_to_write():
     assert "D^1 u" in said.remedy
 
 
+@pytest.mark.parametrize("rows", [0, 5])
+@pytest.mark.parametrize("given", [-1, 3])
+def test_a_given_delay_that_is_wrong_is_named_beside_the_right_one(rows, given):
+    run = record([1.0], [1 / RATE, 1.0], rows, 1, [1.0])
+    delayed = f"u(t {'-' if given > 0 else '+'} {abs(given) * STEP})"
+    found = ftlm.identify(run, ftlm.equation(f"D y = a y + b {delayed}"))
+    (named,) = (f for f in found.findings if f.code == "delay_differs")
+    assert abs(named.numbers["value"] - rows * STEP) < 0.1 * STEP
+    assert named.numbers["before"] == pytest.approx(given * STEP)
+    # The interval of the remedy holds the delay.
+    bounds = named.numbers["low"], named.numbers["high"]
+    better = ftlm.identify(run, ftlm.equation("D y = a y + b u", delay={"u": bounds}))
+    assert better.verdict.level != "do not use"
+    assert abs(better.parameters["delay_u"].value - rows * STEP) < 0.1 * STEP
+
+
 @pytest.mark.parametrize(
     "noise", [[1.0], [1.0, -0.95], [1.0, -1.92 * np.cos(0.2), 0.9216]], ids=["white", "AR1", "AR2"]
 )

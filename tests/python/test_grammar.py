@@ -217,6 +217,7 @@ def test_what_is_printed_is_read(structure):
         ("D y = k (u - y)", "k at character 7 multiplies a sum"),
         ("y = 1/(T s + 1) u", "T multiplies the highest derivative"),
         ("D y = a y + b u(t - Td)", "the delay Td of u is free"),
+        ("D y = a y + b u(t + Td)", "a lead is estimated as a negative delay between bounds"),
         (
             "y = e^(-L s)/(s + 1) u",
             "an exponential at character 5 is a delay; write a number, as in e^(-0.1 s), or bounds",

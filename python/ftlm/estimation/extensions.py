@@ -397,8 +397,14 @@ def _delay_findings(
     findings = []
     for name in extension.inputs:
         key = input_name("delay", name)
-        value, error = refit.values_by_name[key], refit.standard_errors[key]
-        if abs(value - structure.delay.get(name, 0.0)) > MIN_DELAY_CHANGE_SIGMAS * error:
+        value, error, before = refit.values_by_name[key], refit.standard_errors[key], structure.delay.get(name, 0.0)
+        if abs(value - before) > MIN_DELAY_CHANGE_SIGMAS * error:
+            if before:
+                change = abs(value - before)
+                interval = {"low": max(value - change, -step), "high": value + change}
+                numbers = {"value": value, "error": error, "before": before, **interval}
+                findings.append(make_finding("delay_differs", input=name, **about, **numbers))
+                continue
             numbers = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
             code = "delay_fits" if value > 0.0 else "lead_fits"
             findings.append(make_finding(code, input=name, **about, **numbers))

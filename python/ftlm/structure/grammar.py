@@ -540,9 +540,8 @@ class EquationParser(TokenReader):
             return
         self._position += 2
         delay: Value = 0.0
-        if self._next_is("+") and self._peek(1)[0] == "number":
-            self._take()
-            delay = -float(self._take()[1])
+        if self._accept("+"):
+            delay = self._lead(signal)
         elif self._accept("-"):
             delay = self._delay(signal)
         # A printed model has the unit s after a delay.
@@ -553,6 +552,16 @@ class EquationParser(TokenReader):
     def _check_delay(self, signal: str, delay: Value) -> None:
         if self.delays.setdefault(signal, delay) != delay:
             self._twice_delayed = self._twice_delayed or signal
+
+    def _lead(self, signal: str) -> float:
+        kind, value, _ = self._peek()
+        if kind != "number":
+            raise self._error(
+                f"the lead {value!r} of {signal} is not a number, but a lead is estimated as a negative delay between "
+                f"bounds; write bounds in seconds, as in {signal}(t - -0.1:0)"
+            )
+        self._take()
+        return -float(value)
 
     def _delay(self, signal: str) -> Value:
         kind, value, _ = self._peek()
