@@ -38,6 +38,65 @@ def test_band_is_the_spread_of_drawn_models(found):
     assert np.all((ratio > 0.8) & (ratio < 1.25))
 
 
+def delayed_lag(u, step, a, b, delay):
+    """Samples of D y = -a y + b u(t - delay) from rest, exact for a held input."""
+    whole, part = divmod(delay, step)
+    late = np.r_[np.zeros(int(whole) + 1), u]
+    y = np.zeros(u.size)
+    for k in range(u.size - 1):
+        # The older value of the input acts for `part`, the newer one for the rest of the interval.
+        older, newer = late[k], late[k + 1]
+        after = np.exp(-a * part) * y[k] + b / a * (1.0 - np.exp(-a * part)) * older
+        y[k + 1] = np.exp(-a * (step - part)) * after + b / a * (1.0 - np.exp(-a * (step - part))) * newer
+    return y
+
+
+@pytest.fixture(scope="module")
+def delayed():
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.choice([-1.0, 1.0], 20), 25)
+    y = delayed_lag(u, 0.1, 1.5, 3.0, 0.234) + 0.2 * rng.standard_normal(u.size)
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y})
+    return run, ftlm.identify(run, ftlm.equation("D y = -a y + b u(t - 0:1)", initial="rest"))
+
+
+def test_band_of_a_delayed_model_is_the_spread_of_drawn_delays_too(delayed):
+    run, found = delayed
+    assert found.names == ("a", "b", "delay_u")
+    low, high = confidence_bands(found.model, run, found.model.compare(run))["y"]
+    drawn = np.random.default_rng(3).multivariate_normal(found.joint.values, found.covariance, size=400)
+    expected = 1.96 * np.std([delayed_lag(run["u"], 0.1, *v) for v in drawn], axis=0)
+    moved = expected > 0.05 * expected.max()
+    ratio = ((high - low) / 2)[moved] / expected[moved]
+    assert 0.9 < np.median(ratio) < 1.1
+    assert np.all((ratio > 0.7) & (ratio < 1.35)), (ratio.min(), ratio.max())
+
+
+def test_deviation_of_step_and_frequency_response_includes_the_delay(delayed):
+    found = delayed[1]
+    a, b, delay = found.joint.values
+    w = np.array([0.5, 3.0, 20.0])
+    # d arg H = -w d(delay) + atan's derivative by a.
+    gradient = np.array([w / (a * a + w * w), 0 * w, -w])
+    expected = np.sqrt(np.einsum("iw,ij,jw->w", gradient, found.covariance, gradient))
+    assert response_deviation(found.model, w)[1][0, 0] == pytest.approx(expected, rel=1e-5)
+    response = found.model.step(np.linspace(0.0, 4.0, 401))
+    t = response.time - delay
+    slopes = np.array(
+        [b * (t * a * np.exp(-a * t) - 1 + np.exp(-a * t)) / a**2, (1 - np.exp(-a * t)) / a, -b * np.exp(-a * t)]
+    )
+    after = t > 0.1
+    expected = np.sqrt(np.einsum("it,ij,jt->t", slopes, found.covariance, slopes))
+    assert response.deviation[0, 0][after] == pytest.approx(expected[after], rel=0.01)
+
+
+def test_a_saved_model_keeps_the_covariance_of_its_delay(delayed, tmp_path):
+    found = delayed[1]
+    found.model.save(tmp_path / "m.json")
+    again = ftlm.load_model(tmp_path / "m.json")
+    assert np.sqrt(again.estimate.covariance[-1][-1]) == pytest.approx(found.standard_errors["delay_u"])
+
+
 def test_a_model_without_covariance_has_no_band(found):
     other = run(2)
     plain = ftlm.identify(run(1), found.task.structure, method="least-squares").model

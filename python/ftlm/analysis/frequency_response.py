@@ -324,20 +324,21 @@ def covariance_of(model: Model) -> Floats | None:
 
 
 def parameter_vector(model: Model) -> Floats:
-    """Return all orders and coefficients of a model as a vector, equation by equation.
+    """Return all orders and coefficients of a model as a vector, equation by equation, then its input parameters.
 
     An equation contributes alpha, then order and coefficient of each term, then the parameters of its friction. The
-    coefficient of a term includes its known factor.
+    coefficient of a term includes its known factor. The input parameters are those of ``Structure.fixed_inputs``:
+    delays, saturations and dead zones.
     """
     numbers: list[float] = []
     for item in model.equations:
         numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
         numbers += [] if item.friction is None else item.friction.numbers
-    return np.array(numbers)
+    return np.array([*numbers, *model.structure.fixed_inputs.values()])
 
 
 def with_parameter_vector(model: Model, numbers: Floats) -> Model:
-    """Return the model with orders and coefficients from a vector, in the sequence of :func:`parameter_vector`."""
+    """Return the model with parameters from a vector, in the sequence of :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
     for item in model.equations:
@@ -350,7 +351,8 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
             None if item.friction is None else item.friction.with_numbers([next(at) for _ in item.friction.numbers])
         )
         equations.append(_replace_unchecked(item, alpha, tuple(terms), friction))
-    return replace(model, structure=replace(model.structure, equations=tuple(equations)))
+    structure = replace(model.structure, equations=tuple(equations))
+    return replace(model, structure=structure.with_inputs({name: next(at) for name in structure.fixed_inputs}))
 
 
 def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Iterator[tuple[int, float, Model, Model]]:
@@ -386,6 +388,7 @@ def linear_part(model: Model) -> Model:
     for item in model.equations:
         keep += [True] * (1 + 2 * len(item.terms))
         keep += [False] * (0 if item.friction is None else len(item.friction.numbers))
+    keep += [True] * len(structure.delay) + [False] * (len(structure.fixed_inputs) - len(structure.delay))
     equations = tuple(replace(e, coulomb=UNSET) for e in structure.equations)
     matrix, estimate = covariance_of(model), model.estimate
     if matrix is not None and estimate is not None:

@@ -160,6 +160,7 @@ class Command(TyperCommand):
         if HELP_ALL_FLAG in args:
             ctx.meta["method"] = None
             args = ["--help"]
+        self._check_repetition(ctx, args)
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
@@ -170,6 +171,17 @@ class Command(TyperCommand):
             elif callable(problems := getattr(error.__cause__, "errors", None)):
                 error.message = _number_message(problems()[0])
             raise
+
+    def _check_repetition(self, ctx: Any, args: Sequence[str]) -> None:
+        """Fail if an option with a single value is given twice; the parser would ignore all values but the last."""
+        *_, order = self.make_parser(ctx).parse_args(list(args))
+        single = [p for p in order if p.param_type_name == "option" and not (p.multiple or p.is_flag or p.count)]
+        for option in single:
+            if single.count(option) > 1:
+                (flag, *_), remedy = sorted(option.opts, key=len, reverse=True), "give it once"
+                if flag == "--structure":
+                    remedy = "join the equations of several outputs by a semicolon"
+                ctx.fail(f"{flag} is given {single.count(option)} times, but takes one value; {remedy}.")
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:
         """Return the method that the arguments select, or the default method; None if the command has no methods."""

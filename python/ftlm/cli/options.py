@@ -49,7 +49,7 @@ class StructureOptions:
     only : OUTPUT
         Fit the equation of this output only; default all.
     coupling
-        Values of other outputs in an equation; default measured for a link.
+        Values of other outputs in an equation; default measured.
     cross_stage
         Add terms of the other joint of the arm; default none.
     cross_sensitivity
@@ -121,10 +121,8 @@ class StructureOptions:
                 "'D y = a y + b u' (ftlm identify-frequency fits circuits: fit each, and compare their AICc)"
             )
         else:
-            built = equation(text, sensor_filter=self._sensor())
+            built = equation(text, sensor_filter=self._sensor(), coupling=self.coupling)
             self._check_equation(len(built.equations))
-            if len(built.equations) > 1:
-                built = replace(built, coupling=self.coupling or "simulated")
         if self.only is not None:
             built = built.equation(self.only)
         if self.offset is not None:

@@ -617,6 +617,8 @@ def least_certain_parameter(model: Model) -> str:
             for t in item.terms
             for n in (f"the order of {t.signal} in {item.output}", f"the coefficient of {t.signal} in {item.output}")
         ]
+        names += [f"the friction of {item.output}"] * (0 if item.friction is None else len(item.friction.numbers))
+    names += list(model.structure.fixed_inputs)
     share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
     at = int(np.argmax(np.nan_to_num(share, nan=0.0, posinf=1e300)))
     return f"the most uncertain is {names[at]}, with a standard error of {100 * share[at]:.2g} %"

@@ -260,8 +260,10 @@ def estimate_output_error(
 
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
-    """Return the covariance of all orders and coefficients of the model; None if one is not identifiable."""
+    """Return the covariance of all parameters of the model, as a model file stores it; None if one is not identifiable."""
     jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
+    inputs = problem.structure.with_inputs(joint.inputs).fixed_inputs
+    jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
     with np.errstate(invalid="ignore", over="ignore"):
         # Covariances of non-identifiable directions are NaN or overflow.
         spread = jacobian @ joint.covariance @ jacobian.T

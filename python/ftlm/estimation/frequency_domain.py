@@ -694,6 +694,7 @@ def _model(
                     if isinstance(term.coefficient, str):
                         row[problem.names.index(term.coefficient)] = term.factor
                     rows.append(row)
+        rows += [np.array([float(n == name) for n in problem.names]) for name in structure.fixed_inputs]
         table = np.array(rows)
         spread = tuple(tuple(row) for row in (table @ covariance @ table.T).tolist())
     units: dict[str, str] = {}

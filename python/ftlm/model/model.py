@@ -67,9 +67,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values, standard_errors
         Estimates of orders and coefficients by name, and their standard errors by name, None if not available.
     covariance
-        Covariance of all orders and coefficients. For each equation, its rows are alpha, then order and coefficient of
-        each term, then friction parameters (fc, fs, vs). None if the estimator gives none. It is singular if laws
-        relate parameters.
+        Covariance of all orders and coefficients, and of delays, saturations and dead zones. For each equation, its
+        rows are alpha, then order and coefficient of each term, then friction parameters (fc, fs, vs). The delays
+        follow, then the limits. None if the estimator gives none. It is singular if laws relate parameters.
     fit
         Fit of the simulation to the runs of the identification [%], by output.
     information

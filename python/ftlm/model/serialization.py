@@ -160,7 +160,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             input_nonlinearities=self.limits or UNSET,
         )
         if self.estimate is not None and self.estimate.covariance is not None:
-            count = sum(e.count for e in self.equations)
+            count = sum(e.count for e in self.equations) + len(structure.fixed_inputs)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance does not have {count} by {count} elements, as its equations require")

@@ -330,8 +330,8 @@ def run_charts(run: Run, *signals: str) -> Figures:
 def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:
     """Return the pointwise 95 % confidence band of each simulated output on one run, by output.
 
-    The covariance of orders and coefficients is propagated to first order. The band does not include measurement noise,
-    or the uncertainty of delays, saturations and dead zones. The computation takes one simulation per parameter.
+    The covariance of all parameters is propagated to first order. The band does not include measurement noise. The
+    computation takes one simulation per parameter.
 
     Parameters
     ----------

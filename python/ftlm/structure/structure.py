@@ -496,13 +496,18 @@ class Structure:
         delay_parameters = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*delay_parameters, *(limit.free for limit in self.limits if limit.free is not None)])
 
+    @property
+    def fixed_inputs(self) -> dict[str, float]:
+        """Values of fixed delays, saturations and dead zones by name, such as ``delay_u``, ``sat_u``."""
+        delays = {input_name("delay", n): delay for n, delay in self.delay.items()}
+        return delays | {limit.name: limit.value for limit in self.limits if not isinstance(limit.value, tuple)}
+
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
-        """Return the structure with free delays and limits fixed to values by name, such as ``delay_u``, ``sat_u``."""
-        names = {n: input_name("delay", n) for n in self.free_delays}
+        """Return the structure with delays and limits fixed to values by name, such as ``delay_u``, ``sat_u``."""
+        names = {n: input_name("delay", n) for n in (*self.delay, *self.free_delays)}
         delays = {n: values[name] for n, name in names.items() if name in values}
         limits = tuple(
-            replace(limit, value=float(values[limit.name])) if limit.free and limit.name in values else limit
-            for limit in self.limits
+            replace(limit, value=float(values[limit.name])) if limit.name in values else limit for limit in self.limits
         )
         return replace(self.with_delays(delays), input_nonlinearities=_or_unset(limits))
 

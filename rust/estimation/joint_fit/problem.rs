@@ -367,19 +367,22 @@ pub struct Candidate {
     pub origin: String,
     /// Origins of merged duplicates.
     pub duplicates: Vec<String>,
+    /// Cost before the last optimization; infinite if there was none.
+    pub cost_before: f64,
 }
 
 impl Candidate {
     /// Candidate before its first optimization.
     #[must_use]
     pub fn at(place: Iterate, origin: impl Into<String>) -> Self {
-        Self { result: OptimizationResult::initial_result(place), origin: origin.into(), duplicates: Vec::new() }
+        let result = OptimizationResult::initial_result(place);
+        Self { result, origin: origin.into(), duplicates: Vec::new(), cost_before: f64::INFINITY }
     }
 
     /// Return the candidate with a new optimization result.
     #[must_use]
     pub fn with_result(&self, attempt: OptimizationResult) -> Self {
-        Self { result: attempt, ..self.clone() }
+        Self { result: attempt, cost_before: self.result.cost, ..self.clone() }
     }
 
     /// Mean square of the weighted residuals.

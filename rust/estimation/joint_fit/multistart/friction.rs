@@ -521,12 +521,13 @@ fn coulomb_guesses(
     }
     let (linear, source) = without_friction(&free.structure, grid.source())?;
     let coarse = Objective::new((&linear.problem, &source, grid.stop()), grid.weights.clone(), grid.sampling, false)?;
-    let start = guess_at(&linear, &values, String::new())?.result.iterate;
-    let optimum = match coarse.minimize_in(&linear.problem_at(&start, false, &[]), &start, FIRST_BUDGET_EVALUATIONS) {
+    let guess = guess_at(&linear, &values, String::new())?;
+    let start = &guess.result.iterate;
+    let optimum = match coarse.minimize_in(&linear.problem_at(start, false, &[]), start, FIRST_BUDGET_EVALUATIONS) {
         Err(Error::Interrupted) => return Err(Error::Interrupted),
         // Without any friction the simulation diverges.
         Err(_) => return Ok(out),
-        Ok(optimum) => Candidate { result: optimum, origin: String::new(), duplicates: Vec::new() },
+        Ok(optimum) => guess.with_result(optimum),
     };
     values.extend(values_of(&linear, &optimum));
     out.extend(coulomb_force_guesses(free, grid, &values, origin)?);

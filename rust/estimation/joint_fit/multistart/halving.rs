@@ -184,6 +184,21 @@ pub(in crate::estimation::joint_fit) fn split_unfinished(
     candidates.into_iter().partition(continues)
 }
 
+/// Split candidates into those that can reach the least cost among them within `evaluations` evaluations, and the others.
+///
+/// A cost is extrapolated at its mean decrease per evaluation in the last optimization of the candidate. Optimizations on
+/// a plateau above the best candidate thus end. A candidate with one evaluation has no such rate and continues.
+pub(super) fn split_by_prospect(candidates: Vec<Candidate>, evaluations: usize) -> (Vec<Candidate>, Vec<Candidate>) {
+    let least = candidates.iter().map(|candidate| candidate.result.cost).fold(f64::INFINITY, f64::min);
+    #[allow(clippy::cast_precision_loss)]
+    let can_reach = |candidate: &Candidate| {
+        let (cost, count) = (candidate.result.cost, candidate.result.evaluations);
+        let decrease = (candidate.cost_before - cost) * evaluations as f64 / count.max(1) as f64;
+        count < 2 || cost - decrease <= least
+    };
+    candidates.into_iter().partition(can_reach)
+}
+
 /// Return the survivors that continue on all samples: the best distinct optima within the cost ratio.
 #[must_use]
 pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
@@ -252,6 +267,7 @@ mod tests {
             result: OptimizationResult { cost: level, residuals: vec![0.0; 2], ..attempt },
             origin: String::new(),
             duplicates: Vec::new(),
+            cost_before: f64::INFINITY,
         }
     }
 
@@ -280,6 +296,20 @@ mod tests {
         };
         assert_eq!(costs(1.0), [1.0005, 0.5]);
         assert_eq!(costs(0.1), [1.0005, 1.5, 0.5]);
+    }
+
+    #[test]
+    fn candidate_on_a_plateau_does_not_continue() {
+        let fallen = |cost_before: f64, cost: f64, evaluations: usize| {
+            let mut candidate = Candidate { cost_before, ..candidate_at(cost, 1.0) };
+            candidate.result.evaluations = evaluations;
+            candidate
+        };
+        // The best one, a plateau, two that fall fast enough, one without a rate.
+        let reached = [fallen(1.0, 1.0, 15), fallen(2.1, 2.0, 15), fallen(5.0, 3.0, 15), fallen(f64::INFINITY, 4.0, 2)];
+        let (near, ended) = split_by_prospect([&reached[..], &[fallen(5.0, 5.0, 1)]].concat(), 60);
+        let costs = |candidates: &[Candidate]| candidates.iter().map(|c| c.result.cost).collect::<Vec<_>>();
+        assert_eq!((costs(&near), costs(&ended)), (vec![1.0, 3.0, 4.0, 5.0], vec![2.0]));
     }
 
     #[test]

@@ -59,6 +59,7 @@ impl ReducedProblem {
             result: OptimizationResult { iterate: place, ..source.result.clone() },
             origin,
             duplicates: source.duplicates.clone(),
+            cost_before: f64::INFINITY,
         }
     }
 }

@@ -3,8 +3,8 @@
 use super::coarse_grid::{coarse_sampling, leading_part};
 use super::halving::{
     competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
-    split_unfinished, RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
-    PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS, SUBMODEL_SURVIVORS,
+    split_by_prospect, split_unfinished, RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS,
+    MAX_SURVIVOR_COST_RATIO, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS, SUBMODEL_SURVIVORS,
 };
 use super::nested_models::{
     fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, ReducedProblem,
@@ -374,10 +374,14 @@ impl<'a> MultistartState<'a> {
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
-        let short = self.executor.run(self.free, &self.coarse, survivors, FIRST_BUDGET_EVALUATIONS)?;
-        let (unfinished, ended) = split_unfinished(short, self.context.floor);
-        let mut candidates = self.executor.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?;
+        let budget = FIRST_BUDGET_EVALUATIONS + SECOND_BUDGET_EVALUATIONS;
+        let (survivors, mut candidates) = split_by_prospect(survivors.to_vec(), budget);
+        let short = self.executor.run(self.free, &self.coarse, &survivors, FIRST_BUDGET_EVALUATIONS)?;
+        let (near, ended) = split_by_prospect(short, SECOND_BUDGET_EVALUATIONS);
         candidates.extend(ended);
+        let (unfinished, ended) = split_unfinished(near, self.context.floor);
+        candidates.extend(ended);
+        candidates.extend(self.executor.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?);
         let mut candidates = rank_candidates(&self.coarse, self.half, sort_by_cost(candidates))?;
         candidates.extend_from_slice(rest);
         Ok((candidates, self.coarse))
