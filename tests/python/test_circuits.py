@@ -168,6 +168,19 @@ def test_equal_groups_are_numbered_from_the_fastest_on():
     assert kept.values["R1"] == pytest.approx(0.03, rel=0.05)
 
 
+def test_the_capacitor_that_replaces_a_cpe_of_exponent_1_is_named():
+    z = CASES["R0-p(R1,C1)"][0](0.01, 0.05, 2.0)
+    fits = [ftlm.identify_frequency(spectrum(z, seed=seed), "R0 − p(R1, CPE1)") for seed in range(6)]
+    named = [fit for fit in fits if fit.values["CPE1_alpha"] == 1.0]
+    assert named
+    for fit in named:
+        (finding,) = (f for f in fit.findings if f.code == "cpe_is_capacitor")
+        assert finding.remedy == "write C1 instead of CPE1"
+        assert not any(f.code == "response_on_bound" for f in fit.findings)
+    taken = ftlm.identify_frequency(spectrum(z, seed=0), "R0-p(R1,CPE1)-p(R2,C1)", fixed={"R2": 1e-6, "C1": 1.0})
+    assert all(f.code != "cpe_is_capacitor" or "write C2 " in f.remedy for f in taken.findings)
+
+
 def test_an_exponent_ends_at_1_and_bounds_are_kept():
     z = CASES["R0-p(R1,C1)"][0](0.01, 0.05, 2.0)
     found = ftlm.identify_frequency(
@@ -244,6 +257,7 @@ def test_a_profile_interval_ends_at_a_user_bound():
         ("R0-C1", {"bounds": {"R0": (1, 1)}}, "are not an interval"),
         ("R0-CPE1", {"bounds": {"CPE1_alpha": (1, 2)}}, "leave no range: CPE1_alpha lies between 0.05 and 1"),
         ("R0-CPE1", {"bounds": {"CPE1_alpha": (-1, 0)}}, "leave no range"),
+        ("R0-CPE1", {"bounds": {"CPE1_alpha": (0.5, 1.2)}}, "exceed its largest value 1; use 1"),
         ("R0-CPE1", {"fixed": {"CPE1_alpha": 2.0}}, "is not admissible: CPE1_alpha lies between 0.05 and 1"),
         ("R0-C1", {"fixed": {"R0": -1.0}}, "is not admissible"),
         ("R0-C1", {"fixed": {"R0": np.nan}}, "is not admissible"),

@@ -130,6 +130,12 @@ class CircuitProblem(ResponseProblem):
                 words.append(ConstraintText(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}", name))
         return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
 
+    def capacitor_of(self, name: str) -> str:
+        """Return an unused name of a capacitor that replaces the constant-phase element with the exponent `name`."""
+        taken = {parameter.partition("_")[0] for parameter in (*self.names, *self.circuit.values)}
+        number = name.removeprefix("CPE").removesuffix("_alpha")
+        return next(c for c in (f"C{number}", *(f"C{k}" for k in range(1, len(taken) + 2))) if c not in taken)
+
     def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
         """Return the names of the parameters on a bound of the user, as opposed to a limit of the element."""
         names = []
@@ -244,6 +250,8 @@ def check_admissible(values: Mapping[str, float], bounds: Mapping[str, tuple[flo
                 f"bounds of {name}, {low:g} to {high:g}, leave no range: {name} lies between {least:g} and {most:g}; "
                 f"give bounds that overlap this range, or fix the value with {parameter('fixed')}"
             )
+        if name.endswith("_alpha") and high > most:
+            raise ModelError(f"bounds of {name}, {low:g} to {high:g}, exceed its largest value {most:g}; use {most:g}")
 
 
 def profile_intervals(

@@ -23,7 +23,7 @@ from ftlm.estimation.model_checks import (
     second_optimum_findings,
 )
 from ftlm.estimation.objective import covariance_of
-from ftlm.estimation.response_problem import ConstraintText, ResponseProblem
+from ftlm.estimation.response_problem import MAX_EXPONENT, ConstraintText, ResponseProblem
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.progress import Progress, ShareTracker
@@ -591,11 +591,13 @@ def _result(
     else:
         model = _model(problem, records, values_by_name, values, covariance, standard, findings)
     reported = [name for name, _ in absent]
-    findings += [
-        make_finding("response_on_bound", bound=bound.text)
-        for bound in active_bounds
-        if bound.parameter is None or bound.parameter not in reported
-    ]
+    for bound in active_bounds:
+        name = bound.parameter
+        if isinstance(problem, CircuitProblem) and name in problem.orders and values_by_name[name] == MAX_EXPONENT:
+            element, capacitor = name.removesuffix("_alpha"), problem.capacitor_of(name)
+            findings.append(make_finding("cpe_is_capacitor", parameter=name, element=element, capacitor=capacitor))
+        elif name not in reported:
+            findings.append(make_finding("response_on_bound", bound=bound.text))
     findings += _identifiability_findings(problem, {n: values_by_name[n] for n in names if n not in reported}, standard)
     return FrequencyIdentification(
         model,

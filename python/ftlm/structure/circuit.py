@@ -145,7 +145,8 @@ class Circuit:
     @cached_property
     def tree(self) -> Node:
         """Circuit as a tree of nested series and parallel groups; see :data:`Node`."""
-        text = "".join(c for c in self.text if not c.isspace())
+        # Reports print a true minus sign between elements.
+        text = "".join(c for c in self.text if not c.isspace()).replace("−", "-")
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
             raise ModelError(f"circuit {self.text!r} has an invalid character; write it as in 'R0-p(R1,CPE1)-W1'")
