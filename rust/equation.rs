@@ -245,7 +245,8 @@ impl Initial {
         }
     }
 
-    /// Return the exponents of t of the offset in an equation of order `alpha`. Empty without an offset.
+    /// Return the exponents of the powers of t that represent the offset in an equation of order `alpha`. The list is
+    /// empty without an offset.
     pub(crate) fn offset_exponents(&self, alpha: f64) -> Vec<f64> {
         match self {
             Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
@@ -398,7 +399,8 @@ fn whole_below(order: f64) -> impl Iterator<Item = f64> {
 
 /// Round an order to a multiple of 1e−9, so that equal orders have equal bits.
 ///
-/// NaN is returned unchanged, as are magnitudes beyond 9·10⁶, where floating-point numbers are farther apart than 1e−9.
+/// NaN and orders of a magnitude above 9·10⁶ are returned unchanged. Floating-point numbers of this magnitude are
+/// farther apart than 1e−9.
 ///
 /// ```
 /// assert_eq!(ftlm::equation::tidy(0.1 + 0.2), 0.3);
@@ -416,17 +418,17 @@ pub fn tidy(order: f64) -> f64 {
     }
 }
 
-/// Return an order as an integer multiple of 1e−9, which identifies the regressor of this order. The result saturates
-/// for magnitudes beyond 9·10⁹ and is 0 for NaN.
+/// Return an order as an integer number of units of 1e−9. This integer is the key of the regressor of this order. The
+/// result saturates for magnitudes beyond 9·10⁹ and is 0 for NaN.
 #[must_use]
 #[allow(clippy::cast_possible_truncation)]
 pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
 
-/// Maximum magnitude of an order law within the bounds of its free orders. A law may exceed the range of a single
-/// order, because that range is checked at every point. The memory of tables by integer order is proportional to this
-/// limit.
+/// Maximum magnitude that an order law may attain within the bounds of its free orders. It is wider than the valid
+/// range of an order, because that range is checked separately at every point. The memory of tables that are indexed by
+/// integer order is proportional to this limit.
 pub const MAX_REACHED_ORDER: f64 = 100.0;
 
 /// Affine order law: constant + Σ weight × free order.
@@ -527,7 +529,8 @@ impl Filter {
 /// systems are not tested.
 const MAX_EQUATIONS: usize = 16;
 
-/// Leading term of a polynomial: order, coefficient, and sum of the magnitudes added to the coefficient. None for 0.
+/// Leading term of a polynomial: its order, its coefficient, and the sum of the magnitudes of the products that add up
+/// to the coefficient. None for the zero polynomial.
 type Leading = Option<(f64, f64, f64)>;
 
 fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
@@ -540,9 +543,9 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
 
 /// Return an error if coupled equations do not determine every output.
 ///
-/// The determinant of the equations is a polynomial in the Laplace variable s. Its order must be the order of its
-/// largest products. If these products cancel, the equations repeat or contradict each other. Systems of more than 16
-/// equations are not tested.
+/// The determinant of the equations is a sum of products of powers of the Laplace variable s. The products of highest
+/// order must not cancel. If they do, the equations repeat or contradict each other. Systems of more than 16 equations
+/// are not tested.
 ///
 /// # Errors
 /// [`Error::Structure`] if the equations cannot be solved for all outputs.

@@ -127,7 +127,7 @@ pub enum Error {
         /// Cause.
         why: String,
     },
-    /// Fit whose simulation overflows at every initial guess.
+    /// Fit in which the squares of the residuals of an output overflow.
     #[error("the simulation of {output} overflows from every initial guess; remove the term that makes the model unstable, or bound its coefficient")]
     Beyond {
         /// Name of the output.
@@ -290,7 +290,7 @@ pub fn check_step(step: f64) -> Result<()> {
 }
 
 /// Maximum number of points of a series or a record, which take 1 GiB per signal. A larger number is a mistake that
-/// would exhaust memory. Tables of prime divisors with 31-bit indices cover this number.
+/// would exhaust memory. The tables of prime divisors, which store 32-bit integers up to twice this number, allow it.
 pub const MAX_POINTS: usize = 1 << 27;
 
 /// Return an error if `m` exceeds [`MAX_POINTS`].

@@ -42,7 +42,8 @@ impl Function {
         }
     }
 
-    /// Return value and derivative at x. The infinite slope of the square root at 0 is replaced by 0.
+    /// Return the value and the derivative of the function at x. The infinite slope of the square root at 0 is replaced
+    /// by 0.
     fn apply(self, x: f64) -> (f64, f64) {
         match self {
             Self::Sin => (libm::sin(x), libm::cos(x)),
@@ -67,7 +68,7 @@ fn sign(x: f64) -> f64 {
     }
 }
 
-/// Return value and derivative of x^n. The infinite slope at 0 for n < 1 is replaced by 0.
+/// Return the value and the derivative of x^n. The infinite slope at 0 for n < 1 is replaced by 0.
 #[allow(clippy::cast_possible_truncation)]
 fn power(x: f64, n: f64) -> (f64, f64) {
     if n == 0.0 {
@@ -145,7 +146,7 @@ pub struct Expression {
 }
 
 impl Expression {
-    /// Expression that a program computes from this number of channels.
+    /// Return the expression that a program computes from `channels` numbered channels.
     ///
     /// # Errors
     /// [`Error::Structure`] for a program that lacks a value or ends with several values, a channel index out of range,
@@ -265,7 +266,7 @@ pub struct DerivedSignal {
 }
 
 impl DerivedSignal {
-    /// Signal that an expression computes from these channels.
+    /// Return the signal that an expression computes from these channels.
     ///
     /// # Errors
     /// [`Error::Structure`] for a wrong number of channels, or an order that is negative or above 10.

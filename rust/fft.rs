@@ -57,8 +57,8 @@ const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 /// Otherwise, refining a grid repeatedly would leave all its plans in memory. If a plan is evicted too early, its new
 /// computation costs about two transforms.
 const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
-/// Number of recent requests for long plans whose plans are not evicted, even above the limit. One evaluation of a
-/// large problem may need more points than the limit.
+/// Number of most recent requests for long plans. The plans of these requests are not evicted, even if the total
+/// exceeds the limit. One evaluation of a large problem may need more points than the limit.
 const IN_USE: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
@@ -106,8 +106,9 @@ impl Plans {
         (plan, evicted)
     }
 
-    /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until these have at most
-    /// `points` points in total. Recently requested plans are not evicted. Return the evicted plans.
+    /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until the remaining plans
+    /// of this length have at most `points` points in total. Recently requested plans are not evicted. Return the
+    /// evicted plans.
     fn evict(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
             .plans

@@ -1,6 +1,6 @@
 //! Fractional-order models of flexible machines from measured data.
 //!
-//! Modules in the order of data flow:
+//! Modules in the sequence of the data flow:
 //!
 //! 1. [`signal`]: point samples become means over block pulses, and pulse means become nonuniform samples;
 //! 2. [`fractional`], [`series`]: fractional integrals as truncated power series in the one-step delay, and the

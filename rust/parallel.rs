@@ -3,7 +3,7 @@
 //! A global thread pool hangs after a fork. Work therefore runs on the thread pool of the current search, or serially
 //! if there is none.
 //!
-//! After a fork, the child process has one thread. A lock that another thread had taken stays locked for good. Attempts
+//! After a fork, the child process has one thread. A lock that another thread had taken stays locked forever. Attempts
 //! to take a fork-safe lock end after some microseconds, far longer than any thread keeps it locked. The caller then
 //! continues without the value.
 
@@ -16,8 +16,8 @@ use crate::error::{Error, Result};
 
 /// Apply `work` to each item, in parallel if the caller runs in a thread pool.
 ///
-/// Results keep the order of the items. `scratch` creates scratch memory, which a thread reuses for its items. `work`
-/// must give the same result for any scratch memory, so that results do not depend on the number of threads.
+/// The results are in the sequence of the items. `scratch` creates scratch memory, which a thread reuses for its items.
+/// `work` must give the same result for any scratch memory, so that results do not depend on the number of threads.
 pub(crate) fn map<T, S, R>(
     items: Vec<T>,
     scratch: impl Fn() -> S + Sync + Send,

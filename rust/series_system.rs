@@ -124,7 +124,7 @@ impl<'a> System<'a> {
     }
 
     /// Return the outputs if `bounded` accepts them. Otherwise return the outputs of the first damped copy of the
-    /// system that it accepts, and the flag true.
+    /// system whose outputs `bounded` accepts. The flag is true for a damped copy.
     ///
     /// The damped copies have decays of 4, 8, 16, … per record ([`crate::simulate::respond_damped`]). The last copy is
     /// returned if `bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. While the
@@ -219,8 +219,8 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Return the spectra of the inverse of the matrix. Responses to the initial terms `units` follow from them by
-    /// products.
+    /// Return the spectra of the inverse of the matrix. The responses to the initial terms `units` are products with
+    /// these spectra.
     ///
     /// `None` if `units` is empty. Also `None` if the inverse grows so much over the record that products would lose
     /// digits of its first terms.
@@ -258,7 +258,7 @@ impl<'a> System<'a> {
             .collect()
     }
 
-    /// Return the right-hand side for one initial term with coefficient 1 in equation `i`.
+    /// Return the right-hand sides of all equations for one initial term with coefficient 1 in equation `i`.
     fn initial_term_right_side(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
         let mut rows = vec![vec![0.0; self.record.m()]; self.matrix.len()];
         rows[i] = self.record.forcing_term(exponent);
@@ -286,7 +286,7 @@ struct InverseKernels<'s, 'a> {
 }
 
 impl InverseKernels<'_, '_> {
-    /// Return the outputs with zero initial conditions.
+    /// Return the outputs for the inputs of the record with zero initial conditions.
     fn rest(&mut self) -> Vec<Vec<f64>> {
         let (rhs, m) = (&self.system.rhs, self.system.record.m());
         let mut outputs = vec![vec![0.0; m]; self.kernels.len()];

@@ -4,14 +4,14 @@
 //! An equation y = Σ c_k I^{η_k} s_k + Σ a_e t^e with integers η = α − ν and e is a chain of integrators. State j is
 //! the integrand of the j-th integral: w_j′ = w_{j+1} + Σ c_k s_k over the terms with η_k = j. A term with η = 0 acts
 //! on the output directly, and a power of t is the initial state w_{e+1} = a_e e!. With the outputs substituted this is
-//! w′ = A w + B u, y = C w + D u. One sampling interval is
+//! w′ = A w + B u, y = C w + D u. Over one sampling interval h,
 //!
 //! w(h) = w + (e^{hA} − I) w + φ₁(hA) hB u(0) + φ₂(hA) hB (u(h) − u(0)),
 //! φ₁(z) = (e^z − 1)/z, φ₂(z) = (e^z − 1 − z)/z²,
 //!
-//! where the second input term exists for a linear input only. The recursion advances w by e^{hA} − I, and squaring
-//! computes this difference rather than e^{hA}. Slow modes keep their digits beside fast modes and at short steps
-//! (Higham, *Functions of Matrices*, 2008, sections 10.3 and 10.7).
+//! where the second input term exists for a linear input only. The recursion adds (e^{hA} − I) w to w. Scaling and
+//! squaring computes this difference of matrices instead of e^{hA}. Slow modes therefore keep their accuracy next to
+//! fast modes and at short steps (Higham, *Functions of Matrices*, 2008, sections 10.3 and 10.7).
 
 use std::borrow::Cow;
 
@@ -345,7 +345,7 @@ pub(crate) struct InputGains {
 }
 
 impl InputGains {
-    /// Gains of an input whose input vector is `input_vector`; None if they overflow.
+    /// Return the gains of the input with the input vector `input_vector`; None if they overflow.
     ///
     /// `fraction` is the fraction of the interval after which the next value of a zero-order-hold input takes effect.
     /// It is 0 without a delay.
@@ -504,7 +504,7 @@ mod tests {
     use crate::parallel::Stop;
     use crate::signal::block_pulse::Intersample;
 
-    /// Exact e^M − I, φ₁ and φ₂ of a chain of two real poles, from partial fractions.
+    /// Return the exact values of e^M − I, φ₁(M) and φ₂(M) for a chain of two real poles, from partial fractions.
     fn two_poles(fast: f64, slow: f64) -> [f64; 3] {
         // Element (1, 1) of a function of [[−(f + s), f], [−s, 0]] with the eigenvalues −f and −s.
         let of = |z: fn(f64) -> f64| (-slow * z(-fast) + fast * z(-slow)) / (fast - slow);

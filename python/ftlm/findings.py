@@ -137,7 +137,7 @@ def finding_catalogue() -> Catalogue:
 
 
 class _Reference:
-    """Mapping for templates, from ``{ask[offset]}`` or ``{ask[offset is none]}`` to the text of a parameter.
+    """Object ``ask`` in templates, which replaces ``{ask[offset]}`` or ``{ask[offset is none]}`` by parameter text.
 
     The text is that of :func:`ftlm.utils.parameters.parameter`, for Python or for the command line.
     """
@@ -148,14 +148,14 @@ class _Reference:
 
 
 class _Choice:
-    """Mapping for templates, from ``{choose[validate]}`` to its text for Python or for the command line."""
+    """Object ``choose`` in templates, which replaces ``{choose[validate]}`` by text for Python or the command line."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
 class _Sentence(string.Formatter):
-    """Formatter of templates that inserts text unchanged, such as "inf", also where the template formats a number."""
+    """Formatter of templates that inserts text such as "inf" unchanged, even where the template formats a number."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return value if isinstance(value, str) else str(format(value, format_spec))

@@ -825,5 +825,5 @@ def _with_kernels(
 
 
 def _broadcast_to(array: NDArray[Scalar], shape: tuple[int, ...]) -> NDArray[Scalar]:
-    """Return a view of an array broadcast to a shape; for an unchanged shape this saves 7 us of NumPy's function."""
+    """Return a view of an array broadcast to a shape; the array itself if it already has this shape."""
     return array if array.shape == shape else np.broadcast_to(array, shape)

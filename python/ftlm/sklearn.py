@@ -183,7 +183,7 @@ def _columns(table: Any) -> list[str] | None:
 
 
 def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the name of the signal in each column: by column name for several named columns, otherwise by position.
+    """Return the name of the signal in each column. Several named columns are matched by name, all others by position.
 
     Raise ValueError if the column names are not the signal names; `what` ("X" or "y") is named in the message.
     """

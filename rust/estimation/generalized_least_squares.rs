@@ -1,7 +1,7 @@
 //! Estimation by generalized least squares under autoregressive noise, and the likelihood ratio of two nested regressions.
 //!
-//! Only one-step-ahead predictions are compared. The mean of a random walk is as large as the walk itself, but its
-//! increments are white.
+//! Only one-step-ahead predictions are compared. The mean of a random walk is as large as the walk itself and would
+//! look like a constant term, but the prediction errors of a random walk are white.
 
 use std::ops::Range;
 
@@ -76,8 +76,8 @@ pub fn prediction_ratio(
 /// Return the noise criterion after regression on `columns`, summed over outputs, and the noise order of each output.
 ///
 /// The criterion is that of [`Autoregression`]. Generalized least squares and the fit of the autoregressions alternate
-/// until the criterion no longer decreases. `limits` contains the maximum noise order of each output. This number is
-/// also the index of the first predicted sample in each run.
+/// until the criterion no longer decreases. `limits` contains the maximum noise order of each output. This maximum
+/// order is also the index of the first predicted sample in each run of the output.
 fn noise_criterion(
     columns: &[Vec<f64>],
     residuals: &[f64],

@@ -6,7 +6,8 @@ use crate::linalg::dense;
 use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 
-/// Norm of a unit column outside the span of the previous ones below which it counts as linearly dependent.
+/// Norm of the component of a unit column outside the span of the previous columns, below which the column counts as
+/// linearly dependent.
 const RANK_TOLERANCE: f64 = 1e-12;
 
 /// Least-squares estimate of one equation.

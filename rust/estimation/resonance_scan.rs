@@ -8,11 +8,13 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Relative norm of a response outside the span of the other responses below which it counts as dependent on them.
+/// Distance of the response to an initial term from the span of the other responses, relative to its norm, at or below
+/// which it is omitted as linearly dependent.
 ///
-/// The responses are those to the initial terms.
+/// The responses are those of one record to its initial terms.
 const RANK_TOLERANCE: f64 = 1e-12;
-/// Relative norm of a column after projection below which its coefficient is solved together with the initial terms.
+/// Norm of a column after projection orthogonal to the initial terms, relative to its norm before. If this ratio of any
+/// column is at or below the limit, all coefficients are solved together with the initial terms.
 const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 
 /// Best fit of an equation with fixed autoregressive terms.
@@ -35,7 +37,7 @@ struct RecordSpectra {
 
 /// Fit an equation by output error for several sets of fixed autoregressive coefficients.
 ///
-/// `structure` contains the terms of other signals than the output. `own` contains the integration orders of the
+/// `structure` contains the terms in signals other than the output. `own` contains the integration orders of the
 /// autoregressive terms, and each point contains their coefficients. The coefficients of the other terms and of the
 /// initial terms follow by linear least squares. There is one result per point. It is None if the response overflows or
 /// a free term is linearly dependent.

@@ -2,10 +2,10 @@
 //!
 //! A new row requires the fractional integrals of every signal at the newest pulse, which depend on all past samples.
 //! The newest two pulses enter by the exact kernel, eq. (32) of the paper. Older pulses enter through a sum of
-//! exponentials, which is exact to rounding. An integral of an order above 1 is the running integral of an integral of
-//! that order minus one. A row costs O((signals + terms)·rates + k³) for k coefficients. This does not depend on the
-//! innovation length and on the length of the run. Earlier rows may be forgotten exponentially. A stream with nonzero
-//! initial conditions has powers of time as additional terms.
+//! exponentials, which is accurate to rounding error. An integral of an order η above 1 is computed as the running
+//! integral of an integral of order η − 1. A row costs O((signals + terms)·rates + k³) for k coefficients. The cost
+//! depends neither on the innovation length nor on the length of the run. Earlier rows may be forgotten exponentially.
+//! A stream with nonzero initial conditions has powers of time as additional terms.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -15,7 +15,7 @@ use crate::fractional::kernels::{block_pulse_kernel, PowerMeans};
 use crate::linalg::small::{Recursion, SlidingGram};
 use crate::simd::{self, dot};
 
-/// Relative accuracy of the sum of exponentials, which is the rounding level of a computation on the whole record.
+/// Relative accuracy of the sum of exponentials. It equals the rounding error of a computation on the whole record.
 const MEMORY_TOLERANCE: f64 = 2e-15;
 
 /// History of one signal: exponential states of all pulses except the newest two, and the mean of the last pulse.
@@ -25,9 +25,9 @@ struct SignalHistory {
     last: f64,
 }
 
-/// Weights of the pulses in an integral at the newest pulse, for an order of at most 1.
+/// Weights with which the pulse means enter the mean of an integral over the newest pulse, for an order of at most 1.
 ///
-/// For a higher order, they are the weights in the last increment of the integral.
+/// For a higher order, the weighted sum is added to a running sum ([`RunningIntegral`]).
 #[derive(Debug, Clone)]
 struct PulseWeights {
     /// Weights of the newest pulse and of the previous one.
@@ -48,7 +48,7 @@ impl PulseWeights {
 struct RunningIntegral {
     signal: usize,
     local: PulseWeights,
-    /// Weights of the integral of the order minus one, and the running sum of this integral; None for orders up to 1.
+    /// Weights of the integral of order η − 1, and the running sum of that integral; None for η ≤ 1.
     inner: Option<(PulseWeights, f64)>,
     step: f64,
 }
@@ -121,11 +121,11 @@ struct EquationRecursion {
     initial: Vec<InitialColumn>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
-    /// Gram matrix of the p newest rows.
+    /// Gram matrix of the p newest rows, where p is the innovation length.
     window: SlidingGram,
     /// Fractional integrals at the newest pulse: of the output, then of the signal of each term.
     values: Vec<f64>,
-    /// Newest row.
+    /// Newest row of regressors: those of the free terms, then those of the initial terms.
     row: Vec<f64>,
 }
 
@@ -186,10 +186,9 @@ impl Streaming {
     /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. Each equation has its structure, and
     /// one entry per term: the value of a fixed coefficient, or None for a free one.
     ///
-    /// # Errors
-    /// [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if `fixed` does not
-    /// match the terms. [`Error::NotFinite`] if a fixed coefficient is not finite. [`Error::Structure`] for an unknown
-    /// signal.
+    /// # Errors [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if an
+    /// equation does not have one such entry per term. [`Error::NotFinite`] if a fixed coefficient is not finite.
+    /// [`Error::Structure`] for an unknown signal.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -300,7 +299,7 @@ impl Streaming {
 
     /// Return the coefficients of every equation after the newest sample.
     ///
-    /// Those of its terms, including fixed ones, come first, then those of its initial terms.
+    /// For each equation, the coefficients of the terms, including fixed ones, precede those of the initial terms.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
         self.fits.iter().map(|fit| fit.coefficients().collect()).collect()
@@ -340,7 +339,7 @@ impl InitialColumn {
     }
 }
 
-/// SIMD task that integrates the newest pulse for every equation and then adds it to the histories.
+/// SIMD task that integrates the newest pulse for every equation and then updates the histories of all signals.
 struct Integration<'a> {
     fits: &'a mut [EquationRecursion],
     histories: &'a mut [SignalHistory],

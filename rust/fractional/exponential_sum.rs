@@ -139,7 +139,7 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
 /// exponentials. The arguments are the samples `x`, the order q, the sampling interval `step` \[s\] and the relative
 /// accuracy `tolerance`. The result is one value per sample, and the number of states.
 ///
-/// O(samples · rates).
+/// The cost is O(samples · rates).
 ///
 /// # Errors
 /// [`Error::OutOfRange`] for an order outside (0, 1], and for a step or a tolerance out of range ([`Rates::new`]).

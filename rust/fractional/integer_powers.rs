@@ -6,8 +6,8 @@ use std::thread::LocalKey;
 
 use crate::parallel::ForkSafeLock;
 
-/// Return `n^exponent` for n = 0 … m−1, with 0 for n = 0. Only a prime needs a power function, any other integer one
-/// product. The relative error grows by ε/2 per prime factor. Integers below 2^20 have at most 19 factors.
+/// Return `n^exponent` for n = 0 … m−1, with 0 for n = 0. Only primes require the power function. Every other integer
+/// requires one product. The relative error grows by ε/2 per prime factor. Integers below 2^20 have at most 19 factors.
 pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(m), powers_of_primes(exponent, m));
     let mut powers = vec![0.0; m];
@@ -39,8 +39,8 @@ pub(crate) fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
 /// Logarithm in double-double precision: the rounded value and its error.
 type Logarithm = (f64, f64);
 
-/// Return a function for p^e of primes p < m, with e = `exponent`. It uses ln p and is accurate to about 1.5 ε. An
-/// exponential takes a third of the time of `pow`.
+/// Return a function that computes p^e for a prime p < m, with e = `exponent`. It uses ln p and is accurate to about
+/// 1.5 ε. An exponential takes a third of the time of `pow`.
 ///
 /// For an integer e it uses `pow`, which is exact if the power is representable.
 #[allow(clippy::cast_precision_loss)]

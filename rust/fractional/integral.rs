@@ -223,7 +223,7 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
 }
 
 /// Return the derivative of integer order k ≤ 3 by central differences, which are one-sided at the ends. The error is
-/// of second order in the step at every sample. Needs at least k + 2 samples.
+/// of second order in the step at every sample. The signal must have at least k + 2 samples.
 ///
 /// Each k has a separate formula, because every repetition of first differences would lose an order of accuracy at the
 /// ends.

@@ -1,5 +1,5 @@
-//! Kernels of the fractional integral I^η: block-pulse kernel, derivative by η, Grünwald–Letnikov weights and improper
-//! terms.
+//! Kernels of the fractional integral I^η: block-pulse kernel, its derivative with respect to η, Grünwald–Letnikov
+//! weights, and kernels of improper terms.
 //!
 //! A term is improper if its order exceeds the order of its equation. The equation D^α y = c D^ν s + … with ν > α is
 //! integrated by its highest order ν: I^{ν−α} y = c s + …. Division by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …,
@@ -266,8 +266,8 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 /// Return the means of `t^exponent` over the pulses k = 1 … m of length `step` from t = 0 on. They are exact to a few ε
 /// for exponents above −1.
 ///
-/// For the exponents −1, −2, … the result is differences over the first pulses, which represent an impulse and its
-/// derivatives.
+/// For the exponents −1, −2, … the result contains weights of differences on the first pulses, which represent an
+/// impulse and its derivatives.
 ///
 /// ```
 /// let means = ftlm::fractional::kernels::power_means(1.0, 3, 2.0);
@@ -316,8 +316,8 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
 /// Number of pulses at the start of a long record whose means of t^e are computed as differences of powers at the pulse
 /// ends. The means over later pulses are computed by a series about the pulse midpoint.
 const ENDPOINT_PULSES: usize = 16;
-/// Number of terms of the series about the midpoint of a pulse, for pulses before number [`LONG_SUM_TERMS`]. The
-/// omitted terms, 33^−16, are below the rounding error.
+/// Number of terms of the series about the midpoint of a pulse, for pulse indices below [`LONG_SUM_TERMS`]. The omitted
+/// terms, 33^−16, are below the rounding error.
 const MIDPOINT_SERIES_TERMS: usize = 8;
 
 /// Return the number of pulses at the start of a record of m pulses whose means of t^e are computed from powers at the

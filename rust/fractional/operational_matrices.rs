@@ -83,7 +83,8 @@ struct Wavelet {
 }
 
 impl Wavelet {
-    /// Return level 0 (the constant), 1 (the widest wavelet), 2, … of the basis for m pulses.
+    /// Return a level of the Haar basis for m pulses. Level 0 is the constant, level 1 the widest wavelet, and every
+    /// further level halves the width.
     #[allow(clippy::cast_precision_loss)]
     fn of(level: usize, m: usize) -> Self {
         let width = m >> level.saturating_sub(1);
@@ -122,7 +123,7 @@ struct Table {
 }
 
 impl Table {
-    /// Return the elements of this table in row `i` of the wavelet level of the rows.
+    /// Return the elements of this table in row `i`, counted from the first row of the wavelet level.
     fn window(&self, i: usize) -> &[f64] {
         let start = if self.phases > 1 {
             (i % self.phases) * (2 * self.count - 1) + self.count - 1 - i / self.phases
@@ -133,8 +134,8 @@ impl Table {
     }
 }
 
-/// Return the tables of one wavelet level of rows with every level of columns, in the sequence of the columns.
-/// `response` is the convolution of the kernel with a wavelet of the rows.
+/// Return one table for each level of the columns, from the constant to the narrowest wavelets. The rows belong to one
+/// wavelet level. `response` is the convolution of the kernel with a wavelet of the rows.
 fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
     // padded[m + d] is the sum of the responses from d on, over half the width of a column.
     let mut padded = vec![0.0; 2 * m];
@@ -254,8 +255,8 @@ pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     Ok(())
 }
 
-/// Transform as [`haar_transform`] does, with scratch memory of the caller of at least the length of `f`. This length
-/// must be a power of two.
+/// Transform as [`haar_transform`] does, with scratch memory from the caller. `scratch` must be at least as long as
+/// `f`, and the length of `f` must be a power of two.
 pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     let mut len = f.len();
     while len > 1 {

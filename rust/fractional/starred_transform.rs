@@ -44,7 +44,7 @@ pub(crate) struct StarredTransform {
     damping: Vec<f64>,
     /// Logarithm ln s of the Laplace variable at each frequency bin.
     logarithms: Vec<Bin>,
-    /// Number of the first bin of each panel of the base band, then the number of bins.
+    /// Index of the first bin of each panel of the base band, followed by the total number of bins.
     panels: Vec<usize>,
     /// Weight and ln s of each alias term at the frequency s, by interpolation node.
     aliases: Vec<Vec<(f64, Bin)>>,

@@ -110,7 +110,7 @@ pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
 }
 
 impl FrictionLaw {
-    /// Coulomb friction alone: a friction force that does not depend on speed.
+    /// Return the law of Coulomb friction alone, whose friction force does not depend on speed.
     #[must_use]
     pub const fn coulomb(coulomb: f64) -> Self {
         Self { coulomb, stribeck: 0.0, speed: 1.0 }
@@ -217,8 +217,8 @@ impl FrictionLaw {
     }
 
     /// Return the derivatives of the friction force in a pulse and of the velocity at its end with respect to a
-    /// parameter. `v`, `p` and `g` are the arguments of [`FrictionLaw::pulse`], `at` is its result, and `derivatives`
-    /// holds their derivatives.
+    /// parameter. `v`, `p` and `g` are the arguments of [`FrictionLaw::pulse`], and `at` is its result. `derivatives`
+    /// holds the derivatives of these arguments and of the law with respect to the parameter.
     #[must_use]
     pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
         let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();

@@ -1,4 +1,4 @@
-//! Dry friction of a pulse: F(v) sgn(v), set-valued at rest, with F(v) = fc + fs exp(−(v/vs)²).
+//! Dry friction in a pulse: F(v) sgn(v), set-valued at rest, with F(v) = fc + fs exp(−(v/vs)²).
 //!
 //! [`law`] computes the friction force of one body in closed form, and [`contact`] the friction forces of coupled
 //! bodies. The velocity of a body at the end of the pulse is V = P − g φ. P is this velocity without friction, φ ∈ F(V)

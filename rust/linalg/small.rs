@@ -209,8 +209,8 @@ pub const fn packed_index(i: usize, j: usize) -> usize {
 ///
 /// `gram` contains the lower triangles ([`packed_index`]) of correlation matrices. Their diagonal elements are 1, or 0
 /// for a zero column. `rhs` is overwritten with the solutions. The first `needed` unknowns must be linearly
-/// independent. The returned flags are true for lanes in which they are not. Later dependent unknowns are set to 0. The
-/// operations of a lane depend neither on other lanes nor on L.
+/// independent. The returned flag of a lane is true if these unknowns are linearly dependent. Dependent unknowns after
+/// them are set to 0. The operations of a lane depend neither on other lanes nor on L.
 #[inline(always)]
 pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
     // For frequent numbers of unknowns, the compiler generates loops of constant length.
@@ -373,8 +373,8 @@ fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     Some(())
 }
 
-/// Sums Σ q qᵀ and Σ q m over a sliding window of the newest rows, with regressor values q and output m of a row. They
-/// take amortized O(k²) operations per row of k values, for any length of the window.
+/// Sums Σ q qᵀ and Σ q m over a sliding window of the newest rows, with regressor values q and output m of a row. An
+/// update takes amortized O(k²) operations per row of k values, for any length of the window.
 ///
 /// The rows form blocks of the length of the window. A window consists of the end of one block and the beginning of the
 /// next. Its sum is therefore a suffix sum plus a prefix sum (van Herk, doi:10.1016/0167-8655(92)90069-C). No sums are

@@ -64,7 +64,8 @@ pub(super) struct IntegralKernel {
 }
 
 impl IntegralKernel {
-    /// True if values at pulse ends are averages of neighboring pulse means.
+    /// Return true if values at pulse ends are computed as averages of neighboring pulse means instead of by a
+    /// convolution.
     pub(super) fn is_averaged(self) -> bool {
         self.at_ends && self.order <= MAX_FEEDTHROUGH_ORDER
     }

@@ -14,8 +14,8 @@ use crate::linalg::small;
 /// Maximum number of iterations in a pulse. Each of them solves for the state channels, then for the friction forces.
 /// Three are usual.
 const MAX_PULSE_ITERATIONS: usize = 60;
-/// Error of a friction force at which the iteration has converged, expressed as the velocity change it causes relative
-/// to the velocities of the pulse.
+/// Maximum error of a friction force after the iteration has converged. The error is expressed as the velocity change
+/// that it causes, relative to the velocities of the pulse.
 const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
 
 /// Equations of one pulse of a simulation, which can be solved at given friction forces.
@@ -44,7 +44,8 @@ pub(super) struct ContactOperators {
     velocities: Vec<usize>,
     /// Number of state channels.
     states: usize,
-    /// Inverse matrix of the equations of a pulse for the state channels, without non-linear terms. Row-major.
+    /// Inverse of the matrix of the linear equations for the state channels in a pulse, without non-linear terms.
+    /// Row-major.
     inverse: Vec<f64>,
 }
 
@@ -158,7 +159,8 @@ impl MotionDerivatives {
 
 /// Linear responses to the friction forces in each pulse of a run. They are the same for all parameters.
 pub(super) struct ContactResponses {
-    /// Response of each state channel to a unit of each mean friction force. The indices are pulse, body and channel.
+    /// Response of each state channel to a unit of each mean friction force. The elements are stored by pulse, then by
+    /// body, then by channel.
     channels: Vec<f64>,
     /// Matrix of each pulse, row-major. It maps changes of the mean friction forces at fixed state channels to changes
     /// that include the feedback through the state channels.
@@ -195,12 +197,13 @@ struct IntervalWorkspace {
 }
 
 impl ContactOperators {
-    /// Friction problem of bodies with these friction laws.
+    /// Return the friction problem of a simulation for bodies with these friction laws.
     ///
     /// `channels` holds, for each body, the state channels of its output and of its velocity at the end of a pulse.
-    /// `gains` holds weights within a pulse, row-major with one row per state channel. Columns are the contributing
-    /// state channels, non-linear terms and friction forces. `states` is the number of state channels. Return an error
-    /// if the equations of a pulse are singular, or if coupled bodies have no unique friction forces.
+    /// `gains` is row-major with one row per state channel. A row holds the contributions of a unit of each state
+    /// channel, non-linear term and friction force to this channel within the same pulse. `states` is the number of
+    /// state channels. Return an error if the equations of a pulse are singular, or if coupled bodies have no unique
+    /// friction forces.
     pub(super) fn new(
         laws: Vec<FrictionLaw>,
         channels: &[(usize, usize)],
@@ -274,7 +277,8 @@ impl ContactOperators {
     }
 
     /// Return the derivatives of the bodies' gains, friction laws and initial states with respect to a parameter.
-    /// `gains` holds the weights within a pulse ([`ContactOperators::new`]), and `gain_derivatives` their derivatives.
+    /// `gains` holds the contributions within a pulse ([`ContactOperators::new`]), and `gain_derivatives` their
+    /// derivatives.
     pub(super) fn derivatives(
         &self,
         gains: &[f64],

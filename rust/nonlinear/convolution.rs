@@ -165,8 +165,8 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
         .unzip()
 }
 
-/// Integration order up to which a signal has direct feedthrough to the velocity at a pulse edge. The mean of the two
-/// neighboring pulses is then its value at the edge.
+/// Integration order up to which a signal has direct feedthrough to the velocity at a pulse edge. The value of the
+/// signal at the edge is then the average of its means over the two neighboring pulses.
 pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
 /// Return the convolution of `series` with a signal whose spectrum is `cached`, truncated to the length of `series`.

@@ -35,7 +35,7 @@ pub struct NonlinearFit {
     pub inputs: Vec<f64>,
     /// Initial states of each run.
     pub states: Vec<Vec<f64>>,
-    /// Powers of t that the initial states add, as (exponent, coefficient), by run and equation.
+    /// Powers of t that the initial states add to the outputs, as (exponent, coefficient), by run and equation.
     pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
@@ -207,9 +207,9 @@ const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
 /// Estimate the initial state of a run, with all other parameters fixed.
 ///
-/// Local optimizations start from guesses based on the first samples. Another one starts from the state fitted to the
-/// first eighth, then quarter, then half of the run. The best result is returned, or the first guess if all
-/// optimizations fail.
+/// Local optimizations start from guesses based on the first samples. A further optimization starts from a state that
+/// is fitted to the first eighth of the run, then to the first quarter, then to the first half. The best result is
+/// returned, or the first guess if all optimizations fail.
 fn estimate_initial_state(
     model: &NonlinearModel,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
@@ -321,6 +321,6 @@ pub fn fit(
     })
 }
 
-/// Distance of the response to an initial state from the span of other responses, relative to its norm. Below this
-/// value the response counts as linearly dependent.
+/// Distance of the response to an initial state from the span of the other responses, below which this response counts
+/// as linearly dependent. The distance is relative to the norm of the response.
 const DEPENDENCE_TOLERANCE: f64 = 1e-12;

@@ -30,16 +30,15 @@ pub(super) struct EndVelocityForcing {
 }
 
 impl EndVelocityForcing {
-    /// Effect of powers of t in the outputs. `powers` holds (exponent, coefficient) of each power, by equation, and
-    /// `links` the coupling terms of each equation.
+    /// Return the effect of powers of t in the outputs. `powers` holds (exponent, coefficient) of each power, by
+    /// equation, and `links` the coupling terms of each equation.
     ///
     /// A coupling term with coefficient c and integration order η integrates the initial level x₀ of its signal,
     /// including the jump to that level. It adds c x₀ t^{η−1}/Γ(η) to the velocity. An initial velocity v₀ of the
     /// signal adds c v₀ t^η/Γ(η + 1).
     ///
-    /// # Errors
-    /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
-    /// initial levels or velocities are not determined by the equations.
+    /// # Errors [`Error::OutOfRange`] for a power whose derivative has no finite mean over the first pulse;
+    /// [`Error::LeadingZero`] if the initial levels or velocities are not determined by the equations.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();

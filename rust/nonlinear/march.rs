@@ -88,8 +88,8 @@ pub(super) struct Operators {
     kernels: Vec<ConvolutionKernel>,
     kernel_contributions: Vec<KernelContributions>,
     inputs: Vec<InputContribution>,
-    /// Weights within a pulse, row-major. A row is a state channel. Columns are the state channels, the non-linear
-    /// terms and the friction forces that contribute to it.
+    /// Contributions within a pulse, row-major with one row per state channel. A row holds the contributions of a unit
+    /// of each state channel, non-linear term and friction force to this channel within the same pulse.
     gains: Vec<f64>,
     /// True if the value of a non-linear term depends on itself in the same pulse, because it enters a state channel
     /// without integration.
@@ -664,8 +664,8 @@ impl PulseEquations for Pulse<'_> {
     }
 }
 
-/// Magnitude of an argument above which a function without a value counts as overflow. Below it, the argument lies
-/// outside the function's domain.
+/// Magnitude of an argument at or above which a function without a finite value is reported as an overflow. For smaller
+/// arguments, the argument is reported as outside the domain of the function.
 const OVERFLOW_SIZE: f64 = 1e60;
 /// Failure of a pulse in which no Newton step reduces the residual, or whose iteration does not converge.
 const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");

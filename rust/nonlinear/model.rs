@@ -25,7 +25,7 @@ pub struct FreeFrictionLaw {
 }
 
 impl FreeFrictionLaw {
-    /// Coulomb friction alone: a friction force that does not depend on speed.
+    /// Return the law of Coulomb friction alone, whose friction force does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
         let known = |factor: f64| Monomial { factor, powers: Vec::new() };

@@ -63,16 +63,17 @@ impl Control {
 pub struct BatchPosition {
     /// Number of the batch. Earlier batches of the range are complete.
     pub batch: u64,
-    /// Number of candidates of the batch that no bound excluded and that have been evaluated, in evaluation order.
+    /// Number of candidates of the batch evaluated so far. They come first in the evaluation sequence of the candidates
+    /// that no bound excluded.
     pub evaluated_count: u64,
-    /// End of the current chunk of candidates in the evaluation order, 0 if the batch has not been screened.
+    /// End of the current chunk of candidates in the evaluation sequence, 0 if the batch has not been screened.
     pub end: u64,
     /// Number of candidates of the current chunk, 0 if the batch has not been screened.
     pub size: u64,
     /// Limit of the raw score (Σ|e| or Σe²) for that chunk.
     pub limit: f64,
-    /// Digest of the evaluation order of the candidates of the batch that no bound excluded. It is below 2^63, and 0 if
-    /// `end` is 0.
+    /// Digest of the evaluation sequence of the candidates of the batch that no bound excluded. It is below 2^63, and 0
+    /// if `end` is 0.
     pub order: u64,
 }
 
@@ -88,8 +89,8 @@ impl BatchPosition {
         has_begun && self.evaluated_count <= self.end
     }
 
-    /// Return true if the position is compatible with a batch that has `open` candidates to evaluate and the digest
-    /// `order`.
+    /// Return true if the position is compatible with a batch that has `open` candidates to evaluate, whose evaluation
+    /// sequence has the digest `order`.
     pub(crate) fn fits(&self, open: u64, order: u64) -> bool {
         self.end == 0 || (self.end <= open && self.order == order)
     }

@@ -36,7 +36,7 @@ pub struct Row {
     pub score: f64,
     /// Coefficients of the terms, one per term.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms: one vector per record, in the order of the exponents of the structure.
+    /// Coefficients of the initial terms: one vector per record, in the sequence of the exponents of the structure.
     pub initial: Vec<Vec<f64>>,
 }
 
@@ -77,7 +77,7 @@ pub struct Outcome {
 /// Partial result of a search, from some of its batches.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Part {
-    /// Best rows of the batches, at most as many as the table has. Scores are raw scores (Σ|e| or Σe²).
+    /// Best rows of the batches, at most as many as the result table holds. Scores are raw scores (Σ|e| or Σe²).
     pub rows: Vec<Row>,
     /// Number of candidates by outcome. Candidates in `rows` count as `beaten` until the search is complete.
     pub counts: Counts,

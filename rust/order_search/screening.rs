@@ -27,7 +27,8 @@ pub(crate) fn sort_by_guess(open: &mut [OpenCandidate]) {
 }
 
 /// Screen candidates `lo … hi − 1` against a limit of the raw score (Σ|e| or Σe²). Return the candidates that no bound
-/// excludes, and the indices of the singular ones. It is compiled for the widest vector instructions available.
+/// excludes, and the indices of the singular ones. The screening is compiled for the widest vector instructions
+/// available.
 pub(crate) fn screen(
     candidate_index: &CandidateIndex<'_>,
     lo: u64,
@@ -85,8 +86,8 @@ impl simd::SimdKernel for Screening<'_> {
     }
 }
 
-/// Data for the common bound of candidates that differ in one term only. This bound precedes the others if candidates
-/// are ranked by squared equation error.
+/// Data for the common bound of candidates that differ in one term only. It is applied before all other bounds, and
+/// only if candidates are ranked by squared equation error.
 struct RowBoundContext<'a> {
     squares: &'a ResidualSumOfSquares,
     limit: f64,
@@ -214,8 +215,8 @@ impl<const L: usize> Screen<L> {
         self.screen_positions(candidate_index, std::array::from_fn(|n| index + n as u64), L, limit, screened);
     }
 
-    /// Screen the first `count` of the L candidates whose columns have been set. Append to the candidates that no bound
-    /// excludes, and to the indices of singular candidates.
+    /// Screen the first `count` of the L candidates whose columns have been set. Append the candidates that no bound
+    /// excludes to `open`, and the indices of singular candidates to `singular`.
     #[inline(always)]
     fn screen_positions(
         &mut self,

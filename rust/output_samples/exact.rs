@@ -1,4 +1,4 @@
-//! Exact samples of models with integer orders at uniform sample times, by their state space.
+//! Exact samples of models with integer orders at uniform sample times, from their state-space form.
 
 use super::initial_terms::{fit_initial_terms, OutputSamples};
 use super::richardson::Rows;

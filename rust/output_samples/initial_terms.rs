@@ -34,10 +34,10 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
 
 /// Add the initial terms that fit the measured samples best to the samples `driven` of a simulation from rest.
 ///
-/// `units` holds (index of the equation, exponent) of each term, and `columns` the samples of all outputs per unit of
-/// it. With `has_level`, the level of each output is an additional term with the exponent ∞. The weight of an output is
-/// the inverse of the standard deviation of its measurement. Missing samples are NaN and have weight 0. If terms are
-/// collinear, the solution of minimum norm is used.
+/// `units` holds (index of the equation, exponent) of each term, and `columns` the samples of all outputs for this term
+/// with coefficient 1. With `has_level`, the level of each output is an additional term with the exponent ∞. The weight
+/// of an output is the inverse of the standard deviation of its measurement. Missing samples are NaN and have weight 0.
+/// If terms are collinear, the solution of minimum norm is used.
 ///
 /// # Errors
 /// [`Error::Length`] if the numbers of samples, outputs or terms differ. [`Error::Structure`] for an equation index out

@@ -2,9 +2,10 @@
 //!
 //! Initial terms are multiples of powers of time that are added to the right-hand sides of the equations, and levels of
 //! the outputs. Before the first sample, each equation has an unknown zero-mean Gaussian input, which is piecewise
-//! constant on octaves of time over [`PAST_LENGTHS`] lengths of the run. The size of these inputs, scaled by the
-//! response to the inputs of the run, maximizes the marginal likelihood (empirical Bayes). Without the prior, the
-//! initial terms would absorb errors of the model. Initial values by Caputo's definition and levels have no prior.
+//! constant on octaves of time over [`PAST_LENGTHS`] lengths of the run. The standard deviation of these inputs is
+//! relative to the response to the inputs of the run. It maximizes the marginal likelihood (empirical Bayes). Without
+//! the prior, the initial terms would absorb errors of the model. Initial values by Caputo's definition and levels have
+//! no prior.
 
 use std::sync::Arc;
 
@@ -24,13 +25,13 @@ use crate::signal::statistics::{inner, mean, variance_inflation};
 
 /// Length of the past that is modeled, in lengths of the run.
 const PAST_LENGTHS: usize = 4;
-/// Standard deviations of past inputs to choose from. With 1, their response at the first sample is as large as the
-/// root mean square of the response to the inputs of the run.
+/// Candidate standard deviations of past inputs. At the value 1, the response to past inputs is as large at the first
+/// sample as the root mean square of the response to the inputs of the run.
 const PAST_INPUT_SIZES: [f64; 6] = [0.0, 0.03, 0.1, 0.3, 1.0, 3.0];
-/// Ratio to the largest singular value below which a singular value of responses is rounding.
+/// Ratio to the largest singular value below which a singular value of responses counts as rounding error.
 const MIN_SINGULAR_VALUE_RATIO: f64 = 1e-10;
 
-/// Columns of weighted samples that initial terms are fitted with.
+/// Regressors of the fit of initial terms: one column of weighted samples per term.
 struct WeightedColumns {
     /// Columns of unit norm.
     columns: Rows,
@@ -47,9 +48,8 @@ impl OutputSimulation {
     /// prior. With `has_level`, the level of each output is a further term without a prior; it has the exponent ∞ and
     /// belongs to the equation of the output. None if a response is not finite.
     ///
-    /// # Errors
-    /// As [`OutputSimulation::refine`]; [`Error::Length`] if `exponents` or `free` do not have
-    /// one entry per equation.
+    /// # Errors The errors of [`OutputSimulation::refine`]. [`Error::Length`] if `exponents` or `free` do not have one
+    /// entry per equation.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -132,8 +132,8 @@ impl OutputSimulation {
         Ok(Some(found))
     }
 
-    /// Responses `[equation][octave]` to a unit input that acted in this equation during this octave of past time: one
-    /// row per output, at the sample times of the simulation. None if a response is not finite.
+    /// Return the responses `[equation][octave]` to a unit input that acted in this equation during this octave of past
+    /// time. Each has one row per output, at the sample times of the simulation. None if a response is not finite.
     fn past_responses(&self, options: Refinement, stop: &Stop) -> Result<Option<Vec<Vec<Rows>>>> {
         let (n, rows) = (self.equations.len(), self.recording.len());
         let past = PAST_LENGTHS * rows;
@@ -162,7 +162,8 @@ impl OutputSimulation {
         Ok(Some(responses))
     }
 
-    /// Uniform samples, interpolated linearly at the sample times of the simulation plus `shift` sampling intervals.
+    /// Return uniform samples that are interpolated linearly at the sample times of the simulation plus `shift`
+    /// sampling intervals.
     fn samples_after(&self, samples: &[f64], shift: usize) -> Vec<f64> {
         let Some(times) = &self.times else { return samples[shift..shift + self.recording.len()].to_vec() };
         let grid: Vec<f64> = (0..samples.len()).map(|k| self.recording.step() * k as f64).collect();
@@ -170,8 +171,8 @@ impl OutputSimulation {
         later.iter().map(|time| interpolate(*time, &grid, samples)).collect()
     }
 
-    /// Simulation of `rows` uniform samples from rest, of a unit step that is added to the right-hand side of one
-    /// equation. The inputs of the run are zero.
+    /// Return a simulation from rest with `rows` uniform samples. A unit step is added to the right-hand side of the
+    /// equation with index `forced`. The inputs of the run are zero.
     fn unit_step(&self, forced: usize, rows: usize) -> Result<Self> {
         let outputs = self.recording.outputs();
         let own = |signal: usize, i: usize| {
@@ -202,11 +203,12 @@ impl OutputSimulation {
 }
 
 impl WeightedColumns {
-    /// Coefficients of all terms, one per column, in a target: the weighted measured samples minus the response to the
-    /// inputs.
+    /// Fit all terms to a target, and return their coefficients, one per column. The target is the weighted measured
+    /// samples minus the response to the inputs.
     ///
-    /// `driven` are the weighted samples of the response to the inputs, None if it is zero. Each of `groups` belongs to
-    /// an equation: the sum of squares of the first samples of its octave responses, and these responses.
+    /// `driven` are the weighted samples of the response to the inputs, None if it is zero. Each entry of `groups`
+    /// belongs to one equation. It holds the sum of squares of the first samples of the octave responses, and these
+    /// responses.
     fn fit(&self, target: &[f64], driven: Option<Vec<f64>>, groups: &[(f64, Rows)]) -> Result<Vec<f64>> {
         let space = decompose(&self.columns)?;
         let free: Rows = self.free.iter().map(|&k| self.columns[k].clone()).collect();
@@ -247,8 +249,8 @@ impl WeightedColumns {
     }
 }
 
-/// Posterior mean of the coefficients of a linear regression of a target on columns, under independent normal priors of
-/// equal variance.
+/// Return the posterior mean of the coefficients in a linear regression of a target on columns, under independent
+/// normal priors of equal variance.
 ///
 /// The variance of the prior maximizes the marginal likelihood. The part of the target that the columns do not explain
 /// is noise, whose variance is increased for autocorrelation.
@@ -277,7 +279,7 @@ fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
     Ok(linear_combination(&right, &means, columns.len()))
 }
 
-/// Singular value decomposition of the matrix with these columns.
+/// Return the singular value decomposition of the matrix with these columns.
 fn decompose(columns: &[Vec<f64>]) -> Result<SingularValues> {
     singular_values(columns).ok_or_else(not_decomposed)
 }
@@ -286,13 +288,13 @@ fn not_decomposed() -> Error {
     Error::Internal { what: "singular values of responses to past inputs that do not converge".into() }
 }
 
-/// The left singular vectors and singular values above rounding errors.
+/// Return the left singular vectors and the singular values, without those at the level of rounding errors.
 fn significant(all: SingularValues) -> (Rows, Vec<f64>) {
     let least = MIN_SINGULAR_VALUE_RATIO * all.values.first().copied().unwrap_or(0.0);
     all.left.into_iter().zip(all.values).filter(|(_, value)| *value > least).unzip()
 }
 
-/// Linear combination of columns, of a given length.
+/// Return the sum of the columns times their coefficients, as a vector of `length` values.
 fn linear_combination(columns: &[Vec<f64>], coefficients: &[f64], length: usize) -> Vec<f64> {
     let mut sum = vec![0.0; length];
     columns.iter().zip(coefficients).for_each(|(column, c)| add_multiple(&mut sum, *c, column));

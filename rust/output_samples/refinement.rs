@@ -12,8 +12,8 @@ use crate::recording::Role;
 use crate::series;
 use crate::signal::nonuniform::interpolate_gaps;
 
-/// Number of pulses per sampling interval of the coarsest grid. With two or more, a sample does not depend on a jump of
-/// a zero-order-hold input at its time.
+/// Number of pulses per sampling interval of the coarsest grid. With two or more pulses, a sample does not depend on a
+/// jump of a zero-order-hold input at the sample time.
 pub(super) const FIRST_REFINEMENT: usize = 2;
 /// Ratio of the end times of successive time ranges into which responses are divided. The shortest range has at least
 /// [`MIN_RANGE_INTERVALS`] sampling intervals. With this ratio, halving the step on a range costs as much as the whole
@@ -35,20 +35,20 @@ pub struct RefinedSamples {
     pub samples: OutputSamples,
     /// Number of pulses per sampling interval of the finest grid.
     pub refinement: usize,
-    /// Change of each output when the step was last halved, relative to the largest magnitude of the output. It is
-    /// infinite with fewer than three grids.
+    /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
+    /// output. It is infinite with fewer than three grids.
     pub change: Vec<f64>,
 }
 
 /// Options of the step refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Tolerance for the change of each output when the step is halved, relative to the largest magnitude of the
-    /// output. The refinement ends when no change exceeds it.
+    /// Tolerance for the change of each output that is expected if the step is halved again, relative to the largest
+    /// magnitude of the output. The refinement ends when no expected change exceeds the tolerance.
     pub tolerance: f64,
     /// Maximum number of pulses of a grid.
     pub max_pulses: usize,
-    /// Number of sampling intervals from which on a record is simulated by superposition of responses.
+    /// Minimum number of sampling intervals of a record that is simulated by superposition of responses.
     pub long_record_intervals: usize,
     /// Memory limit \[bytes\].
     pub memory: usize,
@@ -393,7 +393,7 @@ fn time_ranges(intervals: usize) -> Vec<(usize, usize)> {
     firsts.zip(ends.iter().copied()).collect()
 }
 
-/// True if the responses are finite and grow so little that their sum does not lose digits.
+/// True if the responses are finite and grow so little over the record that their superposition does not lose digits.
 fn decays(rows: &Rows) -> bool {
     rows.iter().all(|row| {
         let (first, second) = row.split_at(row.len() / 2);

@@ -49,8 +49,8 @@ pub(super) fn add_multiple(sum: &mut [f64], factor: f64, values: &[f64]) {
 pub struct LimitEstimate {
     /// Samples of each output in the limit.
     pub samples: Vec<Vec<f64>>,
-    /// Change of each output that is expected if the step is halved again, relative to its largest magnitude. It is
-    /// infinite with fewer than three grids.
+    /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
+    /// output. It is infinite with fewer than three grids.
     pub change: Vec<f64>,
     /// Coefficients of the initial terms in the limit.
     pub terms: Vec<f64>,
@@ -175,8 +175,8 @@ impl RichardsonTable {
     }
 }
 
-/// Return, for each output, the ratio of the remaining change to the last change, if changes decrease by a constant
-/// factor.
+/// Return, for each output, the ratio of the remaining change in the limit of zero step to the last change. The changes
+/// are assumed to decrease by a constant factor per halving of the step.
 ///
 /// This is Aitken's method with one factor for all samples of an output. None if only few samples of an output change,
 /// or if the changes decrease too slowly.

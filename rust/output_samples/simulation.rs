@@ -24,7 +24,7 @@ pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 
 /// Difference of two orders below which they count as equal.
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
-/// Integration order from which on pulse means resolve a slope discontinuity without a correction.
+/// Minimum integration order at which pulse means resolve a slope discontinuity without a correction.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 /// Termination criteria of the fit of initial states for models with friction or non-linear terms.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 60, tolerance: 1e-12 };
@@ -61,7 +61,8 @@ pub struct OutputSimulation {
 }
 
 impl OutputSimulation {
-    /// Simulation of linear equations, with optional friction, in the sequence of the recording's outputs.
+    /// Build the simulation of linear equations with optional friction. The equations are in the sequence of the
+    /// recording's outputs.
     ///
     /// `frictions` holds (index of the equation, friction law). `times` holds the sample times \[s\]; None stands for
     /// the uniform samples of the recording.
@@ -108,8 +109,8 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with non-linear terms and optional friction. A non-linear term is a term whose signal is
-    /// derived. Derived signals are numbered after the signals of the recording.
+    /// Build the simulation of equations with non-linear terms and optional friction. A non-linear term is a term whose
+    /// signal is derived. Derived signals are numbered after the signals of the recording.
     ///
     /// # Errors
     /// The errors of [`NonlinearSystem::check`] for an invalid system. [`Error::Structure`] if the outputs of the
@@ -313,8 +314,8 @@ impl OutputSimulation {
         Ok(exponents.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |e| (i, *e))).collect())
     }
 
-    /// Return the index of the equation whose simulated output is this signal. None for inputs, and if outputs enter
-    /// other equations as measured.
+    /// Return the index of the equation whose simulated output is this signal. None for inputs. Also None if outputs
+    /// enter other equations as measured.
     pub(super) fn simulated_output(&self, signal: usize) -> Option<usize> {
         self.equations.iter().position(|e| self.recording.is_coupled && e.structure.output == signal)
     }
@@ -409,8 +410,8 @@ impl<'a> Grid<'a> {
         Ok(outputs.collect::<Result<Vec<_>>>()?.concat())
     }
 
-    /// Return the pulse means of the outputs with zero initial conditions, and those for a unit of each initial term
-    /// without inputs.
+    /// Return the pulse means of the outputs with zero initial conditions. Also return those for each initial term
+    /// alone with coefficient 1, without inputs.
     pub(super) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Rows, Vec<Rows>)> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         if recording.is_coupled {
@@ -430,7 +431,8 @@ impl<'a> Grid<'a> {
         Ok((rest, responses))
     }
 
-    /// Return the samples of the outputs for a unit of one initial term without inputs, from their pulse means.
+    /// Return the samples of the outputs, from their pulse means, for one initial term with coefficient 1 and without
+    /// inputs.
     pub(super) fn unit_samples(&self, (equation, exponent): (usize, f64), means: &Rows) -> Result<Rows> {
         let mut terms = vec![Vec::new(); means.len()];
         terms[equation].push((exponent, 1.0));
@@ -440,9 +442,11 @@ impl<'a> Grid<'a> {
     /// Return the samples of the outputs from their pulse means. Direct feedthrough uses the values of the inputs at
     /// the sample times.
     ///
-    /// The last two pulses before each sample time are extrapolated to it. These pulses contain no jump of a
-    /// zero-order-hold input, so the extrapolation crosses no slope discontinuity t^α. Nonuniform sample times may be
-    /// close to any jump. Their samples are interpolated from the surrounding pulses, and kink corrections are added.
+    /// Without improper terms, the last two pulse means before each sample time are extrapolated to it. These pulses
+    /// contain no jump of a zero-order-hold input, so the extrapolation crosses no slope discontinuity t^α. With
+    /// improper terms, the pulse means before and after each sample time are averaged. Nonuniform sample times may be
+    /// close to any jump. Samples at these times are interpolated from the surrounding pulses, and kink corrections are
+    /// added.
     fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
         let OutputSimulation { recording, equations, times, .. } = self.simulation;
         let (n, m, every) = (means.len(), self.record.m(), self.every);
@@ -567,8 +571,9 @@ impl<'a> Grid<'a> {
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
     }
 
-    /// Return, for each inner sample of each output, the part of the averaged pulse means that occurs after the sample
-    /// time. A sample is the average of the pulses before and after it, so this part must be subtracted.
+    /// Return the part of each sample that is due to the response after the sample time, for all samples of each output
+    /// except the first and the last. A sample that is the average of the pulse means before and after it contains this
+    /// part, which must be subtracted.
     ///
     /// It is half of the response in the first pulse after a jump or a slope discontinuity of an input. At the sample
     /// time only direct feedthrough acts, as in the joint fit.

@@ -34,17 +34,17 @@ pub enum RecordArg<'py> {
 pub type StructureArg = (usize, f64, List<(usize, f64)>);
 /// Equation: (structure, coefficients).
 pub type EquationArg = (StructureArg, List<f64>);
-/// Initial terms: (true for the powers of t of Caputo derivatives, explicit exponents otherwise).
+/// Initial terms: (true for the powers of t of Caputo derivatives, exponents that are used if the flag is false).
 #[derive(FromPyObject)]
 pub enum InitialArg {
-    /// Initial terms with an offset, and with the number of impulses of a filter transient.
+    /// Initial terms with an offset as in `Offset`, and with the number of impulses of a filter transient.
     Filtered(bool, List<f64>, u8, u8),
     /// Initial terms with an offset: 0 for none, 1 for a constant, 2 for a constant and a ramp, 3 for an output level.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
 }
 
-/// Signal of an expression: ([(name, number), …] of the instructions of its expression, [(signal, order of the
+/// Description of a derived signal: ([(name, number), …] of the instructions of its expression, [(signal, order of the
 /// derivative), …] of its channels).
 pub type DerivedArg = (List<(String, f64)>, List<(usize, f64)>);
 

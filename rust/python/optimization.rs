@@ -13,7 +13,8 @@ use crate::estimation::optimization::damped_step::{LeastSquaresProblem, Lineariz
 use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, MinimizationSettings};
 use crate::signal::statistics::inner;
 
-/// Violation of a constraint that counts as rounding error, relative to the terms of the constraint in a step.
+/// Maximum violation of a constraint by a step that counts as rounding error. It is relative to Σ|row·step|, the sum of
+/// the moduli of the terms of the constraint.
 const CONSTRAINT_TOLERANCE: f64 = 1e-9;
 const CONSTRAINT_ROUNDING: f64 = 1e-14;
 

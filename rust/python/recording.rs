@@ -34,7 +34,7 @@ pub struct ChannelArg<'py> {
     enters_others: bool,
 }
 
-/// (coefficient, order) pairs of the numerator and of the denominator.
+/// Sensor filter as (coefficient, order) pairs: those of the numerator, then those of the denominator.
 type FilterArg = (List<(f64, f64)>, List<(f64, f64)>);
 
 /// Run from a dictionary with these fields as keys. `free` holds (index of the signal, law) of each free delay,

@@ -260,7 +260,8 @@ impl OutputSimulation {
     }
 
     /// Refine the step. Return ((extrapolated samples, initial terms), pulses per sampling interval of the finest grid,
-    /// change). The change is the remaining change of each output, relative to its largest magnitude.
+    /// change). The change is that of each output that is expected if the step is halved again, relative to the largest
+    /// magnitude of the output.
     #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
     #[allow(clippy::too_many_arguments)]
     fn refine<'py>(
@@ -280,9 +281,9 @@ impl OutputSimulation {
         Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
 
-    /// Initial terms that represent past inputs, as (exponent, coefficient) by equation: the posterior mean under a prior
-    /// on these inputs. `exponents` and `free` are the exponents of all terms and of those without a prior, by equation.
-    /// None if a response is not finite.
+    /// Return the initial terms that represent past inputs, as (exponent, coefficient) by equation. They are the
+    /// posterior mean under a prior on these inputs. `exponents` and `free` are the exponents of all terms and of those
+    /// without a prior, by equation. None if a response is not finite.
     #[pyo3(signature = (exponents, free, has_level, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
     #[allow(clippy::too_many_arguments)]
     fn fit_past_inputs(

@@ -191,7 +191,7 @@ impl VirtualArm {
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
-    /// Start the arm. If `paced`, its deadlines count from now on in real time; otherwise it runs as fast as possible.
+    /// Start the arm. If `paced`, the arm has real-time deadlines from now on. Otherwise it runs as fast as possible.
     fn start(&mut self, paced: bool) -> PyResult<()> {
         run_attached(|| {
             self.pace = if paced { Some(Pace::new(self.step)?) } else { None };

@@ -35,7 +35,7 @@ pub struct Channel {
     pub role: Role,
     /// Delay of an input \[s\]; None if the structure does not define a delay for it.
     pub delay: Option<f64>,
-    /// Saturations and dead zones in the order in which they act.
+    /// Saturations and dead zones, in the sequence in which they act.
     pub nonlinearities: Vec<Nonlinearity>,
     /// True if the signal was measured through the sensor filter.
     pub is_filtered: bool,

@@ -15,7 +15,8 @@ pub struct Recordings {
 }
 
 impl Recordings {
-    /// Recordings with the same signals.
+    /// Return the recordings as the data of one fit. They must have the same number of signals, the same outputs and
+    /// the same number of free input parameters.
     ///
     /// # Errors
     /// [`Error::Length`] for different numbers of signals or free input parameters, [`Error::Structure`] for different

@@ -172,8 +172,8 @@ impl Pulses {
 }
 
 impl Recording {
-    /// Recording of signals with the sampling interval `step` \[s\]. `times` \[s\] holds the nonuniform sample times,
-    /// if any.
+    /// Build a recording of signals with the sampling interval `step` \[s\]. `times` \[s\] holds the nonuniform sample
+    /// times, if any.
     ///
     /// `outputs` holds the indices of the signals that equations simulate, in the sequence of the equations.
     ///
@@ -254,7 +254,8 @@ impl Recording {
         &self.name
     }
 
-    /// Recording of uniform samples. Its outputs are the channels with [`Role::Output`], in their sequence.
+    /// Build a recording of uniform samples. Its outputs are the channels with [`Role::Output`], in the sequence of
+    /// `channels`.
     ///
     /// # Errors
     /// The errors of [`Self::new`], for samples of unequal length or an invalid channel.
@@ -471,8 +472,8 @@ impl Recording {
         (0..self.len()).map(|row| row as f64 * self.step).collect()
     }
 
-    /// Return the value of a delayed signal before its first sample: 0 with zero initial conditions, otherwise that
-    /// sample.
+    /// Return the value of a delayed signal before its first sample: 0 with zero initial conditions, otherwise the
+    /// value of the first sample.
     pub(crate) fn value_before(&self, samples: &[f64]) -> f64 {
         if self.is_at_rest {
             0.0

@@ -11,8 +11,8 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::spectral_radius;
 use crate::state_space::exponential;
 
-/// Length of the record to which the transient is fitted, in time constants of the fastest pole. Over this time the
-/// input of the filter is nearly a straight line.
+/// Length of the initial part of the record to which the transient is fitted, in time constants of the fastest pole.
+/// Over this time the input of the filter is nearly a straight line.
 const TRANSIENT_FIT_TIME_CONSTANTS: f64 = 1.0;
 /// Minimum number of samples per parameter in the fit of the transient.
 const SAMPLES_PER_PARAMETER: usize = 2;
@@ -33,8 +33,8 @@ pub(super) struct FilterStates {
 }
 
 impl FilterStates {
-    /// State-space form of a filter. None if the filter has zeros, fractional orders or order 0, because its transients
-    /// are then not impulse responses.
+    /// Return the state-space form of a filter. None if the filter has zeros, fractional orders or order 0, because its
+    /// transients are then not impulse responses.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn of(filter: &Filter) -> Option<Self> {
         let whole = |order: f64| order.fract() == 0.0;

@@ -36,7 +36,7 @@ pub const SIGNAL_COUNT: usize = 6;
 /// Equations and friction of the arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// Equations D^α θ = Σ c D^ν s of the angles θ₁₁, θ₁₂, θ₂₁, θ₂₂, in this order. s is one of the [`SIGNAL_COUNT`]
+    /// Equations D^α θ = Σ c D^ν s of the angles θ₁₁, θ₁₂, θ₂₁, θ₂₂, in this sequence. s is one of the [`SIGNAL_COUNT`]
     /// signals. Friction is not subtracted from the motor currents.
     pub equations: Vec<Equation>,
     /// Coulomb friction of each joint, expressed as a motor current \[A\].
@@ -84,8 +84,8 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// Arm at rest. A sample lasts `step` \[s\], and is divided into substeps of at most `longest_substep` \[s\]. The
-    /// history is accurate up to the time `horizon` \[s\].
+    /// Build the model of an arm at rest. A sample lasts `step` \[s\] and is divided into substeps of at most
+    /// `longest_substep` \[s\]. The history is accurate up to the time `horizon` \[s\].
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step
@@ -311,7 +311,7 @@ impl Operator {
     }
 }
 
-/// Return the weights of the exponentials in the kernel at lags beyond one substep.
+/// Return the weights of the exponentials in the kernel of order `q` for lags longer than one substep `h`.
 fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }

@@ -30,9 +30,10 @@ pub struct GuardSettings {
     pub thermal_time: f64,
     /// Maximum permitted deflection \[rad\].
     pub deflection_limit: [f64; 2],
-    /// Magnitude of the voltage from which on a strain gauge counts as saturated \[V\].
+    /// Minimum magnitude of the voltage at which a strain gauge counts as saturated \[V\].
     pub saturation: f64,
-    /// Current from which on a joint must move \[A\]. If it does not move, its encoder counts as dead.
+    /// Minimum commanded current at which a joint must move \[A\]. The encoder of a joint that does not move counts as
+    /// dead.
     pub moving_current: f64,
     /// Maximum duration for which a joint may stand still while its commanded current is at least `moving_current`
     /// \[s\].
@@ -113,7 +114,7 @@ pub enum Fault {
         joint: usize,
         /// Duration of the standstill \[s\].
         seconds: f64,
-        /// Current from which on the joint must move \[A\].
+        /// Minimum commanded current at which the joint must move \[A\].
         current: f64,
     },
     /// Encoder jump that exceeds the highest plausible joint speed.
@@ -143,7 +144,7 @@ pub enum Fault {
         volts: f64,
         /// Duration without a response \[s\].
         seconds: f64,
-        /// Change of the motor current from which on the reading must change \[A\].
+        /// Minimum change of the motor current that must change the voltage of the gauge \[A\].
         current: f64,
     },
     /// Current sensor whose voltage is not finite.
@@ -309,8 +310,8 @@ impl Guard {
     }
 
     /// Check a reading and convert it to hub angle and deflection of joint 1, then of joint 2 (θ₁₁, θ₁₂, θ₂₁, θ₂₂
-    /// \[rad\]), and both motor currents \[A\]. `late` \[s\] is its delay after the deadline. A violated limit latches
-    /// a fault.
+    /// \[rad\]), and both motor currents \[A\]. `late` \[s\] is the time from the deadline to this reading. A violated
+    /// limit latches a fault.
     pub fn read(&mut self, reading: &Reading, late: f64) -> [f64; 6] {
         self.check(reading);
         let mut hubs = [0.0; 2];
@@ -337,8 +338,8 @@ impl Guard {
         [hubs[0], bends[0], hubs[1], bends[1], -reading.analog[2] * scale, -reading.analog[3] * scale]
     }
 
-    /// Convert commanded currents \[A\] to voltages of both motors \[V\] within all limits. Every command passes this
-    /// function last.
+    /// Convert commanded currents \[A\] to voltages of both motors \[V\] within all limits. Every command passes
+    /// through this function immediately before the output.
     ///
     /// The voltages are zero while a fault is latched. A command that is not finite latches a fault.
     pub fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
@@ -410,8 +411,8 @@ impl Guard {
         }
     }
 
-    /// Latch a fault if a strain gauge does not respond. Noise alone changes the reading of a working gauge. Without
-    /// noise, a change of the motor current changes it.
+    /// Latch a fault if a strain gauge does not respond. Noise alone changes the voltage of a working gauge from sample
+    /// to sample. Without noise, the voltage changes when the motor current changes.
     fn check_gauge(&mut self, j: usize, volts: f64) {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]

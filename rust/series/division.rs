@@ -108,8 +108,8 @@ impl simd::SimdKernel for Substitution<'_> {
 /// fastest of 8, 16 and 32 at m = 2048 terms.
 const MAX_LEVEL_BLOCKS: usize = 32;
 
-/// Spectra for one block length of a division of n unknown series: of the solved blocks, and of segments of the n²
-/// series of the matrix. Their products are the contributions of solved blocks to later blocks.
+/// Spectra for one block length in a division with n unknown series: the spectra of the solved blocks, and those of
+/// segments of the n² series of the matrix. Products of both are the contributions of solved blocks to later blocks.
 ///
 /// Segment d contains the terms d·len to (d + 2)·len of a series. The second half of its product with block k is the
 /// contribution to block k + d + 1. Contributions of several blocks are summed as spectra. A tile is a group of
@@ -259,8 +259,8 @@ impl simd::SimdKernel for Contributions<'_> {
 /// State of the solution of an n × n system of series, which computes the quotients (unknown series) block by block.
 ///
 /// The caller adds right-hand sides block by block ([`Division::add`]). [`Division::advance`] then solves the next
-/// block and subtracts the contributions of solved blocks from one later block. Its length is that of the longest
-/// blocks that end at the solved terms. The spectrum of every block is computed once.
+/// block and subtracts the contributions of solved blocks from one later block. This later block is as long as the
+/// longest block that ends at the last solved term. The spectrum of every block is computed once.
 pub struct Division {
     n: usize,
     m: usize,
@@ -448,8 +448,8 @@ impl Division {
     }
 }
 
-/// Return (level, block length, block count) for a number of solved terms. The level is the longest with a block that
-/// ends there. The count is the number of its blocks that contribute to the next block.
+/// Return (level, block length, block count) for a number of solved terms. The level is the one with the longest block
+/// that ends at these terms. The count is the number of blocks of this level that contribute to the next block.
 fn level_at(solved: usize) -> (usize, usize, usize) {
     let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
     while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {

@@ -1,5 +1,5 @@
-//! Systems of integrals of integer order by running sums instead of transforms. O(n² K) per term for n equations and K
-//! sums.
+//! Solution of systems of integrals of integer order by running sums instead of transforms. O(n² K) per term for n
+//! equations and K sums.
 //!
 //! In pulse means with the sampling interval h, the integral I^η of integer order η is h^η/(η+1)!·A(z)/(1−z)^η. Here z
 //! is the one-step delay, and A is an Eulerian polynomial of degree η. In powers of 1−z it is a combination of running

@@ -4,11 +4,11 @@
 //! (j+1)h). A measured signal is linear between its samples. Estimates from samples in place of pulse means would be
 //! biased.
 //!
-//! Four pulse means around a sample time determine a smooth signal to fourth order, as the slope of the quartic through
-//! its integral at the pulse edges. After a jump of a zero-order-hold input, the signal is not smooth. The fractional
-//! integral I^η of a jump of size Δ at time p is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means
-//! replace the jump by a ramp within its pulse. Both responses are known exactly, so samples near a jump are corrected
-//! by their difference.
+//! Four pulse means around a sample time determine the value of a smooth signal with fourth-order accuracy. It is the
+//! slope of the quartic polynomial through the integral of the signal at the five pulse edges. After a jump of a
+//! zero-order-hold input, the signal is not smooth. The fractional integral I^η of a jump of size Δ at time p is Δ (t −
+//! p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means replace the jump by a ramp within its pulse. Both
+//! responses are known exactly, so samples near a jump are corrected by their difference.
 
 use crate::error::{check_finite, check_points, Error, Result};
 
@@ -154,7 +154,8 @@ pub(crate) fn check_pulses(m: usize) -> Result<()> {
     })
 }
 
-/// Return the integral over interval j from fraction a to b of it, without cancellation of two partial integrals.
+/// Return the integral over the part of interval `j` from the fraction `a` to the fraction `b` of its length. No
+/// difference of two partial integrals is formed, so no digits cancel.
 fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f64) -> f64 {
     match between {
         Intersample::Hold => samples[j] * (b - a),
@@ -222,8 +223,8 @@ pub fn point_samples(means: &[f64]) -> Vec<f64> {
 
 /// Number of pulse means from which one sample is interpolated.
 const STENCIL_PULSES: usize = 4;
-/// Number of pulses after a jump within which samples are corrected for the slope discontinuity. Later, the error
-/// decreases with the square of the step, like all other errors of the scheme.
+/// Number of pulses after a jump within which samples are corrected for the slope discontinuity. Beyond this range, the
+/// error decreases with the square of the step, like all other errors of the scheme.
 const KINK_RANGE_PULSES: f64 = 16.0;
 
 /// Jump of a held signal near a sample time. All lengths are in pulses.
@@ -254,8 +255,8 @@ pub struct Jumps {
 }
 
 impl SampleInterpolation {
-    /// Interpolation at these positions among `m` pulses. A position is a time in pulses from the start of the first
-    /// pulse.
+    /// Build the interpolation at these positions among `m` pulses. A position is a time in pulses from the start of
+    /// the first pulse.
     ///
     /// # Errors
     /// [`Error::Length`] for fewer than four pulses. [`Error::OutOfRange`] or [`Error::NotFinite`] for a position
@@ -344,8 +345,8 @@ impl SampleInterpolation {
     }
 
     /// Return the corrections of the samples of the fractional integral of order `eta` of a zero-order-hold signal.
-    /// Each is the exact response to its jumps minus the response that pulse means represent. `step` \[s\] is the pulse
-    /// length.
+    /// Each correction is the exact response to the jumps of the signal minus the response that pulse means represent.
+    /// `step` \[s\] is the pulse length.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {

@@ -13,7 +13,7 @@ pub struct Metrics {
     /// Root mean square error √(Σ(y − ŷ)²/M), eq. (46) of the paper, in the unit of the output.
     pub rmse: f64,
     /// NR, the normalized error RMSE / σ(y), eq. (47) of the paper. The standard deviation σ has the divisor M, as in
-    /// its tables.
+    /// the tables of the paper.
     pub nr: f64,
     /// Fit 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) \[%\].
     pub fit_percent: f64,
@@ -70,7 +70,8 @@ pub struct Correlation {
 /// sum adds only noise.
 const WINDOW_CORRELATION_TIMES: f64 = 6.0;
 
-/// Return the correlations of x with y at lags −`lags` … `lags`, each run about its own mean. O(N log N) for N samples.
+/// Return the correlations of x with y at lags −`lags` … `lags`. The mean of each run is subtracted from its samples.
+/// O(N log N) for N samples.
 ///
 /// # Errors
 /// [`Error::Length`] if x and y differ in runs or samples. [`Error::OutOfRange`] if a run has no more samples than

@@ -342,8 +342,8 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
 
 /// Minimum number of samples in all runs together, per lag of each input of an ARX model.
 const SAMPLES_AN_INPUT_LAG: usize = 40;
-/// Residual sum of squares of a regression column on the previous columns, relative to its sum of squares. Below this
-/// value, the column is omitted.
+/// Minimum ratio of the residual sum of squares to the total sum of squares when a column is regressed on the previous
+/// columns. A column with a smaller ratio is omitted.
 const COLUMN_TOLERANCE: f64 = 1e-8;
 
 /// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series e that may depend on inputs u. w are the

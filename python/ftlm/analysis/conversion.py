@@ -178,7 +178,7 @@ def export_text(
 ) -> str:
     """Return a model as text for another tool: a Python script, a MATLAB script, or JSON.
 
-    `band` [rad/s] and `order` are arguments of :func:`control_text`, for "control" only. Raise ModelError for an
+    `band` [rad/s] and `order` are passed to :func:`control_text` and apply to "control" only. Raise ModelError for an
     unknown tool, a missing band, or a model that the tool cannot represent.
     """
     if to == "json":
@@ -314,7 +314,8 @@ def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
 def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...], Floats, Floats]:
     """Return the filtered signals, and numerator and denominator of the sensor filter in descending powers of s.
 
-    Without a filter, they are () and 1. Raise ModelError if an input is filtered, or an order is fractional.
+    Without a filter, return () for the signals and 1 for both polynomials. Raise ModelError if an input is filtered, or
+    an order is fractional.
     """
     sensor = model.structure.sensor_filter
     if sensor is None:
@@ -332,7 +333,8 @@ def _filter_output(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return state-space matrices in which the filter top / bottom is applied to one output, in observer form.
 
-    `output` is the index of the output. `top` and `bottom` are coefficients in descending powers, of equal number.
+    `output` is the index of the output. `top` and `bottom` are coefficients in descending powers and have the same
+    length.
     """
     count, own = bottom.size - 1, a.shape[0]
     top, bottom = top / bottom[0], bottom / bottom[0]
@@ -352,13 +354,13 @@ def _sample_system(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return discrete-time state-space matrices for zero-order-hold inputs with delays [s], which become states.
 
-    For a delay that is not a multiple of the step, the last two values of the input act within an interval (Åström and
-    Wittenmark, Computer-Controlled Systems, section 2.3).
+    For a delay that is not a multiple of the step, two successive values of the input act within each sampling interval
+    (Åström and Wittenmark, Computer-Controlled Systems, section 2.3).
     """
     expm = importlib.import_module("scipy.linalg").expm
 
     def hold(column: Floats, seconds: float) -> tuple[Floats, Floats]:
-        """Return the state-transition matrix over a duration [s], and the state after a unit input of this duration."""
+        """Return the state-transition matrix over a duration [s], and the zero-state response to a unit input."""
         whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
         return whole[:-1, :-1], whole[:-1, -1:]
 
@@ -471,7 +473,7 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
 
 
 def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
-    """Return, for each output, a common monic denominator and the numerators of all inputs for it.
+    """Return, for each output, a common monic denominator and the numerator of each input over it.
 
     `tops` and `bottoms` are numerators and denominators by output and input, with the highest power first.
     """

@@ -203,7 +203,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
         Angular frequencies [rad/s], shape (W,), finite and nonnegative.
     coupling
         ``"simulated"``: coupled equations, with all signals except the outputs as inputs. ``"measured"``: each equation
-        alone, with the other outputs among its inputs (in the order of ``model.structure.signals``).
+        alone, with the other outputs among its inputs (in the sequence of ``model.structure.signals``).
     sensor
         Whether the sensor filter is included: the response of a filtered output is multiplied by the filter, and the
         response to a filtered input is divided by it.
@@ -381,8 +381,8 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], fr
 def linear_part(model: Model) -> Model:
     """Return the model without friction, saturations and dead zones, with the covariance of the other parameters.
 
-    The result describes small deviations under three conditions. No velocity with friction is 0 or changes sign.
-    These velocities are well above the Stribeck speed. Inputs are between dead zone and saturation.
+    The result describes small deviations under three conditions. Velocities on which friction acts neither are 0 nor
+    change sign. They are well above the Stribeck speed. Inputs are between dead zone and saturation.
     """
     structure, keep = model.structure, list[bool]()
     for item in model.equations:

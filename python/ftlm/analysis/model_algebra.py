@@ -45,7 +45,8 @@ class Ratio:
         """Return the model of this transfer function as an equation.
 
         The order of the numerator may exceed the order of the denominator by at most `improper_order`. Raise ModelError
-        if it is higher, numerator or denominator is 0, or the order of the denominator is not in (0, 10].
+        if it exceeds this limit, if the numerator or denominator is 0, or if the order of the denominator is not in (0,
+        10].
         """
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:

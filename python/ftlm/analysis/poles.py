@@ -272,10 +272,10 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
     Notes
     -----
-    If the orders have a common base q, the roots lambda of the polynomial in s^q are stable for ``|arg lambda| > q
-    pi/2`` (Matignon 1996). Otherwise the argument principle gives the number of zeros of the characteristic function
-    D(s) with positive real parts, (p_max − p_min)/2 − Φ/π. Here Φ is the change of arg D(jω) from ω = 0 to ∞, and p_max
-    and p_min are the highest and lowest power of s in D. Delays of inputs do not affect stability.
+    If the orders have a common base q, the model is stable if every root lambda of the polynomial in s^q has ``|arg
+    lambda| > q pi/2`` (Matignon 1996). Otherwise the argument principle gives the number of zeros of the characteristic
+    function D(s) with positive real parts, (p_max − p_min)/2 − Φ/π. Here Φ is the change of arg D(jω) from ω = 0 to ∞,
+    and p_max and p_min are the highest and lowest power of s in D. Delays of inputs do not affect stability.
     """
     coupled = is_coupled(coupling)
     unstable, on_axis, method = 0.0, False, "poles"
@@ -393,8 +393,8 @@ class Mode:
     Parameters
     ----------
     pole
-        Pole [rad/s]: of a conjugate pair the one with positive imaginary part, of a stable relaxation -1/T with the
-        time constant T.
+        Pole [rad/s]. For a conjugate pair, it is the pole with positive imaginary part. For a stable relaxation with
+        the time constant T, it is -1/T.
     frequency
         Natural frequency abs(pole) [rad/s].
     damping
@@ -513,7 +513,7 @@ def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
 
 
 def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
-    """Return the zeros of a sum of c s^p ln s, slowest first, without s = 0 and with 0 <= Im ln s <= max_argument."""
+    """Return the zeros of a sum of c s^p as ln s, slowest first: s is not 0, and 0 <= Im ln s <= max_argument."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < POWER_TOLERANCE:
@@ -544,7 +544,7 @@ def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_A
 
 
 def _rounded_order_zeros(polynomial: Polynomial, base: float, max_argument: float) -> Complex:
-    """Return initial guesses for zeros as ln s, the roots of the sum with orders rounded to multiples of a base."""
+    """Return initial guesses for zeros, as ln s: the zeros after rounding the orders to multiples of a base."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
         near = round(round(power / base) * base, 9)
@@ -737,7 +737,7 @@ def dcgain(model: Model) -> Floats:
     -------
     ndarray, shape (outputs, inputs)
         Gains in SI units of output over input. A gain is 0 if the input does not affect the output or its effect
-        decays, and infinite if the input is integrated. Inputs have the order of
+        decays, and infinite if the input is integrated. Inputs have the same sequence as in
         :func:`ftlm.analysis.transfer_functions`.
 
     Raises
@@ -756,8 +756,9 @@ def dcgain(model: Model) -> Floats:
 def settling_time(model: Model) -> float:
     """Return a duration for response charts [s]: six time constants of the slowest mode plus the longest delay.
 
-    A time constant counts as at most twenty periods of its mode. Without the delay, the duration is at most fifty
-    periods of the fastest oscillation, so that a chart resolves this oscillation. A model without modes gives 10 s.
+    The time constant of each mode is limited to twenty periods of the mode. Without the delay, the duration is at most
+    fifty periods of the fastest oscillation, so that a chart resolves this oscillation. A model without modes gives 10
+    s.
     """
     model_modes = modes(model)
     if not model_modes:

@@ -38,7 +38,7 @@ PADE_ACCURATE_ANGLE = 5.7
 
 
 def identifier(name: str) -> str:
-    """Return an identifier for a name that is valid in MATLAB, Python and python-control."""
+    """Return a name converted to an identifier that is valid in MATLAB, Python and python-control."""
     plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"x_{plain}"
 
@@ -148,7 +148,7 @@ def _filter_signal(
 ) -> _Signal:
     """Apply Oustaloup's filter for s^power to a signal, with one state per pole, and return the filtered signal.
 
-    `states` has the time derivative of each state; those of the states of the filter are appended.
+    `states` contains the time derivative of each state. The derivatives of the new filter states are appended to it.
     """
     roots, residues, gain = oustaloup(power, band, order)
     parts = [(gain, signal)]
@@ -232,7 +232,7 @@ def state_space_matrices(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the state-space matrices A, B, C and D of a model with coupled equations.
 
-    Inputs have the order of :func:`response_inputs`.
+    Inputs have the sequence of :func:`response_inputs`.
 
     Parameters
     ----------

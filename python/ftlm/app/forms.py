@@ -85,7 +85,7 @@ class RunSource:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """Request of a fit, which completely defines it: runs, structure and options.
+    """Complete definition of a fit that the user requests: runs, structure and options.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """Model of a fit with its estimation run, validation run, validation, structure selection and Python script."""
+    """Identification with its estimation run, validation run, validation result, structure selection and script."""
 
     result: Identification
     run: Run
@@ -314,7 +314,7 @@ def parse_structures(request: FitRequest) -> list[Structure]:
 
 
 def split_time(rows: int, step: float, share: float) -> float:
-    """Return the time [s] that splits a run of `rows` samples so that the fraction `share` of them follows it."""
+    """Return the time [s] at which to split a run of `rows` samples so that its last part has the fraction `share`."""
     return float(f"{round(rows * (1.0 - share)) * step:.9g}")
 
 
@@ -440,7 +440,7 @@ def _plain_text(_: str, text: str) -> str:
 
 
 def _parse_line_count(name: str, text: str) -> int:
-    """Return the number of lines in the text of the form field `name`; raise DataError for other text."""
+    """Return the line count that is given as text in the form field `name`; raise DataError for other text."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise DataError(f"{name}: {text[:40]!r} is not a number of lines; write one such as 2")
     return int(text)

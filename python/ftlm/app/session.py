@@ -60,7 +60,7 @@ class File:
     error
         Reason why the file cannot be read; empty otherwise.
     version
-        Number of completed readings, by which the page detects changes.
+        Number of times that the file was read, by which the page detects changes.
     task
         Worker process that reads the file; None if it is not being read.
     """
@@ -229,7 +229,7 @@ class Session:
         return job
 
     async def open(self, file: File) -> None:
-        """Read the preview of a file with the options of the user; a reading in progress is stopped first."""
+        """Read the preview of a file with the options of the user; a read that is in progress is stopped first."""
         if file.task is not None:
             file.task.stop()
         request = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}

@@ -157,7 +157,7 @@ def _worst_fit(item: Model) -> float:
 
 
 def state(session: Session) -> dict[str, Any]:
-    """Return the versions of all files, and version, phase and progress of all models, by key. The page polls it."""
+    """Return the versions of all files, and version, phase and progress of all models, by key, for polling."""
     return {
         "files": {f.key: f.version for f in session.files.values()},
         "models": {
@@ -221,7 +221,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
 
 
 def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
-    """Return title, caption, and SVG markup for wide and narrow screens of at most `MAX_FIGURES` figures."""
+    """Return the title, caption, and SVG markup (wide and narrow) of each of the first `MAX_FIGURES` figures."""
     return [
         {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.note}
         for f in figures[:MAX_FIGURES]

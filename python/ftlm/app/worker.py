@@ -56,7 +56,7 @@ class Reports(Progress):
         self.send(phase=words)
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Report completed and total parts, at most once per `REPORT_INTERVAL_S` except at the end."""
+        """Report completed and total parts, at most once per `REPORT_INTERVAL_S` except at the end; ignore `pruned`."""
         now = time.monotonic()
         if now - self._last >= REPORT_INTERVAL_S or count >= total:
             self._last = now

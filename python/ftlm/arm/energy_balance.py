@@ -56,8 +56,8 @@ class Power:
 class Energies:
     """Energies, generalized forces and powers of one joint of the arm at the samples of a run.
 
-    Equation numbers are those of the paper. Index 1 is the hub and index 2 the link: stiffness K_s, frictions B_1 and
-    B_2, orders gamma_1, beta_2 and mu_2. Arrays have shape (N,).
+    Equation numbers are those of the paper. Index 1 is the hub and index 2 the link. K_s is the stiffness, B_1 and B_2
+    are friction coefficients, and gamma_1, beta_2 and mu_2 are orders. Arrays have shape (N,).
 
     Parameters
     ----------

@@ -305,8 +305,9 @@ def flexible_link(
         Filter that the deflections have passed in the measurement. ``"stock"`` is the 2 Hz low-pass of the arm's stock
         real-time model on both deflections.
     offset
-        ``"constant"`` or ``"ramp"``: an unknown constant, or a constant and a linear drift, in each equation and run,
-        such as from a current offset; see :func:`ftlm.equation`.
+        Unknown offset of each run; see :func:`ftlm.equation`. ``"constant"``: a constant in each equation, such as from
+        a current offset. ``"ramp"``: a constant and a linear drift in each equation. ``"level"``: a constant that is
+        added to each output.
 
     Returns
     -------
@@ -439,8 +440,8 @@ def _joint_equations(
 ) -> tuple[Equation, Equation]:
     """Return (hub equation, deflection equation) of one joint.
 
-    `law` are the orders by the order law. They are used if `laws` contains "orders"; otherwise each order is a
-    separate free order. `friction` adds the linear Coulomb term.
+    `law` contains the orders that :func:`order_law` returns. They are used if `laws` contains "orders"; otherwise each
+    order of the equations is a separate free order. `friction` adds the linear Coulomb term.
     """
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
@@ -492,11 +493,12 @@ def _add_cross_inertia(
 ) -> tuple[Equation, Equation]:
     """Return (hub equation, deflection equation) of a joint with added accelerations of the other joint.
 
-    The terms follow from the kinetic energy T of the planar arm, with the absolute rates in eq. (8) of the paper:
-    T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
-    w_3 = w_2 + D theta_21 and w_4 = w_3 + D theta_22. J_12 includes all masses beyond link 1, at its tip. H is the
-    length of link 1 times the first moment of mass of link 2. The equation of hub 1 gets no terms, because its
-    difference from that of link 1 has none of joint 2. `both` states whether the other joint is modeled too.
+    The terms follow from the kinetic energy T of the planar arm, with the absolute rates in eq. (8) of the paper: T =
+    (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12, w_3
+    = w_2 + D theta_21 and w_4 = w_3 + D theta_22. J_12 includes all masses beyond link 1, at its tip. H is the length
+    of link 1 times the first moment of mass of link 2. The equation of hub 1 gets no terms: accelerations of joint 2
+    cancel in it, because it is the difference of the Lagrange equations of theta_11 and theta_12. `both` states whether
+    the other joint is modeled too.
     """
     h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
     oh, od = 2 * other - 1, 2 * other
@@ -525,12 +527,13 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
 def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
     """Return the structure of a deflection by eq. (15) of the paper, with the measured hub angle as input.
 
-    Elasticity and damping have free orders, and effects of hub angle and offset on the strain gauge are included. If
-    both joints are measured (`both`), so are the accelerations of the other joint, and with `rate` the rate of its
-    deflection. `filtered` states whether deflections passed the stock 2 Hz low-pass.
+    Elasticity and damping have free orders. The effect of the hub angle on the strain gauge and the offset of the gauge
+    are included. If both joints are measured (`both`), the equation also contains the accelerations of the other joint
+    and, if `rate` is True, the rate of its deflection. `filtered` states whether deflections passed the stock 2 Hz
+    low-pass.
 
-    Initial conditions are those of Caputo derivatives. A history before the run would give fractional orders more
-    parameters on the validation run than integer orders.
+    Initial conditions are those of Caputo derivatives. With a history before the run, a model of fractional orders
+    would have more free initial terms on the validation run than a model of integer orders.
     """
     structure = flexible_link(
         stage=stage,

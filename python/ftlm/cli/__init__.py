@@ -40,7 +40,7 @@ driven_by : OUTPUT=SIGNAL,…
 Method
 ------
 m
-    Block pulses per run; default 2048, or as many as fit.
+    Block pulses per run; default 2048, fewer for short runs.
 threads
     Number of threads; default FTLM_THREADS, or all cores.
 bounds : NAME=LOW:HIGH

@@ -69,7 +69,7 @@ LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
 
 
 def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure | None:
-    """Return the first of the given structures, or None for ``auto``, before any run is read.
+    """Check structures before any run is read, and return the first of them, or None for ``auto``.
 
     Raise ModelError for a structure that is invalid for every run. ``auto`` must be the only structure; of the options
     of a structure, only --delay and --only can be combined with it.
@@ -101,8 +101,8 @@ def select_structure(
 ) -> Selection:
     """Select a structure with a progress bar, and return the selection.
 
-    `shape` is used for ``"auto"`` only: its delays, and its output if it names one. `driven_by` has texts
-    of the form OUTPUT=SIGNAL,…
+    Of `shape`, only the delays and the option --only are used, and only for ``"auto"``. `driven_by` contains texts of
+    the form OUTPUT=SIGNAL,…
     """
     automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
     drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
@@ -396,7 +396,7 @@ def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
 
 
 def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print results, by the name of the output or search, as text or JSON."""
+    """Print results, given by name of their output or search, as text or JSON."""
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
@@ -432,12 +432,12 @@ def resume(
     threads: int | None = None,
     as_json: bool = False,
 ) -> None:
-    """Resume the searches of a checkpoint file and print them; no other file is needed.
+    """Resume the searches of a checkpoint file and print their results; no other file is needed.
 
     Options
     -------
     recover
-        Continue a corrupt file; the corrupt one is kept beside it.
+        Continue a damaged file; a copy of the damaged file is kept.
     """
     results = {}
     with resumable(store), Store(store, recover=recover) as open_store:
@@ -612,7 +612,7 @@ def select(
     Method
     ------
     validation : runs|blocks|FILE
-        Cross-validate over runs or quarters (blocks), or on a run.
+        Cross-validate over runs or quarters (blocks); or use a run.
 
     Output
     ------

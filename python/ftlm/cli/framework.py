@@ -302,7 +302,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     Positional parameters become arguments, and keyword-only parameters become options. Their help texts are in the
     docstring of the function. Options that several commands share have their help in the docstring of ``ftlm.cli``. A
     dataclass parameter is expanded: each field becomes an option, and the function receives the dataclass. If the
-    dataclass has a function `methods_of`, it returns the methods that use an option.
+    dataclass has a function `methods_of`, this function returns the names of the estimation methods that use an option.
 
     An error becomes one line on standard error and an exit code. An output file that already exists is an error unless
     `force` is set.

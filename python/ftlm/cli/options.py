@@ -194,10 +194,10 @@ class StructureOptions:
     def _arm(self, text: str, alone: bool) -> Structure:
         """Return the structure of the link deflections of the real arm, with all angles as inputs.
 
-        All orders are integer except the order of the elastic term. If `alone` is True, for one link with the other
-        joint locked, the order of the damping term is free instead. This improved the fit on validation runs. The
-        offset of each run is the zero of the strain gauge. The initial conditions are the angle and velocity of the
-        link by default, because terms of nearly integer order have little memory.
+        Only the order of the elastic term is free. If `alone` is True (one link, with the other joint locked), only the
+        order of the damping term is free. These choices improved the fit on validation runs. The offset of each run is
+        the zero of the strain gauge. The initial conditions are the angle and velocity of the link by default, because
+        terms of nearly integer order have little memory.
         """
         wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if wrong:

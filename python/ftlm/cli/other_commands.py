@@ -37,7 +37,7 @@ def demo(
     verbose: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Simulate both joints of the arm, identify each equation with p = 1, 3, 5, 7, and write models and charts.
+    """Simulate both joints of the arm, identify them with innovation lengths 1, 3, 5, 7, and write models and charts.
 
     The paper's order grid has the increment 0.05, which takes minutes.
 

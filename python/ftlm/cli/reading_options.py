@@ -143,7 +143,7 @@ class ReadingOptions:
 
 
 def given_fields(*records: Any) -> dict[str, Any]:
-    """Return the fields of option dataclasses that are not None, which the user set, by name."""
+    """Return the options that the user set, by name: the fields of the given dataclasses that are not None."""
     return {
         f.name: getattr(record, f.name)
         for record in records

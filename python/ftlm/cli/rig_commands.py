@@ -256,9 +256,10 @@ def record(
 
 
 def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
-    """Return a callback (count, total) in samples for the progress bar.
+    """Return a callback that updates the progress bar from (recorded samples, total samples).
 
-    With a streaming estimator it also prints the estimate once per second of the run. `rate` is the sampling rate [Hz].
+    With a streaming estimator, the callback also prints the estimate once per second of the run. `rate` is the sampling
+    rate [Hz].
     """
     due = 1.0
 

@@ -36,7 +36,7 @@ def same_rate(first: float, second: float) -> bool:
 def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of chosen outputs; all outputs if the choice is None.
 
-    Raise ModelError if a name is unknown or repeated, or the choice is empty. `what` is the argument in the message.
+    Raise ModelError if a name is unknown or repeated, or the choice is empty. `what` names the argument in the message.
     """
     if choice is None:
         return outputs
@@ -87,7 +87,7 @@ def check_samples(samples: object, seed: object) -> tuple[int, int]:
 def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
     """Return the coefficient of each output in a sum such as "theta11 + theta12", shape (outputs,).
 
-    Raise ModelError if a term is not an output. `what` is the argument in the message.
+    Raise ModelError if a term is not an output. `what` names the argument in the message.
     """
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:

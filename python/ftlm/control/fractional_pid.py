@@ -210,7 +210,7 @@ class DiscretePid:
         ]
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Return the frequency response of the discrete-time controller at w [rad/s], shape (W,); no saturation."""
+        """Return the frequency response of the unsaturated discrete-time controller at w [rad/s], shape (W,)."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
@@ -362,10 +362,10 @@ class PidDesign(LoopDesign):
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return the frequency responses of the controller at w [rad/s] that a loop analysis requires.
+        """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
-        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
-        (outputs, W), and the response of the command to the reference, shape (W,).
+        The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
+        is its response to the reference, shape (W,).
         """
         response = DiscretePid(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
@@ -440,15 +440,17 @@ def fractional_pid(
     ModelError
         If the model is unstable (an integrator is permitted), has friction, or is too uncertain. It is too uncertain if
         for more than 5 % of the parameter samples the loop is unstable or has less than half the phase margin. Also if
-        no nonnegative gains meet the requirements, or only with another crossover above the requested one.
+        no nonnegative gains meet the requirements, or if all loops that meet them have a second crossover above the
+        requested one.
 
     Notes
     -----
     At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the three
-    gains and are met exactly. Orders are admissible if their maximum sensitivity over the parameter samples is at most
-    1.5, or if no orders achieve this, within 5 % of the smallest. Among them, those with the largest loop gain at a
-    tenth of the crossover are selected. If their loop has another crossover at a higher frequency, only orders without
-    one are compared. Source: Monje, Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
+    gains and are met exactly. Orders are admissible if the maximum sensitivity of their loop over the parameter samples
+    is at most 1.5. If no orders achieve this, orders within 5 % of the smallest maximum sensitivity are admissible.
+    Among them, those with the largest loop gain at a tenth of the crossover are selected. If their loop has another
+    crossover at a higher frequency, only orders without one are compared. Source: Monje, Vinagre, Feliu and Chen
+    (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
@@ -561,9 +563,9 @@ def _best(
 ) -> FractionalPid | None:
     """Return the controller with the largest low-frequency gain among those that meet all conditions; None without one.
 
-    The controller has the value `target` at the frequency `wc` [rad/s], and there the phase slope `slope` of the plant
-    is compensated. `curves` are the plant responses at the frequencies `w`, one row per parameter sample, with which
-    the sensitivity is evaluated.
+    At the frequency `wc` [rad/s], the controller has the response `target`, and its phase slope is minus the phase
+    slope `slope` of the plant. `curves` are the plant responses at the frequencies `w`, one row per parameter sample.
+    They determine the maximum sensitivity of the loop.
     """
     candidates: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
@@ -587,7 +589,7 @@ def _best(
 def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
     """Return the controller C with orders lam and mu, C(j wc) = target and d arg C/dw = -slope at wc [rad/s].
 
-    None if a gain is negative or not finite, or if the equations are singular.
+    Return None if a gain is negative or not finite, or if the equations are singular.
     """
     powers = np.array([0.0, -lam, mu])
     parts = (1j * wc) ** powers
@@ -605,7 +607,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
 
 
 def least_certain_parameter(model: Model) -> str:
-    """Return text that names the coefficient or order with the largest relative standard error, and this error."""
+    """Return text on the coefficient or order with the largest relative standard error, or on a missing covariance."""
     covariance = covariance_of(model)
     if covariance is None:
         return "their covariance is not known"

@@ -293,7 +293,7 @@ def _zv_samples(mode: Mode, step: float) -> Floats:
 def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) -> float | None:
     """Return the largest residual vibration over the 95 % intervals of frequency and damping of the modes.
 
-    None if no mode has intervals.
+    Return None if no mode has intervals.
     """
     worst: float | None = None
     for mode in modes:

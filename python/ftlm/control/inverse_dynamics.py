@@ -45,10 +45,10 @@ class Loop(Protocol):
         """Plants from the manipulated input of the loop, one per output."""
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return the frequency responses of the controller at w [rad/s].
+        """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
-        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
-        (outputs, W), and the response of the command to the reference, shape (W,).
+        The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
+        is its response to the reference, shape (W,).
         """
 
 
@@ -190,8 +190,8 @@ def inverse_dynamics(
         If the path is invalid.
     ModelError
         If the command exceeds the limit, the reference would have to start before the first row of the path or
-        diverges, or the model is too uncertain. It is too uncertain if the residual vibration may exceed half of that
-        with the path itself as reference.
+        diverges, or the model is too uncertain. It is too uncertain if the 97.5 % quantile of the residual vibration
+        exceeds half of the residual vibration with the path itself as reference.
 
     Notes
     -----
@@ -273,8 +273,8 @@ def inverse_dynamics(
 def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,).
 
-    Raise DataError if it has another shape, a length outside 16 to 100 000, no move, a value that is not finite or too
-    large, or no rest at an end.
+    Raise DataError if the path is not one-dimensional, has fewer than 16 or more than 100 000 rows, contains a value
+    that is not finite or too large, is constant, or is not at rest at both ends.
     """
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
@@ -297,5 +297,5 @@ def _path(path: ArrayLike) -> Floats:
 
 
 def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
-    """Return the RMS deviation of an output from a path `rows` from the row with index `ends` on."""
+    """Return the RMS deviation of an output from the path `rows`, over index `ends` and all later samples."""
     return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))

@@ -72,8 +72,8 @@ class Observer:
     def over(self, run: Run) -> dict[str, Floats]:
         """Return estimates of each output and of the input disturbance over a run, one array per name.
 
-        The estimate at a sample uses this and earlier samples. The filter starts at rest. If the model has an
-        integrator, it starts in the equilibrium in which a measured output has its first measured value.
+        The estimate at a sample uses this and earlier samples. The filter starts at rest or, if the model has an
+        integrator, in the equilibrium in which one measured output has its first measured value.
 
         Raises
         ------
@@ -301,7 +301,7 @@ class Lqg:
     ------
     ModelError
         If the feedback has the wrong shape or is not finite, the limit is not positive, or the output has no
-        equilibrium. When called, if the command is not finite.
+        equilibrium. Also, on a call of the controller, if the command is not finite.
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
@@ -341,7 +341,7 @@ class Lqg:
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """Return the command from the measured outputs of one sample and the reference of the tracked output.
 
-        The measured outputs are in the order of `observer.measured`. Raise ModelError if the command is not finite.
+        The measured outputs are in the sequence of `observer.measured`. Raise ModelError if the command is not finite.
         """
         y = _measured_values(self.observer, measured)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -358,9 +358,9 @@ class Lqg:
         return self._applied
 
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
-        """Return the frequency responses of the command at w [rad/s], without saturation.
+        """Return the frequency responses of the unsaturated command to measured outputs and reference at w [rad/s].
 
-        The first is to the measured outputs, shape (measured outputs, W), the second to the reference, shape (W,).
+        The response to the measured outputs has shape (measured outputs, W), the response to the reference (W,).
         """
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         a, into = self._transition_matrices()
@@ -436,10 +436,10 @@ class LqgDesign(LoopDesign):
         return self.realization.rate
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return the frequency responses of the controller at w [rad/s] that a loop analysis requires.
+        """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
-        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
-        (outputs, W), and the response of the command to the reference, shape (W,).
+        The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
+        is its response to the reference, shape (W,).
         """
         feedback_response, reference_response = self.controller.response(w)
         return self.controller.observer.measured, -feedback_response, reference_response

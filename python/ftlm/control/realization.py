@@ -218,7 +218,7 @@ def _basis(s: Complex, poles: Complex) -> Complex:
 
 
 def _system(poles: Complex) -> tuple[Floats, Floats]:
-    """Return matrices (a, b) of a real system whose states respond to the input by the columns of :func:`_basis`."""
+    """Return (a, b) of a real system whose responses from input to states are the columns of :func:`_basis`."""
     size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
     a, b = np.zeros((size, size)), np.zeros((size, 1))
     at = 0
@@ -237,8 +237,8 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
     """Fit a system with common poles to the responses `exact`, shape (outputs, points), at the points s.
 
     `integrates` states for each output whether it has an integrator, and `poles` are the initial poles. Return (poles,
-    residues, whether there is an integrator). Residues have one row per output. Their first column belongs to the
-    integrator, 0 without one.
+    residues, whether there is an integrator). Residues have one row per output. Their first column contains the
+    residues of the integrator, 0 for an output without one.
     """
     weight = 1.0 / np.abs(exact)
     for _ in range(MAX_POLE_ITERATIONS):

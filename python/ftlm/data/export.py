@@ -90,7 +90,7 @@ def arguments_from_frame(
 
 
 def _check_index_step(step: float, label: str, index: tuple[Hashable, object]) -> None:
-    """Raise DataError if a given step [s] contradicts the index of a frame, which is a time."""
+    """Raise DataError if a given step [s] contradicts the time index of a frame."""
     dated, unit = as_seconds(index[1], label), split_time_header(str(index[0]))[1] or "s"
     if dated is not None:
         check_step_agrees(step, dated[0], label)
@@ -180,10 +180,10 @@ OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were r
 
 
 class Header(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Header of a run file written by ftlm: the text ``VERSION JSON``; the keys of the JSON object are the fields.
+    """Header of a run file written by ftlm, stored as the text ``VERSION JSON`` with its fields as a JSON object.
 
-    It is the first line of a csv file, or metadata of a parquet file. Fields are those of :class:`ftlm.Run`; `about` is
-    its metadata, and `missing` has the names of outputs with missing samples.
+    It is the first line of a csv file, or metadata of a parquet file. Fields are those of :class:`ftlm.Run`, except
+    that `about` is the metadata of the run, and `missing` contains the names of outputs with missing samples.
     """
 
     name: str
@@ -290,7 +290,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> Non
 
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:
-    """Return the SHA-256 digest of the header and the columns of a run; the isolated reader verifies it."""
+    """Return the SHA-256 digest of header and columns of a run, which the reader of parquet files verifies."""
     digest = hashlib.sha256(header.encode())
     for name, values in columns.items():
         digest.update(f"\0{name}\0{len(values)}\0".encode())

@@ -32,7 +32,7 @@ class FrequencyData:
     Parameters
     ----------
     frequency
-        Angular frequencies [rad/s], shape (N,), finite, above 0, in the order of the file.
+        Angular frequencies [rad/s], shape (N,), finite, above 0, in the sequence of the file.
     response
         Complex response, shape (N,), finite: output over input.
     deviation

@@ -643,7 +643,7 @@ class Run:
         Parameters
         ----------
         names : iterable of str
-            Signals to keep, in this order within inputs and outputs; at least one output.
+            Signals to keep, at least one output. Inputs and outputs of the returned run have this sequence.
 
         Returns
         -------

@@ -17,7 +17,7 @@ MAX_CACHED_RESULTS = 8
 def check_compatible(runs: Iterable[Run]) -> None:
     """Raise DataError if there is no run, or if runs differ in inputs, outputs or units.
 
-    Runs may differ in step, length, intersample behavior, and in the order in which their signals are listed.
+    Runs may differ in step, length, intersample behavior, and the sequence of their signals.
     """
     every = list(runs)
     if not every:

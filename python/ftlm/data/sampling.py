@@ -175,7 +175,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
-    """Raise DataError if lengths differ; the message names the first column without the most frequent length."""
+    """Raise DataError if lengths differ; the message names the first column of another length than most columns."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -266,7 +266,7 @@ def regular_step(
     resolution
         Rounding error of the times [s].
     stated_step
-        Step in the header of the file [s], which is then returned; None if it states none.
+        Step stated in the header of the file [s], which is returned unchanged; None if the header states none.
 
     Raises
     ------
@@ -334,8 +334,9 @@ def check_step_agrees(step: object, clock: Floats, thing: str) -> None:
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
     """Return the decimal with the fewest digits that agrees with the mean step, or the mean step if there is none.
 
-    A decimal agrees if `count` steps of this length differ from `count` mean steps by at most `rounding` [s]. If its
-    relative difference from the mean step is at most 1e-9, a total difference up to `observed` [s] is accepted.
+    A decimal agrees if the total length of `count` such steps differs from that of `count` mean steps by at most
+    `rounding` [s]. The limit is `observed` [s] for a decimal whose relative difference from the mean step is at most
+    1e-9.
     """
     for digits in range(12):
         short = float(f"{mean:.{digits}e}")
@@ -348,8 +349,8 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
 def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
     """Return the index of the first row inside a data window, and the index after its last row.
 
-    `window` is a pair of times [s] since the first row, or None for an open end. Raise DataError if it is invalid or
-    contains no row.
+    `window` is a pair of times [s] since the first row; a time of None marks an open end. Raise DataError if the window
+    is invalid or contains no row.
     """
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
         raise DataError(

@@ -47,8 +47,8 @@ Optimizer = Callable[["CircuitProblem", Floats], tuple[Floats, float]]
 class CircuitProblem(ResponseProblem):
     """Estimation problem of a circuit: its free parameters and the measured impedances.
 
-    The optimizer varies the logarithm of each positive parameter (resistance, capacitance, time constant), which cannot
-    become negative. Exponents are varied directly.
+    The optimizer varies the logarithm of each positive parameter (resistance, capacitance, time constant), so that the
+    parameter cannot become negative. Exponents are varied directly.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class CircuitProblem(ResponseProblem):
         return dict(zip(self.names, self.in_seconds(self.initial_guesses()[0]).tolist(), strict=True))
 
     def sort_groups(self, values: Floats) -> Floats:
-        """Return the parameters with identical parallel groups in series ordered from the fastest to the slowest.
+        """Return the parameters with identical parallel groups in series sorted from the fastest to the slowest.
 
         An exchange of two such groups does not change the impedance. The frequency of the peak of -Im Z determines
         which group is faster.

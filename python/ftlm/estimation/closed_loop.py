@@ -31,7 +31,7 @@ MIN_FIRST_STAGE_F = 10.0
 
 
 def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[Finding]]:
-    """Return runs with inputs projected on past values of the reference, and findings on weak instruments.
+    """Return runs with inputs projected on present and past reference values, and findings on weak instruments.
 
     In a closed loop, a linear filter maps the reference to each input. Least squares over all runs fit this filter, as
     in the first step of the two-stage method. The projection contains no noise that feedback carries into the input.
@@ -101,7 +101,8 @@ def past_regressors(signal: Floats, first: int, max_lag: int, *, dense: int = DE
     Lags from ``first`` to ``dense`` each give one regressor. Longer lags up to ``max_lag`` are averaged in blocks of
     growing length. Each regressor has the length of the signal.
 
-    Samples before the first one equal it. ``max_lag`` may be at most the length of the signal.
+    Samples before the start of the signal are assumed to equal the first sample. ``max_lag`` may be at most the length
+    of the signal.
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
@@ -130,9 +131,10 @@ def first_stage_f(explained: Sequence[Floats], residuals: Sequence[Floats], coef
 
 
 def _columns(references: Sequence[Floats], shortest: int, dense: int) -> Floats:
-    """Return a regressor matrix for all runs: past reference samples, then one constant column per run.
+    """Return a regressor matrix for all runs: present and past reference samples, then one constant column per run.
 
-    Lags reach to half the length `shortest` of the shortest run, and up to `dense` each has its own column.
+    The largest lag is half of `shortest`, the length of the shortest run. Each lag up to `dense` has its own column,
+    and larger lags share columns.
     """
     parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in references]
     levels = np.repeat(np.eye(len(references)), [r.size for r in references], axis=0)

@@ -22,7 +22,7 @@ FitType = TypeVar("FitType")
 
 
 def check_intervals(bounds: object, *, finite: bool = False) -> None:
-    """Raise ModelError unless `bounds` maps names to pairs lower < upper, which must be finite with `finite`."""
+    """Raise ModelError unless `bounds` maps names to pairs lower < upper. `finite` excludes infinite bounds."""
     if not isinstance(bounds, Mapping):
         raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():
@@ -85,9 +85,10 @@ def fit_within_bounds(
 ) -> tuple[FitType, list[Finding]]:
     """Return the fit of a structure with its coefficients within bounds, and a finding on each active bound.
 
-    An active-set method fixes coefficients beyond their bounds at the bounds. Then it frees each of them in turn and
-    fits again from the bound. The refit is kept if it satisfies all bounds. `fit` takes a structure and the only
-    initial guess, or None for automatic ones, and returns a fit and its estimates by name.
+    An active-set method fixes coefficients beyond their bounds at the bounds. Then it frees each fixed coefficient in
+    turn and fits again, starting from the bound. The refit is kept if it satisfies all bounds. `fit` is called with a
+    structure and its only initial guess, or None for automatic initial guesses. It returns a fit and its estimates by
+    name.
     """
 
     def violations(values: Mapping[str, float]) -> dict[str, float]:

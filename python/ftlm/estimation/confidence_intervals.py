@@ -156,10 +156,10 @@ def profile_intervals(
     threads, progress
         Number of threads, and a callback with (bounds found, total bounds).
     budget
-        Two numbers of simulations: the maximum for all bounds together, and the remainder below which no further bound
-        is searched. None for no limit.
+        Limits on the number of simulations: the maximum total, and the number of remaining simulations below which the
+        search for a further bound is not started. None for no limit.
     evaluations
-        Maximum number of evaluations with which the optimum is minimized again before the search.
+        Maximum number of evaluations of a minimization that starts from the optimum before the bounds are searched.
 
     Raises
     ------

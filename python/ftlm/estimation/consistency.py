@@ -73,7 +73,8 @@ class Consistency(ReportMixin):
     results
         Identification of each segment.
     differences
-        Difference of each parameter between any two segments, largest first.
+        Difference of each parameter between any two segments, those with disjoint intervals first, then by decreasing
+        size.
     distance, degrees
         Chi-squared statistic of all parameters about their common weighted mean, and its degrees of freedom under one
         common model. None for a method without covariance.
@@ -109,7 +110,7 @@ class Consistency(ReportMixin):
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """Names of the parameters that at least one segment does not identify, in the order of `differences`."""
+        """Names of the parameters that at least one segment does not identify, in the sequence of `differences`."""
         return tuple(dict.fromkeys(d.name for d in self.differences if math.isnan(d.difference_in_errors)))
 
     @property
@@ -275,7 +276,7 @@ def _cell(value: Cell) -> str:
 
 
 def values_of(result: Identification) -> dict[str, float]:
-    """Return the estimates of all parameters that have a standard error, by name."""
+    """Return the estimates of all parameters that the user did not fix, by name."""
     return {n: p.value for n, p in result.parameters.items() if not p.fixed}
 
 
@@ -293,9 +294,9 @@ def consistency(
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
-    If the structure is right, every segment gives the same parameters within their errors. Segments are inconsistent
-    in two cases. The 95 % intervals of one parameter do not overlap, or a chi-squared test of all parameters rejects
-    common values at 99 %. Then the plant changed, or the structure lacks an effect that only some segments excite.
+    If the structure is right, every segment gives the same parameters within their errors. Segments are inconsistent if
+    the 95 % intervals of one parameter do not overlap, or if a chi-squared test of all parameters rejects common values
+    at 99 %. Then the plant changed, or the structure lacks an effect that only some segments excite.
 
     Parameters
     ----------
@@ -390,7 +391,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
 
 
 def _shift_rows(samples: Floats, rows: int) -> Floats:
-    """Return samples delayed by a number of rows, or advanced if negative; end values fill the gap."""
+    """Return samples delayed by `rows` samples, or advanced if `rows` is negative; end values fill the gap."""
     at = np.clip(np.arange(samples.size) - rows, 0, samples.size - 1)
     return np.asarray(samples[at])
 
@@ -422,7 +423,7 @@ def _segment_names(pieces: Sequence[Run]) -> list[str]:
 def _cross_validated_fit(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
     """Return the fit in percent, by output, of one segment's model on another segment; {} if the simulation fails.
 
-    Initial conditions are those identified on the other segment.
+    The simulation uses the initial conditions that were identified on the segment `piece`.
     """
     if result is own:
         return dict(result.fit)
@@ -434,7 +435,7 @@ def _cross_validated_fit(result: Identification, piece: Run, own: Identification
 
 
 def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
-    """Return the differences of each parameter between any two segments, largest first, NaN last."""
+    """Return the differences of each parameter between any two segments, most significant first."""
     out = []
     for places in itertools.combinations(range(len(results)), 2):
         pair = [results[k] for k in places]
@@ -477,8 +478,8 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     """Return the chi-squared statistic of all parameters about their weighted mean, and its degrees of freedom.
 
     Parameters whose interval in some segment is not close to the Wald interval are omitted, because their covariance is
-    inaccurate. Parameters are scaled by their standard errors, so that units do not affect the numerical rank. Without
-    a covariance or such parameters, the result is (None, 0).
+    inaccurate. Parameters are scaled by their standard errors, so that units do not affect the numerical rank. The
+    result is (None, 0) if a segment has no joint fit, or if no parameter remains.
     """
     joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):

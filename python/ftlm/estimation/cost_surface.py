@@ -61,8 +61,8 @@ def output_error_landscape(
     orders
         Names of the two orders; by default the most correlated ones.
     refit
-        Whether the other parameters are minimized at each grid point, to first order; otherwise they stay at the
-        optimum.
+        Whether the cost at each grid point is minimized over the other parameters, to first order. Otherwise these
+        parameters keep their values at the optimum.
 
     Returns
     -------

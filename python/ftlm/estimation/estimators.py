@@ -62,8 +62,8 @@ def fit_with_instruments(
 ) -> JointFit:
     """Return a joint fit whose output-error residuals are uncorrelated with instruments from noise-free inputs.
 
-    `joint` is the initial fit, to the runs in `answers`. They are the measured `runs` in which each input is replaced
-    by the noise-free part that the reference explains.
+    `joint` is the initial fit to `answers`. These are the measured `runs` in which each input is replaced by the
+    noise-free part that the reference explains.
 
     The residuals belong to the measured runs. The instruments are the sensitivities of the outputs to the parameters,
     computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever the accuracy
@@ -119,8 +119,8 @@ def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], an
     """Return the largest bias that feedback of noise causes in a parameter, in standard errors of the parameter.
 
     `answers` are the runs with inputs from which the part that depends on past residuals is removed. They serve as
-    instruments, and the bias is the first Gauss-Newton step of :func:`fit_with_instruments`. It is infinite if that
-    step cannot be computed.
+    instruments, and the bias is the first Gauss-Newton step of :func:`fit_with_instruments`. The result is infinite if
+    that step cannot be computed.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
@@ -188,9 +188,10 @@ def estimate_output_error(
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
-    `answers` are the runs with each input replaced by the part that a reference explains. They serve as instruments.
-    `begin` is an additional initial guess, completed by the values in `more`. With `alone` it is the only guess.
-    `joint_fit` is a joint fit of the same task, if one was computed before.
+    `answers` are the runs with each input replaced by the part that a reference explains. If given, they serve as
+    instruments. `begin` is an additional initial guess. If it is a model, `more` adds values of parameters that the
+    model lacks. If `alone` is True, no other initial guess is used. `joint_fit` is a joint fit of the same task, if one
+    was computed before.
     """
     # An order with a single grid value is fixed.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -260,7 +261,7 @@ def estimate_output_error(
 
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
-    """Return the covariance of all parameters of the model, as a model file stores it; None if one is not identifiable."""
+    """Return the covariance of all parameters, as a model file stores it; None if one is not identifiable."""
     jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
     inputs = problem.structure.with_inputs(joint.inputs).fixed_inputs
     jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
@@ -396,8 +397,9 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
     """Return the rank of the table row whose orders give the most likely simulation of all equations together.
 
     The order search ranks candidates by simulations in which measured outputs enter each equation. Such simulations
-    hardly distinguish neighboring orders. The criterion here is the sum of ln NR over outputs, which is the negative
-    log likelihood of white noise of unknown variance up to constants.
+    hardly distinguish neighboring orders. The criterion here is the sum over outputs of ln NR, where NR is the
+    normalized residual of eq. (47) of the paper. It is proportional to the negative log likelihood of white noise of
+    unknown variance, up to a constant.
     """
     best, rank = math.inf, 1
     for row in search.table:

@@ -266,7 +266,7 @@ def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_
     """Return extensions by a constant and by a drift; [] for non-linear structures and for other offsets than a level.
 
     The constant is omitted if the structure has a level. If the fit explains little (`is_poor`), the optimum with a
-    constant may be far from the fit. It is then also sought from automatic initial guesses.
+    constant may be far from the fit. The extension is then also fitted from automatic initial guesses.
     """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
@@ -328,7 +328,7 @@ def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
     """Return the fit to the first samples of each run, and these parts of the runs.
 
-    They have at most `MAX_EXTENSION_SAMPLES` samples in all. Short runs and their fit are returned unchanged.
+    All parts together have at most `MAX_EXTENSION_SAMPLES` samples. Short runs and their fit are returned unchanged.
     """
     length = MAX_EXTENSION_SAMPLES // len(runs)
     if all(run.length <= length for run in runs):
@@ -516,10 +516,11 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
 
 def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
-    """Return the extension by a constant load that starts at an unknown time; [] for several or nonuniform runs.
+    """Return an extension by a constant load from an unknown time on, in a list; [] for several or nonuniform runs.
 
     The search starts from the parameters of each fit in `starts`. It places the step at the time at which a load and
-    parameter changes explain most of the residuals. It then fits the model again, until the time does not change.
+    parameter changes explain most of the residuals. It then fits the model with this load. Both steps are repeated
+    until the time no longer changes or the residuals no longer decrease.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:
@@ -583,9 +584,10 @@ def _load_response(item: Equation, structure: Structure, values: Mapping[str, fl
 def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
     """Return the sample index from which a constant load explains most of the residuals.
 
-    None if the response overflows or no load explains a part of the residuals. The first element of all arrays is
-    sample 1. `sensitivities` to the parameters have shape (parameters, samples), and `response` is the response to a
-    load from sample 0 on. The part that the parameters can explain is projected out of residuals and load responses.
+    Return None if the response overflows or no load explains a part of the residuals. The first element of every array
+    belongs to sample 1. `sensitivities` of the output to the parameters have shape (parameters, samples), and
+    `response` is the response to a load from sample 0 on. The part that the parameters can explain is projected out of
+    residuals and load responses.
     """
     series, load = residuals, response[: residuals.size]
     edge = max(int(MIN_LOAD_SHARE * series.size), 1)

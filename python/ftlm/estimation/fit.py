@@ -61,7 +61,7 @@ def make_model(
 ) -> Model:
     """Return a model of a structure with fixed orders and coefficients, which records its method and runs.
 
-    `m` is the number of block pulses; `about` adds entries to the record.
+    `m` is the number of block pulses. `about` adds entries to the field `about` of the model.
     """
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     steps = {run.step for run in task.runs}

@@ -89,9 +89,10 @@ class FreeProblem:
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds (low, high) of all free parameters; only coefficients of friction are bounded, to dissipate energy.
+        """Bounds (low, high) of all free parameters.
 
-        Other coefficients have infinite bounds.
+        Coefficients of friction have a lower bound, so that friction dissipates energy. Other coefficients have
+        infinite bounds.
         """
         return self.core.bounds
 

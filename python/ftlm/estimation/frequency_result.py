@@ -46,7 +46,8 @@ CURVE_POINTS = 160
 def curve_frequencies(record: FrequencyData) -> Floats:
     """Return frequencies [rad/s] for a smooth curve, including all frequencies of the record.
 
-    At least one frequency lies between neighboring measured ones, so that each measured point is drawn as a dot.
+    Between any two neighboring measured frequencies there is at least one other frequency, at which the chart has no
+    measured value. Measured points are therefore drawn as separate dots.
     """
     frequencies = np.unique(record.frequency)
     between = np.sqrt(frequencies[1:] * frequencies[:-1])
@@ -279,7 +280,7 @@ class FrequencyIdentification:
         by name. The standard error of a parameter that is not identifiable is infinite. A circuit parameter on a bound
         of the user has neither error nor interval; one that is not distinguishable from 0 has the lower bound 0.
     names, covariance
-        Names of the parameters with an error, and their covariance matrix in this order.
+        Names of the parameters with a standard error, and their covariance matrix in the same sequence.
     chi_squared
         Mean square of the residuals divided by the stated standard deviations; about 1 for a correct model. None if no
         standard deviations are stated.
@@ -385,7 +386,7 @@ class FrequencyIdentification:
         return FrequencyValidation(others, errors, self._assess(errors, others), self._validation_findings(errors))
 
     def _validation_findings(self, others: Sequence[ResponseError]) -> tuple[Finding, ...]:
-        """Return a finding on each missed response, and one on the first error far above the estimation error."""
+        """Return a finding on each response with a large error, and one on an error far above the estimation errors."""
         findings = _missed_responses(others)
         most = max(e.rms for e in self.errors)
         failures = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
@@ -645,7 +646,7 @@ def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
 
 
 def _missed_responses(errors: Sequence[ResponseError]) -> list[Finding]:
-    """Return a finding on each response of which the model misses more than `MAX_RELATIVE_ERROR`."""
+    """Return a finding on each response on which the relative error of the model exceeds `MAX_RELATIVE_ERROR`."""
     return [
         make_finding("response_missed", run=e.name, output=e.output, input=e.input, rms=e.rms)
         for e in errors

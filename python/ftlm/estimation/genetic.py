@@ -62,10 +62,10 @@ MAX_DEFAULT_EVALUATIONS = 1_000_000
 
 @dataclass(frozen=True)
 class GeneticRun:
-    """Result of the genetic algorithm.
+    """Result of the genetic algorithm or of differential evolution.
 
-    ``orders`` and ``coefficients`` of the best candidate, and the ``bounds`` of the search, are given by name. The best
-    ``errors`` and the numbers of ``evaluations`` are given by seed.
+    ``orders`` and ``coefficients`` are those of the best candidate, by name, and ``bounds`` are those of the search, by
+    name. ``errors`` and ``evaluations`` contain the lowest error and the number of evaluations of each seed.
 
     The error is the sum of absolute simulation errors, eq. (45) of the paper, or the RMSE, eq. (46), for the norm
     ``"l2"``. Under an order law it is the sum over outputs, each divided by the standard deviation of the output.
@@ -83,7 +83,8 @@ class _Rows:
     """Linear map from genes to candidates of one equation: ``genes @ weights + constants``.
 
     A candidate is a row with alpha (the order of the equation), the orders and the coefficients of the terms. ``own``
-    marks the terms of the output, ``points`` evaluates candidates, and ``scale`` divides their errors.
+    is True for terms in the output of the equation, ``points`` computes the errors of candidates, and ``scale`` divides
+    these errors.
     """
 
     points: _core.Points
@@ -93,7 +94,7 @@ class _Rows:
     scale: float
 
     def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
-        """Return one candidate per row of `genes`; with `repaired`, the order of the equation limits those of terms."""
+        """Return one candidate per row of `genes`; `repaired` limits the orders of terms to that of the equation."""
         rows = genes @ self.weights + self.constants
         if repaired:
             highest = rows[:, :1] - np.where(self.own, ORDER_RESOLUTION, 0.0)
@@ -292,7 +293,7 @@ def genetic_search(
 
 
 def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tuple[float, float]:
-    """Return the shortest and the longest expected run time [s], extrapolated from the first generation."""
+    """Return the shortest and the longest expected run time [s], extrapolated from one random generation."""
     low, high = np.array([problem.bounds[n] for n in problem.names]).T
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
     start_time = time.perf_counter()
@@ -422,7 +423,7 @@ def differential_evolution_search(
     """Minimize the simulation error by differential evolution, with the options of the genetic baseline.
 
     Seeds, evaluations and bounds come from `settings`. Other options are defaults of SciPy (best1bin, 15 candidates per
-    gene), without the final local search. The number of generations is the largest that the evaluations allow.
+    gene), without the final local search. The number of evaluations is rounded up to whole generations.
 
     Raises
     ------

@@ -273,7 +273,7 @@ def identify_pieces(
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
     """Raise ModelError if ``offset="auto"`` is not possible: with friction, non-linear terms or a checkpoint file.
 
-    It may need two fits, but the checkpoint file of a method stores one search.
+    The offset test may require two fits, but the checkpoint file of a method stores only one search.
     """
     if structure.has_friction:
         raise ModelError(
@@ -397,7 +397,7 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return a finding, or a less severe one in its place if the residuals are noise that no input explains.
+    """Return a finding, replaced by a less severe one if the residuals are noise that no input explains.
 
     Findings on colored residuals and on a poor fit are replaced. Residual tests omit the first and the last sample. If
     the fit is poor only because of these two samples, the finding states that they are outliers.
@@ -435,7 +435,7 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
-    """Return the residual tests, with the bias of the parameters that detected feedback can cause."""
+    """Return the residual tests, with the parameter bias that detected feedback can cause."""
     fed = {
         signal: test.response
         for o in tests.outputs.values()
@@ -463,7 +463,7 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     """Return findings of failed residual tests.
 
-    Colored residuals of a joint fit are omitted, because its own findings report them.
+    Findings on colored residuals are omitted for a joint fit, because the fit itself already reports them.
     """
     if has_loop_noise_model(fit.settings):
         # Such a fit is consistent in a closed loop, so detected feedback is no finding.
@@ -564,7 +564,7 @@ def identify_many(
     Returns
     -------
     list of BatchResult
-        Results in the order of the runs, each an identification or an error.
+        Results in the sequence of the runs, each an identification or an error.
 
     Raises
     ------

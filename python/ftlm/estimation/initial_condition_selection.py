@@ -48,9 +48,9 @@ def fit_with_offset_decision(
 ) -> Fit:
     """Return the fit of a structure, and decide on its initial conditions and its offset.
 
-    `estimate` is used for ``offset="auto"``, which adds a constant to each equation if it is significant. The structure
-    with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong optimum.
-    `fits` is used for every other offset.
+    With ``offset="auto"``, the function `estimate` fits the structure, and a constant is added to each equation if it
+    is significant. The structure with the constant is fitted first, because a fit that lacks a necessary constant may
+    end at any wrong optimum. With every other offset, the functions in `fits` fit the structure.
     """
     if structure.offset != "auto":
         fit = _fit_with_start_decision(structure, fits)
@@ -114,8 +114,8 @@ class InitialConditionFits:
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
         """Return a fit of a structure whose initial conditions differ from those of `fit`; None if not accepted.
 
-        It starts from the optimum of `fit` if :attr:`complete` is given, otherwise from automatic initial guesses.
-        `accepts` decides from the joint fit whether it is accepted.
+        The new fit starts from the optimum of `fit` if `fit` has a joint fit and :attr:`complete` is given, otherwise
+        from automatic initial guesses. The function `accepts` decides from the new joint fit whether it is accepted.
         """
         joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
@@ -188,7 +188,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return a fit with nonzero initial conditions if the residuals of the fit from rest contradict rest, else None.
+    """Return a fit with nonzero initial conditions or a level if residuals contradict a start from rest, else None.
 
     A few quiet samples do not distinguish slow motion from rest. With white residuals, rest is kept. If the
     residuals are not white but have no slow component, those of the new fit must be white.
@@ -232,9 +232,9 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
 def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, is_suggested: bool) -> Fit | None:
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
-    Information criteria are compared under the noise color of the fit with the larger residuals. With `is_suggested`,
-    the optimum may be far away, so automatic initial guesses are used. Otherwise the fit starts from the optimum
-    without a level.
+    Both information criteria that are compared use the noise spectrum of the fit with the larger residuals. If
+    `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used. They are also used for
+    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -268,8 +268,9 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bool) -> Fit:
     """Return a fit with findings that report its initial conditions, which differ from those first chosen.
 
-    Other runs may start differently, so the model is reset to the requested initial conditions of `structure`. If rest
-    was rejected, it keeps those of the fit, because a comparison with the same runs would choose rest again.
+    Other runs may start differently, so the model is reset to the requested initial conditions of `structure`. If a
+    start from rest was rejected in favor of other initial conditions, the model keeps those of the fit, because a
+    comparison with the same runs would choose rest again.
     """
     initial = None if fit.joint is None else fit.joint.initial
     names = ", ".join(run.name for run in fit.task.runs)

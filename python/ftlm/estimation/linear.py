@@ -425,7 +425,7 @@ class Streaming:
 
     @check_arguments
     def push(self, samples: Floats) -> None:
-        """Update the estimate with samples of shape (n, len(signals)), in SI units and in the order of `signals`.
+        """Update the estimate with samples of shape (n, len(signals)), in SI units and the sequence of `signals`.
 
         Raises
         ------

@@ -288,7 +288,8 @@ class OutputError:
     ) -> Fit:
         """Fit a structure to checked runs; see :func:`ftlm.identify`.
 
-        `fitted` is a joint fit from the method of :meth:`hypothesis`, which is completed instead of a new fit.
+        `fitted` is a joint fit by the method that :attr:`hypothesis` returns. If given, it is completed with the
+        remaining confidence intervals, and no new fit is made.
         """
         if self.reference is not None and structure.has_friction:
             raise ModelError(
@@ -334,9 +335,9 @@ class OutputError:
 
     @property
     def hypothesis(self) -> OutputError | None:
-        """Return this method without profile likelihood, for several preliminary fits.
+        """Method without profile likelihood, for preliminary fits that :meth:`fit` can complete.
 
-        None if `fit` cannot complete such a fit: with bounds, a noise model or a reference.
+        None with bounds, a noise model or a reference, because :meth:`fit` cannot complete such fits.
         """
         resumable = self.bounds is None and self.noise == "white" and self.reference is None
         return replace(self, intervals="quadratic") if resumable else None

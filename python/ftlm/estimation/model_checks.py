@@ -140,7 +140,8 @@ def second_optimum_findings(
     """Return a finding on the most likely other optimum whose parameters differ by over three standard errors.
 
     `values` and `errors` are the parameters of the best optimum and their standard errors. Each other optimum is given
-    as (values, decrease of the log likelihood, standard errors by name). The larger standard error of both is used.
+    as (values, decrease of the log likelihood, standard errors by name). Each difference is compared with the larger of
+    the two standard errors.
     """
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:

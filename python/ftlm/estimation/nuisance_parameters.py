@@ -167,10 +167,10 @@ def offset_test(
     """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
     Two linear regressions of the residuals under autoregressive noise are compared. The regressors of the first one are
-    the sensitivities to all free parameters and initial terms. The second one has the response to a constant in each
-    equation in addition. The statistic is
-    twice the logarithm of the likelihood ratio of their one-step prediction errors. `values` are consistent estimates
-    by name, and `every` is the number of block pulses per sampling interval.
+    the sensitivities to all free parameters and initial terms. The second regression also has, as regressors, the
+    responses to a constant in each equation. The statistic is twice the logarithm of the likelihood ratio of their
+    one-step prediction errors. `values` are consistent estimates by name, and `every` is the number of block pulses per
+    sampling interval.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
@@ -281,9 +281,9 @@ def offset_errors(
 
 
 def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int, str, str]]) -> list[Floats]:
-    """Return the derivatives of the weighted residuals by levels, made orthogonal to the responses to initial terms.
+    """Return derivatives of weighted residuals with respect to levels, orthogonal to responses to initial terms.
 
-    Each entry of `listed` is (index of the run, output, kind) and gives one array of all residuals.
+    Each entry of `listed` is (index of the run, output, kind). The result has one array over all residuals per entry.
     """
     shares, blocks = grid.residual_weights, _residual_blocks(grid)
     bases, columns = _initial_responses(point, blocks, shares.size), []
@@ -314,7 +314,7 @@ def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[R
 def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
     """Return initial terms without the powers of t that the response to a constant contains.
 
-    Only ``"caputo"`` is changed. It becomes a history with the remaining exponents.
+    Caputo initial terms become a history with the remaining exponents. Other initial terms are returned unchanged.
     """
     if initial != "caputo":
         return initial
@@ -403,9 +403,9 @@ def fit_with_initial_conditions(
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
     `start` are the initial conditions suggested by the data. A fit with a history (powers of t that represent past
-    inputs) is kept unless Caputo initial terms, which are fewer, give equally small residuals. A fit from rest is kept
-    unless a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`, the
-    first of `guesses` is the only initial guess.
+    inputs) is kept unless Caputo initial terms, of which there are fewer, give equally small residuals. A fit from rest
+    is kept unless a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`,
+    the first of `guesses` is the only initial guess.
     """
 
     def fit_initial_terms(
@@ -460,7 +460,7 @@ def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
-    """Whether the variance of a sum of residuals is inflated as by a missing term or a wrong initial condition."""
+    """Whether residuals are as strongly correlated as a missing term or a wrong initial condition makes them."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
     return max(inflation) > START_SETTINGS.white_inflation
 
@@ -491,7 +491,7 @@ def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Str
 def _fit_without_implausible_history(
     joint: JointFit, runs: Sequence[Run], structure: Structure, fit_caputo: Callable[[], JointFit]
 ) -> JointFit | None:
-    """Return the fit with Caputo initial terms if no plausible past input causes the fitted history, otherwise None.
+    """Return the fit with Caputo initial terms if no plausible past input explains the fitted history, else None.
 
     The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs that
     :func:`ftlm.compare` uses, such a history gives larger residuals than Caputo's terms do.
@@ -535,10 +535,10 @@ def refit_after_screening(
     """Return the refit of a linear structure with other initial conditions or offsets; None if screened out or failed.
 
     First, the cost is minimized from the optimum of `joint` with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
-    residuals, multiplied by `CONVERGED_RESIDUAL_SHARE` or `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of
-    those of a complete fit. If `accepts` rejects them, the result is None. Otherwise the structure is fitted on the
-    same grid, and, with `refine` and if `accepts` accepts that fit, again with a refined step. `accepts` may reject the
-    result.
+    RMS residuals are multiplied by `CONVERGED_RESIDUAL_SHARE` if this minimization converged, otherwise by
+    `SCREENING_RESIDUAL_SHARE`. The products are an optimistic estimate of the residuals of a complete fit. If `accepts`
+    rejects this estimate, the result is None. Otherwise the structure is fitted on the same grid. With `refine`, a fit
+    that `accepts` accepts is repeated with a refined step. The returned fit may be one that `accepts` rejects.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

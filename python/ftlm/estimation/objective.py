@@ -62,7 +62,7 @@ class Iterate:
 
     @property
     def has_converged(self) -> bool:
-        """Whether the gradient vanishes, apart from active bounds; False at any other active constraint."""
+        """Whether the gradient vanishes except along active bounds; False if another constraint is active."""
         return bool(self.outcome["status"] == "converged")
 
 
@@ -79,8 +79,8 @@ def minimize_cost(
 ) -> Iterate:
     """Minimize the output-error cost by Levenberg-Marquardt; parameters with an index in `fixed` stay constant.
 
-    `attempt` is the initial point, and `evaluations` is the maximum number of evaluations. Coefficients are varied as
-    logarithms where their signs permit it; with `plain` they are varied themselves.
+    `attempt` is the initial point, and `evaluations` is the maximum number of evaluations. The optimization variables
+    are logarithms of coefficients where the signs permit it; with `plain`, they are the coefficients themselves.
 
     With `prefer_stable`, no step leads from a stable model to an unstable one.
     """
@@ -176,7 +176,7 @@ class Objective:
 
     @property
     def residual_weights(self) -> Floats:
-        """Robust weight of every residual, in the order of the core's residual vector."""
+        """Robust weight of every residual, in the sequence of the core's residual vector."""
         outputs = len(self.problem.structure.outputs)
         return np.concatenate(
             [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]

@@ -1,4 +1,4 @@
-"""Order search whose result has the verdict of an identification at the best orders."""
+"""Order search, followed by an identification at the best orders that gives the verdict on the result."""
 
 from __future__ import annotations
 

@@ -128,9 +128,10 @@ class JointFit:
     Parameters
     ----------
     orders, coefficients
-        Estimated free orders and free coefficients by name. With a coefficient law, these are its independent factors.
+        Estimated free orders and free coefficients by name. With a coefficient law, `coefficients` has only the
+        independent factors, and `products` has the other coefficients.
     covariance
-        Covariance matrix of orders, coefficients and input parameters, in this order, robust to colored residuals.
+        Covariance matrix of orders, coefficients and input parameters, in this sequence, robust to colored residuals.
         Parameters that are not identifiable have infinite variances, and NaN covariances.
     noise
         Standard deviation of the residuals by output; with a robust loss, estimated from their median absolute value.
@@ -144,8 +145,8 @@ class JointFit:
     step_converged
         Whether halving the step changed every estimate by less than a tenth of its standard error.
     converged
-        Whether the gradient vanishes, apart from active bounds. False if the maximum number of evaluations was reached,
-        no step lowered the cost, or the iterates left the range that the time grid can represent.
+        Whether the gradient vanishes except along active bounds. False if the maximum number of evaluations was
+        reached, no step lowered the cost, or the iterates left the range that the time grid can represent.
     starts
         (cost per residual on a coarse grid, origin as text) of every initial guess, best first.
     survivors
@@ -163,7 +164,7 @@ class JointFit:
     robust_weights
         Robust weights of the samples, an array (outputs, samples) for each run.
     finest_grid_values
-        Parameters at the optimum of the finest grid, in the order of the covariance.
+        Parameters at the optimum of the finest grid, in the sequence of the rows of `covariance`.
     origin
         Description of the initial guess if there was no multistart.
     profiles
@@ -197,7 +198,7 @@ class JointFit:
 
     @property
     def values_by_name(self) -> dict[str, float]:
-        """Estimates by name, in the order of the covariance."""
+        """Estimates by name, in the sequence of the rows of the covariance."""
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
@@ -229,12 +230,12 @@ class JointFit:
 
     @property
     def names(self) -> list[str]:
-        """Parameter names, in the order of the covariance."""
+        """Parameter names, in the sequence of the rows of the covariance."""
         return [*self.orders, *self.coefficients, *self.inputs]
 
     @property
     def values(self) -> Floats:
-        """Parameter values, in the order of the covariance."""
+        """Parameter values, in the sequence of the rows of the covariance."""
         return np.array([*self.orders.values(), *self.coefficients.values(), *self.inputs.values()])
 
     @property
@@ -305,10 +306,10 @@ def fit_output_error(
 
     A coefficient law of the structure is imposed. The structure must not have ``initial="auto"``. `start` gives values
     of all free parameters by name and replaces the automatic initial guesses, whereas `guesses` adds to them. `near` is
-    a fit of the same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result
-    of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval. `progress` is
-    called with (parts done, total parts). The loss compares optima on all samples; initial guesses are compared by
-    squared residuals.
+    a fit of the same structure to nearly the same runs. The grid and the weights of `near` are reused. `multistart` is
+    the result of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval.
+    `progress` is called with (parts done, total parts). Optima are compared by the loss on all samples, and initial
+    guesses by the sum of squared residuals.
 
     Raises
     ------

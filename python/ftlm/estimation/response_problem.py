@@ -26,7 +26,7 @@ MAX_EXPONENT = 1.0
 
 
 class ConstraintText(NamedTuple):
-    """Description of a linear constraint for messages, and the parameter that it bounds, None if there are several."""
+    """Description of a linear constraint for messages, and the parameter that it bounds (None if it bounds several)."""
 
     text: str
     parameter: str | None = None
@@ -56,7 +56,7 @@ class ResponseProblem:
     """Estimation problem of a structure from measured frequency responses, in scaled time.
 
     The time unit is 1/`unit` seconds, where `unit` is the geometric mean of the measured frequencies. Parameters are
-    then near 1. Parameter vectors have the order of `names`: free orders, free coefficients, free delays.
+    then near 1. Parameter vectors are in the sequence of `names`: free orders, free coefficients, free delays.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class ResponseProblem:
         return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
     def constraints(self) -> tuple[Floats, Floats, list[ConstraintText]]:
-        """Return (rows, limits, descriptions) of the constraints ``rows @ values <= limits`` of orders and delays."""
+        """Return (rows, limits, descriptions) of the constraints ``rows @ values <= limits`` on orders and delays."""
         rows: list[Floats] = []
         limits: list[float] = []
         words: list[ConstraintText] = []
@@ -424,10 +424,11 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
 
 
 def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
-    """Return one corner frequency for each grid point, which fixes the coefficient of the slowest output term.
+    """Return, for each grid point, the corner frequency that fixes the coefficient of the slowest output term.
 
-    It is NaN for the `first` points, where this coefficient is estimated. Each row of `slow` gives several additional
-    points, with corner frequencies distributed over the measured band.
+    The slowest output term is the one that dominates at low frequencies. The corner frequency is NaN for the first
+    points (`first` is their number), where this coefficient is estimated. These points are followed by several points
+    per row of `slow`, with corner frequencies distributed over the measured band.
 
     If noise hides a small arc of an impedance, iteratively reweighted least squares are biased. The coefficients of
     output terms are then far too small or too large. If the slowest output term is fixed, the remaining bias is small.
@@ -457,8 +458,8 @@ def _equation(
 ) -> tuple[Floats, Floats]:
     """Return the coefficients of one equation at every grid point by reweighted least squares, and their cost.
 
-    They have shapes (points, names) and (points,). `place` is the index of the equation, and `corners` are the corner
-    frequencies from :func:`_corner_frequencies`.
+    The coefficients have shape (points, names), and the cost has shape (points,). `place` is the index of the equation,
+    and `corners` are the corner frequencies from :func:`_corner_frequencies`.
     """
     item = problem.structure.equations[place]
     alpha = _orders(problem, item.order.constant, item.order.weights, points)
@@ -557,7 +558,8 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
 def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
     """Return the frequency response from the input of a record to a signal.
 
-    It is the measured response of an output, the delay factor `late` for the input itself, and 0 for other signals.
+    For an output it is the measured response to the same input, interpolated from another record if necessary. For the
+    input itself it is the delay factor `late`, and for other signals 0.
     """
     outputs = problem.structure.outputs
     if name not in outputs:

@@ -56,7 +56,8 @@ class PhysicalParameter:
     value, standard_error
         Value and standard error in ``unit``. A parameter that the user gave has standard error 0.
     unit
-        Unit for integer orders. With fractional orders it is multiplied by a power of a second.
+        Unit of the value for integer orders. With fractional orders, the value has this unit times a power of the
+        second.
     """
 
     value: float
@@ -170,7 +171,7 @@ class Task:
     order_grid: OrderGrid | None = None
 
     def part_order_grid(self, part: Structure) -> OrderGrid:
-        """Return the order grid restricted to the free orders of `part`, some equations of the structure."""
+        """Return the order grid restricted to the free orders of `part`, a structure with some of the equations."""
         return restrict_order_grid(self.order_grid, part) or OrderGrid()
 
 
@@ -194,7 +195,7 @@ class Identification:
     findings
         Findings about data, fit and model.
     joint
-        Optimum of the joint output error with its covariance; None for the equation-error methods.
+        Joint output-error fit with its covariance; None for methods that fit the equation error.
     residuals
         Residual tests on the estimation runs; None if the runs are too short.
     information
@@ -372,10 +373,9 @@ class Identification:
 
         The interval of a parameter contains the values at which the rise of the sum of squares is below a limit. The
         limit is the squared normal quantile times the noise variance, enlarged for colored residuals. For a quadratic
-        cost it equals the
-        Wald interval. If the cost has a curved valley, the interval may be asymmetric or unbounded, and standard errors
-        are misleading. With a robust loss, the weights of the fit are kept. Each bound is followed continuously from
-        the optimum, so another optimum behind a ridge is not found.
+        cost, the interval equals the Wald interval. If the cost has a curved valley, the interval may be asymmetric or
+        unbounded, and standard errors are misleading. With a robust loss, the weights of the fit are kept. Each bound
+        is followed continuously from the optimum, so another optimum behind a ridge is not found.
 
         A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley. This amounts
         to 10 to 200 simulations per parameter on the finest grid of the fit. The result does not depend on the number
@@ -401,8 +401,8 @@ class Identification:
         Raises
         ------
         ModelError
-            If the method has no likelihood, the fit has a reference, a name is not a free parameter, or the level is
-            not between 0 and 1.
+            If the method has no likelihood, the fit used a reference signal, a name is not a free parameter, or the
+            level is not between 0 and 1.
         ConvergenceError
             If the profile leads to an optimum with a lower cost than the fit.
         """
@@ -428,7 +428,7 @@ class Identification:
         -------
         Validation
             :class:`ftlm.Comparison` with simulation error, equation error and a ``.verdict``. Findings report a fit
-            that is lower than on the estimation runs, and runs that are estimation runs.
+            that is lower than on the estimation runs, and validation runs that were also used for estimation.
 
         Raises
         ------

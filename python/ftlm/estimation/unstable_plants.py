@@ -66,7 +66,8 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
     Runs of an unstable plant are bounded only because a controller feeds back the output. A correct unstable model
     reproduces the output within a piece. If the plant is stable, an unstable model cannot reproduce the output over
     five time constants, whatever its initial values are. The result is None if the model is stable, its modes are
-    unknown, or a simulation fails. It is also None if samples are nonuniform, too few or too far apart for the growth.
+    unknown, or a simulation fails. It is also None if the runs are sampled nonuniformly, too short for several pieces,
+    or sampled too coarsely for the growth rate of the model.
     """
     try:
         growth_rates = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]

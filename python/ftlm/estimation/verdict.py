@@ -136,7 +136,7 @@ def validation_with_verdict(result: Identification, comparison: Comparison) -> V
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
     """Return the verdict on a result by the rules of :attr:`ftlm.Identification.verdict`.
 
-    Serious findings that no rule covers follow in the order of the topics in ``findings.toml``.
+    Serious findings that no rule covers follow in the sequence of the topics in ``findings.toml``.
     """
     whole = not any(f.code == "runs_split" for f in result.findings)
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
@@ -154,7 +154,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
 
 def _describe_residuals(result: Identification) -> str:
-    """Return text on the residuals of a trusted model: noise, colored noise, or negligibly small."""
+    """Return text on whether the residuals of a trusted model are noise, colored noise, or negligibly small."""
     outputs = () if result.residuals is None else result.residuals.outputs.values()
     if any(not r.is_noise for r in outputs):
         return f"residuals are below {100 * NEGLIGIBLE_RESIDUAL_RATIO:g} % of the output where they are not noise"
@@ -214,7 +214,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
-    """Return the findings against a model that its file records, plus one on unidentifiable parameters if missing."""
+    """Return the stored findings against a model, plus one on unidentifiable parameters if none reports them."""
     findings = list(estimate.against)
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
@@ -363,8 +363,8 @@ def is_buried(residuals: OutputResiduals) -> bool:
 def _poor_fits(where: str, comparison: Comparison, reported: Sequence[str] = ()) -> Iterator[Finding]:
     """Yield a finding on the outputs whose NR exceeds `MAX_NORMALIZED_RESIDUAL` over all runs, or else in one run.
 
-    Each run is also tested by itself, because runs with large signals dominate the total. `reported` are outputs that
-    are not tested.
+    If no output exceeds the limit over all runs, each run is tested by itself, because runs with large signals dominate
+    the total. NR is the normalized residual. `reported` are outputs that are not tested.
     """
     for run, errors in _each(comparison):
         poor_outputs = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in reported]
@@ -387,7 +387,7 @@ def _on(run: str) -> str:
 
 
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
-    """Yield a finding on the first run of each output whose validation fit is far below the estimation fit."""
+    """Yield one finding for each output whose fit on validation runs is far below its fit on estimation runs."""
     found: set[str] = set()
     for run, errors in _each(validation):
         for output, figures in errors.items():
@@ -404,7 +404,7 @@ def _validation_losses(estimation_fits: Mapping[str, float], validation: Compari
 
 
 def _residuals(result: Identification) -> Iterator[Finding]:
-    """Yield findings of failed residual tests: feedback, correlation with an input, color."""
+    """Yield findings on failed residual tests: correlation with an input, feedback, color."""
     if result.residuals is None:
         if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
             yield make_finding("too_short_for_tests")

@@ -43,10 +43,10 @@ def square_wave(rows: int, period: int) -> Floats:
 
 
 def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
-    """Yield (name, commands) of initial inputs for the exchange algorithm: multisine, chirp, squares, random binary.
+    """Yield (name, commands) of initial inputs of the exchange algorithm: multisine, chirp, square wave, random binary.
 
     Commands have shape (inputs, rows) and magnitude at most 1. Their frequencies follow from the optimal spectrum.
-    `inputs` is the number of inputs, `rows` that of samples, and `step` the sampling interval [s].
+    `inputs` is the number of inputs, `rows` the number of samples, and `step` the sampling interval [s].
     """
     rng = np.random.default_rng(seed)
     sines = multisine(spectrum, inputs, rows, step, rng)
@@ -89,8 +89,8 @@ def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, 
 def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.random.Generator) -> Floats:
     """Return multisines with the powers of a spectrum, amplitude 1 and a low crest factor, shape (inputs, rows).
 
-    Starting from Schroeder's phases (doi:10.1109/TIT.1970.1054411), peaks are clipped and the power spectrum is
-    restored alternately (Van der Ouderaa, Schoukens & Renneboog, 1988). An input without power gets a random binary
+    The initial phases are Schroeder's (doi:10.1109/TIT.1970.1054411). Each iteration then clips the peaks and restores
+    the power spectrum (Van der Ouderaa, Schoukens & Renneboog, 1988). An input without power gets a random binary
     signal. `step` is the sampling interval [s].
     """
     points = len(spectrum.power)
@@ -141,8 +141,8 @@ MAX_RELATIVE_UNCERTAINTY = 0.5
 class DesignTask:
     """Arguments of an input design after validation.
 
-    `step` is the sampling interval [s], `rows` the number of samples, and `period` that of the square wave for
-    comparison, in samples.
+    `step` is the sampling interval [s], and `rows` is the number of samples. `period` is the period [samples] of the
+    square wave with which the design is compared.
     """
 
     fit: ModelFit
@@ -307,9 +307,10 @@ def design_input(
 def _design_candidates(
     task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, tracker: ShareTracker
 ) -> list[Design]:
-    """Return all candidate inputs, best first: initial inputs, and results of the exchange algorithm from the best.
+    """Return all candidate inputs, best first: initial inputs, and those improved by the exchange algorithm.
 
-    Raise ModelError if no input makes the parameters of interest identifiable.
+    The exchange algorithm is started from the best initial inputs of different kinds. Raise ModelError if no input
+    makes the parameters of interest identifiable.
     """
     fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
     ended = stop_flag()
@@ -378,7 +379,7 @@ def _bounds_of(
 
 
 def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
-    """Raise ModelError if a change of an input from one peak to the opposite takes over a quarter of the run.
+    """Raise ModelError if an input needs more than a quarter of the run to change from one peak to the opposite.
 
     `step` is the sampling interval [s], and `rows` the number of samples.
     """
@@ -409,7 +410,7 @@ def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, .
 
 
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
-    """Raise ModelError if a model has no input or a filtered one, and DataError if the reference run lacks an input."""
+    """Raise ModelError if there is no input or a filtered input, and DataError if the reference run lacks an input."""
     if not fit.inputs:
         raise ModelError("the model has no input to design; give a model with an input")
     if fit.problem.structure.all_filtered:
@@ -551,9 +552,9 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
 
 
 def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floats) -> float:
-    """Return the factor, at most 1, for commands with which outputs meet their limits within 95 % confidence intervals.
+    """Return the largest factor, at most 1, with which scaled commands and 95 % bands of outputs meet the limits.
 
-    The intervals are due to the uncertainty of the parameters.
+    The bands represent the uncertainty of the parameters.
     """
     outputs, slopes = sensitivities.outputs(commands), sensitivities.derivatives(commands)
     spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
@@ -565,8 +566,8 @@ def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floa
 def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
     """Return the standard errors of the parameters, one array per case "now", "square", "designed" and "both".
 
-    They are those of the model, those predicted for fits to the square wave (`reference`) and to the designed run
-    (`run`), and those for the designed run together with the estimation runs.
+    The cases are, in this sequence: the model; a fit to the square wave (`reference`); a fit to the designed run
+    (`run`); a fit to the designed run together with the estimation runs. The last three are predictions.
     """
     now, new = fit.covariance, fit.predicted_covariance(run)
     size = np.sqrt(np.diag(now))

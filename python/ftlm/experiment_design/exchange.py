@@ -154,16 +154,17 @@ class Hold:
     starts
         Sample indices at which the holds of a run start, shape (holds,).
     block, response
-        Derivatives of the outputs by the parameters, divided by the noise, shape (parameters, outputs, rows), and
-        outputs, shape (outputs, rows). Both begin at the start of the hold.
+        Derivatives of the outputs with respect to the parameters, divided by the noise, shape (parameters, outputs,
+        rows), and outputs, shape (outputs, rows). Both begin at the start of the hold.
     spectrum
         Fourier transform of `block` along its last axis.
     offsets
         Inner products of `block`, for each start, with the basis of the responses to offsets, shape (holds, parameters,
         basis vectors).
     own
-        Fisher information, shape (holds, parameters, parameters), by distance in holds. For distance 0 it is that of
-        one hold for each start. For a larger one it is that of a hold minus another that starts this distance later.
+        Fisher information of the response to an exchange at each start, shape (holds, parameters, parameters), by the
+        distance in holds between the two holds of the exchange. Distance 0 means an exchange of one hold. For a larger
+        distance, the second hold is subtracted, because the two levels change by opposite amounts.
     """
 
     starts: NDArray[np.int64]
@@ -203,9 +204,10 @@ class Hold:
     ) -> Iterator[tuple[int, Floats, Floats]]:
         """Yield (gap, first-order change, second-order change) of the information by exchanges of holds.
 
-        `gap` is the distance in holds of the second hold, 0 for an exchange of one hold. Changes have shape (holds,
-        parameters, parameters). A change of the level by s adds s times the first and s^2 times the second change.
-        `derivatives` are those of the current input.
+        `gap` is the distance between the two holds of an exchange, counted in holds; 0 for an exchange of one hold.
+        Changes have shape (holds, parameters, parameters). If the level changes by s, the information changes by s
+        times the first-order plus s^2 times the second-order change. `derivatives` are the derivatives of the outputs
+        with respect to the parameters for the current input.
         """
         shared = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
         if len(sensitivities.nuisance):
@@ -222,8 +224,8 @@ class Hold:
     def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
         """Return derivatives, or with `of_response` outputs, after an exchange.
 
-        `series` are their values before it. The level of the hold with index `at` changes by `step`, and with `gap`
-        above 0, that of the hold `gap` later by -`step`.
+        `series` are the values before the exchange. The level of the hold with index `at` changes by `step`. With `gap`
+        above 0, the level of the hold that starts `gap` holds later changes by -`step`.
         """
         block, out = self.response if of_response else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
@@ -238,7 +240,7 @@ def _nearest_level(values: Floats) -> Floats:
 
 
 def _hold_response(kernel: Floats, hold: int) -> Floats:
-    """Return the response to a constant input over `hold` samples, from that to one sample (last axis: time)."""
+    """Return the response to a pulse of `hold` samples from `kernel`, the response to one sample (last axis: time)."""
     total = np.cumsum(kernel, axis=-1)
     total[..., hold:] -= total[..., :-hold].copy()
     return total

@@ -33,10 +33,10 @@ MIN_SCALED_DETERMINANT = 1e-28
 
 @dataclass(frozen=True)
 class Criterion:
-    """Optimality criterion of an input: score, higher is better, of its Fisher information matrix.
+    """Optimality criterion, which assigns a score to the Fisher information matrix of an input; higher is better.
 
-    The score is minus the logarithm of a size of the confidence ellipsoid of the parameters of interest. Twice the
-    input amplitude adds ln 2.
+    The score is minus the logarithm of a size of the confidence ellipsoid of the parameters of interest. Doubling the
+    input amplitude increases the score by ln 2.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ class Criterion:
     def smooth_score(self, information: Floats) -> float:
         """Return a differentiable upper bound of the score of an information matrix, shape (p, p).
 
-        For criterion E, Kiefer's mean over all axes of the confidence ellipsoid replaces the longest axis. For D, it is
-        the score itself.
+        For criterion E, Kiefer's mean over all axes of the confidence ellipsoid replaces the longest axis. For D, the
+        bound is the score itself.
         """
         if self.kind == "D":
             return float(self.score(information))
@@ -157,7 +157,7 @@ class Bounds:
     def scale(self, commands: Floats, outputs: Floats) -> float:
         """Return the largest factor, at most 1, with which scaled commands and outputs meet their limits.
 
-        `commands` has one row per input and `outputs` one per output, in the order of the limits.
+        `commands` has one row per input and `outputs` one per output, in the sequence of the limits.
         """
         limits = [*self.output_limits.values(), *self.peaks.values()]
         rows = zip(limits, [*outputs, *commands], strict=True)
@@ -239,7 +239,7 @@ class ModelFit:
 
     @classmethod
     def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
-        """Return the data from a model that was identified by output error, and noise standard deviations by output."""
+        """Return the data that a design requires, from an output-error model and noise deviations by output."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
         return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
@@ -282,7 +282,7 @@ class ModelFit:
         return blank.with_outputs({o: answer[o] for o in self.outputs})
 
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
-        """Return derivatives of the outputs by the parameters, divided by the noise, for a simulated run.
+        """Return derivatives of outputs with respect to parameters, divided by the noise, for a simulated run.
 
         The shape is (parameters, outputs * samples). As in a fit, the first and the last sample are not used. Responses
         to offsets, if the model has any, are projected out unless `offset` is False.
@@ -318,7 +318,7 @@ def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weig
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Derivatives of the outputs by the parameters, in response to one zero-order-hold sample of each input.
+    """Derivatives of the outputs with respect to the parameters, for one zero-order-hold sample of each input.
 
     The derivatives for any input follow by convolution. This is exact, because all equations are linear in their inputs
     and start at rest.
@@ -351,7 +351,7 @@ class Sensitivities:
 
     @classmethod
     def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
-        """Return the sensitivities of a fitted model, from one simulation per input; parameters as for the class."""
+        """Return the sensitivities of a fitted model, from one simulation per input; see the class for arguments."""
         kernels, answers, inputs = [], [], len(fit.inputs)
         for k in range(inputs):
             # A fit does not use the first sample of a run, so the pulse is at the second.
@@ -375,7 +375,7 @@ class Sensitivities:
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Return derivatives of the outputs by the parameters, divided by the noise, shape (parameters, outputs, rows).
+        """Return output derivatives with respect to parameters, divided by noise, shape (parameters, outputs, rows).
 
         `commands` has shape (inputs, rows).
         """

@@ -1,4 +1,4 @@
-"""Optimal spectrum of a periodic input: a convex problem, whose optimality the equivalence theorem certifies."""
+"""Optimal spectrum of a periodic input, from a convex problem; the equivalence theorem certifies its optimality."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
 
 
 def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
-    """Return derivatives of the frequency responses to zero-order-hold inputs by the parameters, and the responses.
+    """Return parameter derivatives of the frequency responses to zero-order-hold inputs, and the responses.
 
     Derivatives have shape (outputs, inputs, W, parameters), and responses shape (outputs, inputs, W). `w` are the
     frequencies [rad/s], and `step` is the sampling interval [s].
@@ -155,9 +155,9 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
 
     Each limit has a dual variable (price). With fixed prices, the problem is an optimization of weights that sum to
     one. It is solved by Titterington's multiplicative algorithm (Silvey, Titterington & Torsney, 1978). For any prices,
-    its optimum is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the
-    distance of the weights from this optimum. After each solution, the price of a limit is increased if much of the
-    limit is used, and decreased otherwise.
+    the optimum of this problem is an upper bound of the optimum of the original problem. The equivalence theorem of
+    Kiefer & Wolfowitz bounds the difference between this optimum and the score of the current weights. After each
+    solution, the price of a limit is increased if much of the limit is used, and decreased otherwise.
 
     If the parameters are not identifiable, the powers are zero and the score is -inf.
     """

@@ -6,10 +6,11 @@ sheet. For every file the reader writes one line of JSON to standard output, fol
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
 little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may have a
-``"unit"``. An array of timestamps has ``"since"``, the reference time in integer nanoseconds since 1970 for its values
-in nanoseconds. Columns that do not come from matrices have ``"text": true``; a run written by ftlm has ``"ftlm-run"``,
-its header. A sheet has ``"sheet"``, its name, ``"others"``, the names of empty sheets, and ``"bytes"``, the number of
-bytes of UTF-8 text that follow: one line per row, tabs between cells.
+``"unit"``. An array of timestamps has values in nanoseconds after a reference time. This time is stored under
+``"since"`` in integer nanoseconds since 1970. Columns that do not come from matrices have ``"text": true``. A run
+written by ftlm has its header under ``"ftlm-run"``. A sheet has its name under ``"sheet"`` and the names of all other
+sheets under ``"others"``. Under ``"bytes"`` it has the number of bytes of UTF-8 text that follow: one line per row,
+tabs between cells.
 """
 
 from __future__ import annotations
@@ -425,7 +426,7 @@ def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> N
 
 
 def has_numbers(item: Any) -> bool:
-    """Whether an HDF5 dataset has a NumPy dtype, and this contains no Python objects."""
+    """Whether an HDF5 dataset has a NumPy dtype that contains no Python objects."""
     try:
         return not item.dtype.hasobject
     except (TypeError, ValueError):

@@ -224,7 +224,7 @@ class Timestamps:
 
     @classmethod
     def read(cls, cells: Sequence[str]) -> Timestamps | None:
-        """Return the timestamps of all cells; None if a cell has no timestamp or another notation."""
+        """Return the timestamps of all cells; None if a cell has no timestamp or the notations of the cells differ."""
         spans = [_DURATION_PATTERN.fullmatch(cell) for cell in cells]
         if all(span is not None for span in spans) and cells:
             clock = np.array([_duration_ns(*span.groups("")) for span in spans if span is not None], np.int64)
@@ -259,12 +259,12 @@ class Timestamps:
         thing
             Label of the column in error messages.
         dates
-            Order of year, month and day given by the user ("ymd", "dmy" or "mdy"), or None.
+            Sequence of year, month and day given by the user ("ymd", "dmy" or "mdy"), or None.
 
         Raises
         ------
         DataError
-            If a date is invalid, or the order of day and month is ambiguous.
+            If a date is invalid, or the sequence of day and month is ambiguous.
         """
         since = self.clock
         if not self.mark:
@@ -281,14 +281,14 @@ class Timestamps:
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
     def inferred_date_order(self, dates: str | None) -> str:
-        """Return the inferred order ("dmy" or "mdy") if the times depend on the inference, otherwise ""."""
+        """Return the inferred sequence of day and month ("dmy" or "mdy") if the times depend on it, otherwise ""."""
         if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
             return ""
         order = self._detect_date_order()
         return "" if order == "ymd" else order
 
     def _detect_date_order(self) -> str:
-        """Return the order of year, month and day that the numbers of the dates imply; "" if it is ambiguous."""
+        """Return the sequence of year, month and day that the numbers of the dates imply; "" if it is ambiguous."""
         first, second, last = self.parts.max(axis=0)
         if first > 31:
             return "ymd"

@@ -18,7 +18,8 @@ from ftlm.utils.validation import CSV_TIME, join_names
 class ColumnSelection:
     """Selection of the columns of a run, with units and layout, from arguments, a columns file or the ftlm header.
 
-    `time` and `step` [s] are alternatives. `inputs` and `outputs` have the name or position of a column by signal.
+    `time` and `step` [s] are alternatives. `inputs` and `outputs` map each signal to the name or position of its
+    column.
     """
 
     time: Hashable | None

@@ -124,7 +124,8 @@ class _Rows:
     """Rows of a table that have been read, with invalid cells and timestamps by column index.
 
     `ragged` is the number of lines with a wrong number of cells; `ragged_line` and `ragged_cells` describe the first.
-    `footer` has the numbers of the lines below the table, and `blocks` the values of the rows, shape (rows, columns).
+    `footer` has the line numbers of the lines below the table. Each array of `blocks` has the values of consecutive
+    rows, shape (rows, columns).
     """
 
     dialect: TableDialect
@@ -232,7 +233,7 @@ def _with_gaps(
     *,
     sheet: bool,
 ) -> TableDialect:
-    """Return the dialect, adjusted for rows of empty cells directly below the header.
+    """Return the layout of the table, adjusted for rows of empty cells directly below the header.
 
     In text such rows are rows of the table. In a sheet they are skipped, and an assumption lists them.
     """
@@ -256,7 +257,7 @@ def _with_gaps(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """Return the assumption on missing names, extended by the comment above the rows if it has one word per column."""
+    """Return an assumption; if it is about missing names, add a comment line that has one word per column."""
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption

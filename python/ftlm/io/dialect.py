@@ -56,7 +56,7 @@ class Layout:
     header : {0, 1, 2}, optional
         Number of header lines: 0 for none, 1 for names, 2 for names and units.
     dates : {"ymd", "dmy", "mdy"}, optional
-        Order of year, month and day in ambiguous dates.
+        Sequence of year, month and day in ambiguous dates.
     sheet : str, optional
         Name of the sheet in a workbook.
 
@@ -250,7 +250,7 @@ class TableDialect:
 
 @dataclass(frozen=True)
 class _Line:
-    """Line of the first lines of a text, split into cells with one candidate for the separators.
+    """One of the first lines of a text, split into cells by a candidate separator and decimal mark.
 
     Parameters
     ----------
@@ -529,8 +529,9 @@ def _header(
 ) -> tuple[list[str] | None, list[str] | None, int]:
     """Return names, units and the index of the first row; names or units are None if the header lacks them.
 
-    `top` is the detected index of the first row. The result is larger if the layout states header lines that look like
-    rows. Raise DataError if the header does not match the options, mixes words and numbers, or repeats a name.
+    `top` is the detected index of the first row. The returned index is larger than `top` if the layout states header
+    lines that look like rows. Raise DataError if the header does not match the options, mixes words and numbers, or
+    repeats a name.
     """
     rows = [line for line in lines[top:] if line.width == width]
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)

@@ -286,7 +286,7 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
 
 
 def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
-    """Return the column of an array of timestamps [ns since `since`, which is in ns since 1970]."""
+    """Return the column of an array of timestamps [ns], counted from the time `since` [ns since 1970]."""
     values = matrix.ravel(order="F")
     thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
     if is_missing.any():

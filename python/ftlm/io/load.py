@@ -250,7 +250,7 @@ def run_from_tables(
 
 @dataclass(frozen=True)
 class _TimeColumn:
-    """Time column: values, unit, label in error messages, column name, and notes. No values if the step is given."""
+    """Time column: values (None if the step is given), unit, label in error messages, column name, and notes."""
 
     times: object = None
     unit: str = "s"
@@ -310,7 +310,7 @@ def _assume_roles(selection: ColumnSelection, pool: ColumnTable, signals: Signal
 
 
 def unused_time(selection: ColumnSelection, pool: ColumnTable, signals: Collection[str]) -> Column | None:
-    """Return the time column beside a given step; None without a step, or if no column is a time by its name or unit.
+    """Return the time column that is not used because the step is given; None without a step or such a column.
 
     `signals` are the names of the columns that are used as signals.
     """

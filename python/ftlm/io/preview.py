@@ -249,8 +249,8 @@ def open_file(
     Raises
     ------
     DataError
-        If the file is missing, damaged or has an ambiguous layout. For other reasons why it cannot be loaded, the
-        result has a `problem`.
+        If the file is missing, damaged or has an ambiguous layout. If the file cannot be loaded for another reason,
+        `problem` of the result states the reason.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is {type_name(path)}; pass the path of one file")
@@ -365,7 +365,7 @@ class _FilePreview:
         return roles, assumptions, open_roles
 
     def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
-        """Return the assumptions on unit and date order of the time column."""
+        """Return the assumptions on the time column: its unit, or the sequence of day and month in its dates."""
         if self.table.header is not None:
             return ()
         if clock.timestamps is not None:

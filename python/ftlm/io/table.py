@@ -110,7 +110,7 @@ class FileTable:
     path
         Path of the file, with any HDF5 group.
     columns
-        Columns in the order of the file.
+        Columns in the sequence of the file.
     text
         Whether columns may be selected by position, as in a text file.
     header
@@ -186,7 +186,7 @@ class ColumnTable:
 
     @property
     def columns(self) -> list[Column]:
-        """All columns, in the order of the files."""
+        """All columns, in the sequence of the files."""
         return list(self._columns.values())
 
     @property
@@ -315,7 +315,7 @@ class ColumnTable:
 
 
 def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None:
-    """Return the assumption on the order of day and month in a time column; None if no order was assumed."""
+    """Return the assumption on the sequence of day and month in a time column; None if none was assumed."""
     order = "" if clock.timestamps is None else clock.timestamps.inferred_date_order(dates)
     if clock.timestamps is None or not order:
         return None

@@ -1,4 +1,4 @@
-"""Members that results of a search or a selection take from the identification of their best model."""
+"""Properties and methods by which results of searches and selections refer to the identification of the best model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 class BestIdentification:
     """Base class of results with a best model, whose identification is the attribute `best`.
 
-    Members have the meaning that they have in :class:`ftlm.Identification`. They raise ModelError if `best` is None.
+    Properties and methods have the same meaning as in :class:`ftlm.Identification`. They raise ModelError if `best` is
+    None.
     """
 
     best: Any

@@ -40,7 +40,7 @@ class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     products
         Coefficients that a coefficient law determines, by name: (sign, names of the factors).
     covariance
-        Covariance of the free parameters in the order of `names`; None if it is not finite.
+        Covariance of the free parameters in the sequence of `names`; None if it is not finite.
     noise
         Standard deviation of the output error of each measured output, by name.
     refinement
@@ -56,7 +56,7 @@ class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Results of the identification of a model, which its file contains, so that a report requires no other file.
+    """Results of the identification of a model, stored in the model file so that a report requires no other file.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Batches of an order search: evaluation in this process or on an executor, and checkpoints.
 
-A batch has candidates of a coupled search, or rounds. A round is a fixed group of candidates of one equation that the
-core evaluates together.
+A batch consists of candidates in a search of coupled equations, and of rounds in a search of one equation. A round is a
+fixed group of candidates that the core evaluates together.
 """
 
 from __future__ import annotations
@@ -385,9 +385,10 @@ Save = Callable[[int, int, Checkpoint | None], None]
 
 
 class SearchState(ABC, Generic[Frame, Table]):
-    """Order search in progress: processed candidates (`done`), all candidates known up to now (`total`), and a batch.
+    """Order search in progress: current batch, and numbers of processed (`done`) and known (`total`) candidates.
 
-    A batch is evaluated in blocks, in any sequence. Later batches use its results.
+    A batch is evaluated in blocks, in any sequence. Later batches use the results of earlier ones. `total` may increase
+    from batch to batch.
     """
 
     #: Whether the core itself calls the progress callback during evaluation in this process.
@@ -558,7 +559,8 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
     def _cut(self, block: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans (equation, first index, exclusive end, limit of the score).
 
-        A span has the candidate indices of its equation. A block is numbered through all spans and batches.
+        Indices in a span count the candidates of its equation. Indices of a block count the candidates of all spans of
+        all batches consecutively.
         """
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:

@@ -331,7 +331,7 @@ class Store:
         Path of the file.
     requests
         Definitions of the searches, with which a new file is created. An existing file must contain the same searches.
-        With None, an existing file is opened, whatever its searches.
+        With None, an existing file is opened, whatever searches it contains.
     recover
         Whether to keep the intact records of a damaged file, and to save a copy of the damaged file.
 
@@ -400,7 +400,7 @@ class Store:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Queue a checkpoint of a partly evaluated block; write the queue if the last write was `FLUSH_INTERVAL_S` ago.
+        """Queue a checkpoint of a partly evaluated block; write the queue at most every `FLUSH_INTERVAL_S` seconds.
 
         `search` is the index of the search in the file, and `first` and `last` (exclusive) are the limits of the block.
         With None as checkpoint, nothing is queued.

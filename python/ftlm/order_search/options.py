@@ -213,7 +213,7 @@ class SearchSettings:
 
     @property
     def needs_haar(self) -> bool:
-        """Whether the Haar row basis is used, which requires a power of two as number of block pulses."""
+        """Whether the Haar row basis is used, for which the number of block pulses must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
     def core_arguments(self, threads: int) -> _core._Options:
@@ -232,6 +232,6 @@ class SearchSettings:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings by name that results and reports show, without those of other coefficient estimators."""
+        """Return the settings to show in results and reports, by name, except options of other estimators."""
         own = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
         return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *own)}

@@ -80,7 +80,7 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether other orders may have an error lower by more than the requested tolerance, for each start point.
+        """Whether other orders may reduce the error by more than the requested tolerance, for each start point.
 
         False means that the lower bound excludes this.
         """
@@ -88,7 +88,7 @@ class OrderCertificate:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Finding if the simulation at the best orders is unstable or poor; empty otherwise.
+        """Finding that the simulation at the best orders is unstable or poor; empty if it is neither.
 
         The certificate covers only the equation error.
         """
@@ -159,7 +159,8 @@ class SearchRow:
     rank
         Rank in the table, from 1.
     index
-        Index of the candidate in the order grid, which decides ties.
+        Index of the candidate in the order grid. Of candidates with equal scores, the one with the smallest index ranks
+        first.
     score
         Sum of absolute errors, eq. (45) of the paper, for the norm ``"l1"``, or RMSE for ``"l2"``. For coupled
         equations, these values are divided by the standard deviation of the output, and for ``"l1"`` also by the number
@@ -414,7 +415,7 @@ class StoreStatus:
 
 
 def search_summary(searches: Mapping[str, SearchResult]) -> Table:
-    """Return a report table: one row per search with numbers of candidates in the table and excluded, by reason."""
+    """Return a report table of the numbers of listed and excluded candidates (by reason), one row per search."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
         [

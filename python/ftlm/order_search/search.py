@@ -85,8 +85,8 @@ def record_run(rec: Record, structure: Structure) -> Run:
 def record_structure(rec: Record, structure: Structure) -> Structure:
     """Return a structure for runs made from a block-pulse record.
 
-    It has no delays and input nonlinearities, because the signals of the record already include them. Initial
-    conditions and offset are those of the record.
+    The structure has no delays or input nonlinearities, because the signals of the record already include their
+    effects. Initial conditions and offset are those of the record.
     """
     return replace(
         structure, delay={}, free_delays={}, input_nonlinearities=UNSET, initial=rec.initial, offset=rec.offset
@@ -258,7 +258,7 @@ class Job:
         return [s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()]
 
     def standard_deviations(self) -> list[float]:
-        """Return the standard deviation of each output, in the order of the outputs.
+        """Return the standard deviation of each output, in the sequence of the outputs.
 
         Deviations are taken from the mean of each record. Raise ModelError if a standard deviation is 0 or not finite.
         """
@@ -288,8 +288,8 @@ def check_executor(executor: object) -> None:
 def threads_per_task(threads: int | None, executor: Executor | None) -> int:
     """Return the number of threads of one task.
 
-    If `threads` is None, it is 1 with an executor. Without one it is ``FTLM_THREADS``, or else the number of cores.
-    Raise ModelError if the number is out of range.
+    If `threads` is None, the number is 1 with an executor. Without an executor it is ``FTLM_THREADS`` if set, otherwise
+    the number of cores. Raise ModelError if the number is out of range.
     """
     return check_threads(1 if threads is None and executor is not None else threads)
 
@@ -643,7 +643,7 @@ def landscape(
 def score_profiles(
     runs: Sequence[Run], structure: Structure, search: SearchResult, order_grid: OrderGrid
 ) -> list[LineChart]:
-    """Return one chart per order with several grid values: score over this order, other orders as in rank 1."""
+    """Return a chart of the score over each order with several grid values, with the other orders as in rank 1."""
     charts = []
     best = search.orders
     score = "sum of absolute errors" if search.settings["norm"] == "l1" else "RMSE"
@@ -703,7 +703,8 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
     """Return (lower, upper) estimates of the time of a search on this machine [s]; (0, 0) for a small grid.
 
-    The time is extrapolated from searches on coarser grids. They take at most a tenth of the search and half a second.
+    The time is extrapolated from searches on coarser grids. Each of these has at most the fraction `MAX_PROBE_FRACTION`
+    of all candidates. None follows one that took `PROBE_TIME_S` seconds or more.
     """
     whole = _candidates(job)
     trials: list[tuple[float, float]] = []
@@ -750,7 +751,8 @@ def _candidates(job: Job) -> float:
 def _remaining_fraction(job: Job, store: Store, number: int) -> float:
     """Return the fraction (0 to 1) of a search's candidates that a checkpoint file does not contain.
 
-    Under an order law it is 1 until the search is complete, then 0. `number` is the index of the search in the file.
+    Under an order law, the fraction is 1 until the search is complete, and 0 afterwards. `number` is the index of the
+    search in the file.
     """
     section = store.contents.sections[number]
     if job.structure.has_order_law:

@@ -86,7 +86,7 @@ def _bands_of_lines(band: Band) -> list[Band]:
 
 @check_arguments
 def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[LineChart]:
-    """Return a chart of every input of every run, for the place below the outputs of the run.
+    """Return a chart of every input of every run, to be shown below the charts of the outputs.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
 
 
 def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
-    """Return the chart of the correlation between the residual of `output` and an input `signal` over the lag.
+    """Return a chart of the correlation of the residual of `output` with an input `signal` as a function of lag.
 
     An empty `signal` stands for the residual itself (autocorrelation).
     """

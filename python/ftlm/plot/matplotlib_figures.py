@@ -532,7 +532,7 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        ``result`` is not an identification or has no joint covariance, axes are invalid, or matplotlib is not
+        If `result` is not an identification or has no joint covariance, `ax` is invalid, or matplotlib is not
         installed.
     """
     if result.joint is None:
@@ -648,7 +648,7 @@ def _designed_chart(result: DesignedInput, name: str) -> LineChart:
 
 
 def _spectrum_chart(result: DesignedInput) -> LineChart:
-    """Return the chart of the power below each frequency, as a fraction, of the designed and the square-wave input.
+    """Return a chart of the fraction of input power below each frequency, for designed and square-wave inputs.
 
     A cumulative curve shows differences between line spectra better than the spectrum itself. The optimal periodic
     spectrum is included if it has power.

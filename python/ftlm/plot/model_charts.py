@@ -262,9 +262,10 @@ class TimeResponse(Response):
     Parameters
     ----------
     kind, outputs, inputs, time, values, deviation, final_values
-        ``"step"`` or ``"impulse"``. Names of outputs and inputs. Sample times [s], shape (N,). Responses and their
-        standard deviations (or None), shape (outputs, inputs, N). An impulse response is a mean over each sampling
-        interval, at the middle of the interval. Limits of step responses by (output, input): value and standard error.
+        In this sequence: ``"step"`` or ``"impulse"``; names of outputs; names of inputs; sample times [s], shape (N,);
+        responses, shape (outputs, inputs, N); their standard deviations in the same shape, or None; final values of
+        step responses by (output, input), as (value, standard error). An impulse response is a mean over each sampling
+        interval, at the middle of the interval.
     units
         Units of the signals by name.
     """

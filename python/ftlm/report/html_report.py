@@ -376,8 +376,8 @@ def _with_inputs(
 ) -> list[Figure]:
     """Return charts of the measured and simulated outputs of each compared run, followed by its inputs.
 
-    `runs` starts with the compared runs, which are removed from this list. Inputs of a run that is not in it are
-    omitted. `points` is the maximum number of points of a line.
+    `runs` has the compared runs in the same sequence. Each run whose inputs are drawn is removed from this list. Inputs
+    of a compared run that the list lacks are omitted. `points` is the maximum number of points of a line.
     """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
     charts: list[Figure] = []
@@ -393,7 +393,7 @@ def _with_inputs(
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
-    """Return a ("validation", residual tests) pair for each run that has at least 2 DEFAULT_LAGS + 3 samples."""
+    """Return a ("validation", residual tests) pair for each run with at least ``2 * DEFAULT_LAGS + 3`` samples."""
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * DEFAULT_LAGS + 3]
 
 
@@ -495,7 +495,7 @@ def _order_search_sections(result: Identification) -> list[Section]:
 
 
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
-    """Return charts of the score over each order, and score maps over two orders of searches with two or more."""
+    """Return charts of the score over each order, and over two orders for searches that vary two or more."""
     maps: list[Figure] = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)

@@ -77,7 +77,7 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
 
 
 def parameter_lines(result: Identification) -> list[str]:
-    """Return one text line per parameter with value, standard error, unit, interval by profile and nominal value.
+    """Return one text line per parameter: value, standard error, unit, profile-likelihood interval, nominal value.
 
     The list is empty without parameters.
     """
@@ -134,7 +134,7 @@ def describe_mode(mode: Mode) -> str:
 
 
 def describe_gain(state: SteadyState, model: Model) -> str:
-    """Return text on the steady-state gain from an input to an output, or on the growth of an output without one."""
+    """Return text on a steady-state gain, or on the growth or decay of the step response if there is no such gain."""
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
@@ -148,7 +148,7 @@ def describe_gain(state: SteadyState, model: Model) -> str:
 
 
 def describe_order(state: SteadyState) -> str:
-    """Return text on the standard error of the exponent of t with which a step response grows; empty if it is fixed."""
+    """Return text on the exponent of t in a step response, with its standard error; empty if it is fixed."""
     error = state.order_error
     if not error:
         return ""

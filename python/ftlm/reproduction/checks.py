@@ -53,7 +53,7 @@ class ClaimVerdict:
     Parameters
     ----------
     word
-        Verdict, to which "depends on" adds the factors.
+        Verdict. If it is "depends on", the text of the verdict continues with `factors`.
     factors
         Factors on which the outcome depends, the most decisive first.
     cases, holding_cases
@@ -198,9 +198,9 @@ def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: boo
 
 
 def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
-    """Return text with numbers from multi-innovation (trials) on the first record of the main arm.
+    """Return text with numbers of the multi-innovation trials on the first record of the main arm.
 
-    They are ordered by prior covariance K0 and angle.
+    The numbers are sorted by prior covariance K0, then by angle.
     """
     texts = []
     for prior in PRIOR_COVARIANCES:
@@ -217,7 +217,7 @@ def _printed_text(
 ) -> str:
     """Return text with one number of each fractional row of the paper's Tables 4 and 5, by angle.
 
-    `number` selects it from a row, and `lengths` are the innovation lengths p of the rows.
+    `number` returns this number for a row, and `lengths` are the innovation lengths p of the rows.
     """
     return by_angle({o: [number(printed.FRACTIONAL_ROWS[o][p]) for p in lengths] for o in outputs}, digits)
 
@@ -313,7 +313,7 @@ def recomputed_tables(reproduction: Reproduction) -> Evidence:
 def printed_orders(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that the orders printed in the paper are the best ones.
 
-    It holds for an angle if no neighboring orders on a grid have a smaller equation error.
+    It holds for an angle if no other orders on a grid around the printed ones have a smaller equation error.
     """
     tables = reproduction.as_printed
     return _of_angles({o: t.rank == 1 for o, t in tables.items()}), {
@@ -457,8 +457,8 @@ def fractional_orders(reproduction: Reproduction) -> Evidence:
 def close_orders(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that models with the orders printed in the paper describe the arm.
 
-    It holds for an angle if the normalized residual (NR) of the simulation is small, also relative to that of the
-    equation error.
+    It holds for an angle if the normalized residual (NR) of the simulation is small, both in itself and relative to the
+    NR of the equation error.
     """
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
@@ -503,7 +503,8 @@ def published_form(reproduction: Reproduction) -> Evidence:
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
     """Return three values of each coefficient of eqs. (22)-(25) of the paper, by name.
 
-    They follow from Table 3 of the paper and from the manufacturer's effective parameters, or are printed in the paper.
+    The first value follows from Table 3 of the paper, and the second from the manufacturer's effective parameters. The
+    third value is printed in the paper.
     """
     sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
     coefficients = {}

@@ -124,7 +124,7 @@ class Verdict:
     kind
         Structure with fractional orders, a key of ``FREE_ORDERS_BY_KIND``.
     improves
-        Whether they improve it; None if the test is inconclusive.
+        Whether fractional orders improve the prediction; None if the test is inconclusive.
     words
         Text with the fits and intervals from which the verdict follows.
     """
@@ -263,7 +263,7 @@ class OrderCrossValidation:
     deflections
         Cross-validation of each deflection by its name.
     filtered
-        Whether the measured deflections passed the stock 2 Hz low-pass.
+        Whether the measured deflections passed the 2 Hz low-pass filter of the arm's stock real-time model.
     notes
         Texts on decimation, and on angles that are constant in a part of a run.
     """
@@ -322,7 +322,7 @@ def cross_validate_orders(
         Two or more runs with theta11 and theta12 and (or) theta21 and theta22 [rad]. Runs with more than 1250 samples
         are decimated. Initial terms, initial filter state and gauge offset are estimated for each run.
     filtered
-        Whether the measured deflections passed the 2 Hz low-pass of the arm's stock real-time model.
+        Whether the measured deflections passed the 2 Hz low-pass filter of the arm's stock real-time model.
     threads, progress
         Number of threads and progress callback; see :func:`ftlm.search_orders`.
     log
@@ -417,7 +417,7 @@ def verdict_sentence(output: str, verdict: Verdict) -> str:
 
 
 def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
-    """Return (heading, cross-validation) pairs: for each deflection with, then without the other deflection's rate."""
+    """Return (heading, cross-validation) for each deflection: with, then without the rate of the other deflection."""
     both = [(o, suffix, d) for o, full in result.deflections.items() for suffix, d in _with_and_without(full)]
     return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
 

@@ -57,7 +57,7 @@ PAPER_TABLE_WIDTHS, ESTIMATES_WIDTHS = (5,) * 4 + (9,) * 4 + (8, 8, 7, 8, 8, 8),
 
 
 def paper_table(models: Mapping[str, Candidate], *, title: str = "Identified models") -> Table:
-    """Return a table in the form of the paper's Tables 4 and 5, for models by label that have the same outputs.
+    """Return a table in the form of the paper's Tables 4 and 5, for models (by label) with the same outputs.
 
     Each row has the orders, coefficients, equation errors and output errors of one angle by one model.
     """

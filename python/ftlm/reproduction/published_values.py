@@ -216,7 +216,7 @@ class Interpretation:
     terms
         Signals in the terms of an equation, as a key of `TERM_INTERPRETATIONS`.
     filtered
-        Whether the deflections passed the stock 2 Hz low-pass.
+        Whether the deflections passed the 2 Hz low-pass filter of the arm's stock real-time model.
     reversed
         Whether terms in the angle itself are on the left-hand side, as in a transfer function. This reverses their
         sign.
@@ -255,12 +255,13 @@ class AsPrinted:
     rows
         Recomputed rows by innovation length p.
     ratio
-        Geometric mean factor between recomputed and printed values of coefficient a and normalized residual NR, over
-        all four rows; at least 1.
+        Geometric mean, over all four rows, of the factors between recomputed and printed values of coefficient a and
+        normalized residual NR; at least 1. A wrong sign of a counts as a further factor of 10.
     ratio_at_unit_prior
-        Smallest such factor among interpretations with prior covariance K0 = 1.
+        Smallest such mean among interpretations with prior covariance K0 = 1.
     rank, among
-        Rank of the printed orders by equation error among neighboring orders, and number of these, at p = 7.
+        Rank of the printed orders by equation error among all points of an order grid around them, and number of these
+        points, at p = 7.
     best
         Orders with rank 1, by name.
     scale
@@ -279,7 +280,7 @@ class AsPrinted:
 
     @property
     def matching_trends(self) -> list[str]:
-        """Letters of the coefficients that rise or fall from each innovation length to the next as in the print."""
+        """Letters of the coefficients that rise or fall between innovation lengths as the printed values do."""
         table = FRACTIONAL_ROWS[self.output]
 
         def course(rows: Mapping[int, Any], letter: str) -> list[float]:
@@ -318,8 +319,8 @@ class AsPrinted:
 class _Angle:
     """Regressors of one angle at any orders, and coefficients by the closed form of eq. (44) of the paper.
 
-    `angles` are the block-pulse means of both angles of the joint, `current` those of the motor current, and `step` is
-    the width of a block pulse [s].
+    `angles` has the block-pulse means of both angles of the joint, and `current` has the block-pulse means of the motor
+    current. `step` is the width of a block pulse [s].
     """
 
     def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
@@ -344,12 +345,18 @@ class _Angle:
         return self._transforms[key]
 
     def places(self, terms: str) -> list[str]:
-        """Return the signal ("own", "other" or "u") in each of the terms with coefficients a, b, d and g."""
+        """Return the signal ("own", "other" or "u") in each of the terms with coefficients a, b, d and g.
+
+        `terms` is a key of `TERM_INTERPRETATIONS`.
+        """
         _, hub, deflection = TERM_INTERPRETATIONS[terms]
         return (hub if self.output.endswith("1") else deflection).split()
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
-        """Return the regressors of a, b, d and g, eq. (42) of the paper, in time and as Haar transform, each (m, 4)."""
+        """Return the regressors of a, b, d and g, eq. (42) of the paper, as time signals and Haar transforms.
+
+        Both arrays have the shape (m, 4).
+        """
         names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
         etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
         parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
@@ -359,8 +366,8 @@ class _Angle:
     def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
         """Return the coefficients by eq. (44) of the paper, one array (4,) for each prior covariance.
 
-        They are weighted least-squares estimates with a prior, from the regressors `haar` in M Haar rows. Row i = 1 … M
-        has the weight min(p, M - i + 1) with the innovation length p.
+        They are weighted least-squares estimates with a prior. `haar` are the Haar transforms of the regressors, with M
+        rows. With the innovation length p, row i = 1 … M has the weight min(p, M - i + 1).
         """
         weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
         weighted = haar * weights[:, None]
@@ -391,7 +398,7 @@ def papers_record() -> tuple[Run, dict[str, float]]:
 
 
 def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
-    """Recompute the paper's Tables 4 and 5 by the interpretation of unstated settings that is closest to the print.
+    """Recompute the paper's Tables 4 and 5 with the interpretation of unstated settings that fits them best.
 
     Parameters
     ----------
@@ -560,7 +567,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
 
 
 def one_angle(output: str, p: int) -> Model:
-    """Return the model of a printed row by eq. (26) of the paper: terms in the angle itself and in the current."""
+    """Return the printed model of one angle by eq. (26) of the paper, with terms in this angle and the current only."""
     row = FRACTIONAL_ROWS[output][p]
     terms = [Term(output, Order(float(row.orders[o])), float(row.coefficients[c])) for c, o in ORDER_OF.items()]
     terms.append(Term(f"I{stage_of(output)}", Order(), float(row.coefficients["g"])))
@@ -608,9 +615,9 @@ def _reidentify(
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
     """Identify one equation of a printed model from the run that this model simulates.
 
-    Return the coefficients at the printed `orders`, and the best orders on a grid around them, both by prior covariance
-    K0 and name. The second is empty unless the innovation length p is the largest. A K0 without a finite simulation
-    error is omitted.
+    Return the coefficients at the printed `orders`, and the best orders on a grid around them. Both are dictionaries by
+    prior covariance K0, whose values are dictionaries by name. The best orders are computed only for the largest
+    innovation length p, and are empty otherwise. A K0 without a finite simulation error is omitted.
     """
     own = {n: [orders[n]] for n in single.order_names}
     near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}

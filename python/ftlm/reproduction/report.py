@@ -185,7 +185,7 @@ def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> L
 def _fits_chart(
     models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
 ) -> list[Figure]:
-    """Return a list with one chart: simulations of an angle by several models on one run; empty without that run.
+    """Return a list with one chart of an angle simulated by several models on one run; empty if the run is absent.
 
     The run is the validation run (`sine`) or the estimation run. `place` is the number of the paper's figure.
     """
@@ -606,9 +606,9 @@ def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
 
 
 def _sections(reproduction: Reproduction) -> list[Section]:
-    """Return all sections of the page in their order.
+    """Return all sections of the page, from top to bottom.
 
-    The sections on the sine run and on optimizers are omitted without results.
+    The sections on the sine run and on optimizers are omitted if there are no such results.
     """
     simulated, stages = reproduction.simulated, list(reproduction.stages.values())
     near = [

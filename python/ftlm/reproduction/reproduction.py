@@ -306,8 +306,8 @@ def reproduce(
 class StageOutcome:
     """Result of one job: cases for verdicts on one arm and joint.
 
-    For the estimation run it also has all results of the joint, simulations of the printed models, recomputed tables
-    by angle, and notes.
+    For the main arm or measured runs, it also has all results of the joint, simulations of the printed models,
+    recomputed tables by angle, and notes. For other arms, it has only the cases.
     """
 
     panel: Panel
@@ -338,7 +338,7 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
 def run_jobs(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
 ) -> list[StageOutcome]:
-    """Run all jobs on a number of worker threads, and return their results in the order of the jobs.
+    """Run all jobs on a number of worker threads, and return their results in the sequence of the jobs.
 
     `seconds` is the expected processor time of all jobs. If a job fails, the others are stopped, and its exception is
     raised.

@@ -118,7 +118,7 @@ def demo_run(
     """Return a run of a simulated arm under an input of the paper, with encoder quantization and noise on all angles.
 
     The arm is simulated by the Euler-Lagrange equations (14)-(15) of the paper, in which links move with their hubs as
-    on a real arm. This is not so in its equations (22)-(25).
+    on a real arm. In equations (22)-(25) of the paper, links do not move with their hubs.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def demo_run(
     seed
         Seed of the noise.
     parameters
-        Parameters of the simulated arm; by default that of the demonstration.
+        Parameters of the simulated arm; by default those of the demonstration.
 
     Returns
     -------

@@ -94,7 +94,7 @@ def integer_orders(structure: Structure) -> Structure:
 
 
 def are_usable(*candidates: Candidate) -> bool:
-    """Whether no identified model has the verdict "do not use", with which comparisons would be meaningless."""
+    """True if no identified model has the verdict "do not use". Comparisons with such a model would be meaningless."""
     return not any(c.result is not None and is_degenerate(c.result) for c in candidates)
 
 
@@ -126,7 +126,10 @@ class Candidate:
 
     @property
     def fits(self) -> list[float]:
-        """Fit of the simulation [%]: for each output on the estimation and on the validation run; NaN without a run."""
+        """Fit of the simulation [%], for each output first on the estimation run, then on the validation run.
+
+        The fit is NaN if there is no validation run.
+        """
         runs = self.estimation, self.validation
         return [math.nan if c is None else c.output_error[o].fit for o in self.estimation.output_error for c in runs]
 
@@ -189,7 +192,8 @@ class DroppedDerivative:
     def correlations(self) -> dict[str, float]:
         """Correlation coefficient of the current with each deflection; NaN for a constant signal.
 
-        Keys are "measured", "derived" (simulated by eqs. (14)-(15) of the paper) and "published" (by its (22)-(25)).
+        Keys are "measured", "derived" (simulated by eqs. (14)-(15) of the paper) and "published" (simulated by eqs.
+        (22)-(25) of the paper).
         """
         names = ("measured", "derived", "published")
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -206,7 +210,7 @@ class Stage:
     number
         Number of the joint, 1 or 2.
     candidates
-        Models by label, in the order of the tables.
+        Models by label, in the sequence of the tables.
     traces, weak_traces
         Convergence of the multi-innovation recursion by output and innovation length p. `traces` have K0 = 1 and the
         best orders of each p. `weak_traces` have a weak prior and the orders of p = 7. Empty for a run that does not
@@ -218,7 +222,8 @@ class Stage:
     derived
         Simulations of the deflection with and without the derivative of the current that the paper drops.
     landscape
-        Cost around the output-error fit over its two most correlated orders; None if there are none.
+        Output-error cost around the optimum, as a function of the two most correlated orders; None if there are no two
+        orders with a finite standard error.
     """
 
     number: StageNumber
@@ -265,7 +270,9 @@ def compare_optimizers(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rival:
-    """Compare multi-innovation with a genetic algorithm and differential evolution; `models` of the result is empty.
+    """Compare multi-innovation with a genetic algorithm and differential evolution.
+
+    The models are not computed, so the field `models` of the result is empty.
 
     By default, each seed of an optimizer has as many evaluations as the order grid has candidates.
 
@@ -452,7 +459,10 @@ def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
 
 
 def euler_means(model: Model, run: Run, m: int) -> dict[str, Floats]:
-    """Return block-pulse means (m,) of each output by explicit Euler, as in the paper; infinite if one overflows."""
+    """Return block-pulse means (m,) of each output, simulated by explicit Euler as in the paper.
+
+    All means of an output are infinite if one of its samples is not finite.
+    """
     means = {}
     for name, samples in explicit_euler(model, run).items():
         with np.errstate(over="ignore", invalid="ignore"):
@@ -552,7 +562,7 @@ class Preset:
     rivals_increment: float | None = CONTEST_STEP
 
     def seconds_of(self, step: str) -> float:
-        """Return the expected processor time [s] of the computation that `step` names."""
+        """Return the expected processor time [s] of the step with this name, at the order increments of this preset."""
         return seconds_of(step, self.order_grid.increment, self.rivals_increment)
 
 
@@ -568,7 +578,7 @@ def simulated_panel(
 ) -> Panel:
     """Return the cases for verdicts on one joint of one simulated arm, from one record per seed of the noise.
 
-    Contests and order comparisons use the first record only. They are omitted for the main arm, because
+    Comparisons of optimizers and of orders use only the first record. They are omitted for the main arm, because
     :func:`panel_of` returns them.
     """
     trials: list[Trial] = []
@@ -638,7 +648,7 @@ class StageWork:
             )
 
     def begin(self, words: str, step: str) -> None:
-        """Log the description `words` of the next step, and report its expected processor time as progress."""
+        """Log the description `words` of the next step, and pass its expected processor time to `progress`."""
         self.log(f"stage {self.number}: {words}")
         if isinstance(self.progress, WorkerProgress):
             self.progress.begin(self.preset.seconds_of(step))
@@ -757,7 +767,8 @@ class StageWork:
         """Return the result of an order search of one equation, whose first row is the best candidate.
 
         With prior covariance 1 the simulated deflection is nearly zero. All candidates then have errors close to that
-        of a zero output, and no bound excludes one. So the fine grid is searched only around the best of a coarser one.
+        of a zero output, so no candidate can be excluded by a bound on its error. The fine grid is therefore searched
+        only around the best candidate of a coarser grid.
         """
         work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
@@ -837,7 +848,11 @@ class StageWork:
         return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
 
     def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
-        """Return comparisons of multi-innovation with other optimizers, by output; empty if one is impossible."""
+        """Return comparisons of multi-innovation with other optimizers, by output.
+
+        The result is empty if the preset omits the comparisons. It is also empty if a comparison is impossible; a note
+        then states the reason.
+        """
         if self.preset.rivals_increment is None:
             return {}
         grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
@@ -862,7 +877,10 @@ class StageWork:
         return rivals
 
     def in_published_form(self, model: Model) -> Model:
-        """Return eqs. (22)-(25) of the paper, which drop a derivative, with the parameters of a model by (14)-(15)."""
+        """Return the model by eqs. (22)-(25) of the paper that corresponds to a model by eqs. (14)-(15).
+
+        Equations (22)-(25) drop a derivative.
+        """
         h, d = self.number * 2 - 1, self.number * 2
         values = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
         values |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}

@@ -1,4 +1,4 @@
-"""Processor time that the steps of the reproduction take, and progress of its worker threads."""
+"""Processor time that each step of the reproduction is expected to take, and progress of its worker threads."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def seconds_of_all(
 ) -> float:
     """Return the expected processor time of the whole reproduction [s].
 
-    `stages` is the number of joints, `arms` that of further simulated arms, and `records` that of records per arm.
+    `stages`, `arms` and `records` are the numbers of joints, of further simulated arms, and of records per arm.
     """
     counts = {step: own + arms * other for step, (_, own, other) in STEP_COSTS.items()}
     counts["trials"] += (arms + 1) * records - 1
@@ -92,12 +92,14 @@ class TotalProgress:
             self._course.advance_to(sum(self._seconds_by_worker.values()) / self._seconds)
 
     def end(self) -> None:
-        """Report that all work is finished, also if steps were skipped."""
+        """Report that all work is finished, even if steps were skipped."""
         self._course.advance_to(1.0)
 
 
 class WorkerProgress(Stoppable):
-    """Progress callback of one worker thread, which searches and fits call with (done, total) of their own work.
+    """Progress callback of one worker thread.
+
+    Searches and fits call it with the counts (done, total) of their own work.
 
     Parameters
     ----------
@@ -120,7 +122,8 @@ class WorkerProgress(Stoppable):
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Report that `count` of `total` items of the current step are done.
 
-        A step may count several times. Each count that restarts covers half of the remaining time of the step.
+        A step may count from zero several times. When the count restarts, half of the remaining expected time of the
+        step is regarded as done, and the new count covers the other half.
         """
         super().__call__(count, total, pruned)
         share = count / max(total, 1)

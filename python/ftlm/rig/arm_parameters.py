@@ -79,7 +79,7 @@ class StageParameters:
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
         """Return the coefficients of hub and link equation by name, with the indices of joint 1 or 2 (`stage`).
 
-        `form` is that of the equations; see :class:`ArmParameters`.
+        `form` selects the form of the equations; see :class:`ArmParameters`.
         """
         h, k = 2 * stage - 1, 2 * stage
         hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
@@ -106,7 +106,7 @@ class ArmParameters:
         Inertia of hub 2 divided by the inertia of link 1 with everything that it carries, J_21/J_12.
     reach
         Coupling ratio H/J_22. H is the length of link 1 times the first moment of mass of link 2, and J_22 the inertia
-        of link 2. It is 1 for equally long links with the mass at the tip.
+        of link 2. The ratio is 1 for equally long links with the mass at the tip.
     rotating_share
         Fraction of the hub inertia J_21 that rotates with link 1. A rotor behind a gear contributes only its inertia
         divided by the gear ratio.
@@ -292,7 +292,7 @@ class ArmParameters:
 def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
     """Return the fields of a dataclass, except `name`, as (name, type, default) of optional keys of a TOML file.
 
-    `replaced` are other types for some keys, and types of additional keys.
+    `replaced` are the types of additional keys, and of keys whose type in the file differs from that of the field.
     """
     hints = {**get_type_hints(kind), **replaced}
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]

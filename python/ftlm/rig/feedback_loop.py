@@ -168,7 +168,7 @@ def _of_both_joints(controller: Controller) -> Controller:
 
 
 def _rate_of(controller: Controller, rate: float | None) -> float:
-    """Return the sampling rate [Hz]: `rate`, or that of the controller, or the default.
+    """Return the sampling rate [Hz]: `rate` if it is given, otherwise the rate of the controller, or else the default.
 
     Raise ModelError if it is out of range or differs from the rate of the controller.
     """

@@ -94,7 +94,10 @@ def _no_library(error: OSError) -> RigFault:
 
 
 def driver_state() -> str:
-    """Return text on whether vendor package, library and board were found; the board is opened and closed for this."""
+    """Return a text that states whether the vendor's package, its library and a board were found.
+
+    The board is opened and closed for this check.
+    """
     try:
         _driver()
     except RigFault as fault:
@@ -273,7 +276,7 @@ class QuanserBoard:
                 return
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply current commands [A], shape (n, 2), and record one sample per command.
+        """Apply commands of the motor currents [A], shape (n, 2), and record one sample per command.
 
         Each read blocks until the board has the next sample. The method returns early if `guard`, which enforces the
         safety limits, latches a fault.
@@ -376,9 +379,9 @@ class QuanserBoard:
     def _run_unless_expired(self, act: Callable[[], None], *, is_end: bool) -> None:
         """Perform an action on the board.
 
-        An error of the action is ignored if `is_end` is True and the watchdog has expired. `is_end` states that an
-        expired watchdog has the same effect as the action (0 V or disabled amplifiers). The expired watchdog is not
-        cleared, because that would restore the previous outputs.
+        `is_end` states that the action only does what an expired watchdog also does (0 V or disabled amplifiers). An
+        error of such an action is ignored if the watchdog has expired. The expired watchdog is not cleared, because
+        that would restore the previous outputs.
         """
         try:
             act()

@@ -165,7 +165,7 @@ def save_run(
     ended: BaseException | None,
     faults: list[str],
 ) -> Run:
-    """Write a recorded run to its final file, and return the run or raise the exception of its early end.
+    """Write a recorded run to its final file, and return the run, or raise the exception that ended it early.
 
     Parameters
     ----------
@@ -344,17 +344,20 @@ def record(
 
 
 class CommandSource(Protocol):
-    """Protocol of an object that supplies the current commands of a run; `rows` is their number."""
+    """Protocol of an object that supplies the commands of the motor currents in a run.
+
+    `rows` is the number of commands.
+    """
 
     rows: int
     #: Additional input signals of the run by name, one value per sample.
     extra_signals: dict[str, Floats]
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return the first current commands [A], shape (n, 2) with n at most `block`."""
+        """Return the first commands [A] of the motor currents, shape (n, 2) with n at most `block`."""
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the current commands [A] after the last measured samples `rows`; empty at the end of the run."""
+        """Return the commands [A] that follow the last measured samples `rows`; empty at the end of the run."""
 
     def explain_fault(self, fault: str) -> str:
         """Return a fault message, with an added explanation if this source contributed to the fault."""
@@ -506,7 +509,7 @@ class Experiment:
 
 
 class FixedCommands:
-    """Command source with precomputed current commands [A], shape (rows, 2)."""
+    """Command source with precomputed commands of the motor currents [A], shape (rows, 2)."""
 
     def __init__(self, commands: Floats) -> None:
         self.commands, self.rows = commands, len(commands)
@@ -566,7 +569,8 @@ class _Recorder:
     """Recorder that runs the commands of a source on a rig, and stores the samples in memory and in a file.
 
     `columns` are the indices of the rig's columns for the signals of `live`. `block` is the number of samples that are
-    written to the file together. `taken` are all recorded samples, and `live_error` is the error of a failed `live`.
+    written to the file together. `taken` are all recorded samples. `live_error` is the message of the error that ended
+    the recursive identification `live`, or None.
     """
 
     partial: PartialRecording
@@ -623,7 +627,7 @@ class _Recorder:
             self.progress(self.done, self.source.rows)
 
     def _columns(self, blocks: list[Floats], start: int) -> Floats:
-        """Return samples from consecutive blocks without their delay, with the extra signals of the source appended.
+        """Return samples of consecutive blocks without the delay column, with the extra signals of the source appended.
 
         `start` is the index of the first sample in the run.
         """

@@ -32,7 +32,7 @@ class OutputGate:
     """Lock for writes to a board. After the gate is closed, no thread can write anything but 0 V.
 
     :class:`Rig` assigns a gate to its board for each session. A user-defined board must acquire `lock` for every write.
-    Before it writes another voltage than 0 V or enables the amplifiers, it must call :meth:`check`.
+    Before it writes a voltage other than 0 V or enables the amplifiers, it must call :meth:`check`.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class InterruptWatch:
         return hasattr(faulthandler, "register")
 
     def add(self, board: Board) -> None:
-        """Register a board whose motors are stopped at the next termination signal with a Python handler.
+        """Register a board, so that the next termination signal with a Python handler stops its motors.
 
         A termination signal without a Python handler ends the program.
         """
@@ -220,13 +220,16 @@ class SignalHandlers:
     def keep(self) -> None:
         """Install the handlers until :meth:`release` is called.
 
-        After the first signal, or after shutdown of the rig, further signals are deferred.
+        Signals that arrive after the first one, or after shutdown of the rig, are deferred.
         """
         self._is_persistent = True
         self.install()
 
     def restore(self) -> None:
-        """Restore all previous handlers; after :meth:`keep`, defer signals until :meth:`release` instead."""
+        """Restore all previous handlers.
+
+        After :meth:`keep`, leave the handlers installed instead, and defer signals until :meth:`release`.
+        """
         if self._is_persistent:
             self._deferring = True
         else:
@@ -255,7 +258,7 @@ class SignalHandlers:
             _end(number)
 
     def _restore(self) -> None:
-        """Restore all previous handlers; the signals are blocked during this if the system supports it."""
+        """Restore all previous handlers, while the signals are blocked if the system supports blocking."""
         if self._board is not None and self._watched:
             self._watched = False
             INTERRUPT_WATCH.remove(self._board)
@@ -341,12 +344,12 @@ class Limits:
     deflection
         Maximum magnitude of a link deflection [rad].
     saturation
-        Magnitude of a strain-gauge voltage [V] from which the gauge counts as saturated.
+        Magnitude of a strain-gauge voltage [V] at and above which the gauge counts as saturated.
     moving_current
         Current above which a hub must move [A]. At a smaller current it may stick.
     standstill
-        Maximum duration [s] for which a hub may stand still while its current exceeds `moving_current`. It is also that
-        for which a strain gauge may show no change after the current has changed by `moving_current`.
+        Maximum duration [s] for which a hub may stand still while its current exceeds `moving_current`. The same limit
+        applies to a strain gauge whose voltage does not change after the current has changed by `moving_current`.
     fastest
         Maximum plausible hub speed [rad/s]. A faster change of the encoder count is an encoder fault.
     max_write_delay
@@ -397,7 +400,10 @@ class Limits:
 
 
 class Board(Protocol):
-    """Protocol of the interface board of a rig. :class:`Rig` calls the methods in the order of their definition."""
+    """Protocol of the interface board of a rig.
+
+    :class:`Rig` calls the methods in the sequence in which they are defined.
+    """
 
     name: str
     hardware: bool
@@ -435,7 +441,7 @@ class Board(Protocol):
         """Read a number of samples with outputs at 0 V, over which `guard` averages the bias of the strain gauges."""
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply current commands [A], shape (n, 2), and record one sample per command.
+        """Apply commands of the motor currents [A], shape (n, 2), and record one sample per command.
 
         The method returns early if `guard`, which enforces the safety limits, latches a fault.
         """
@@ -463,8 +469,8 @@ def shut_down(board: Board) -> list[str]:
     earlier one failed, and is repeated once if it is interrupted, as by a second Ctrl-C. If 0 V cannot be written or
     the amplifiers cannot be disabled, the function waits until the watchdog expires, which does both.
 
-    If neither 0 V nor disabled amplifiers nor the expiry is confirmed, the motors may still have current. The watchdog
-    is then not stopped and the board not closed, so that the watchdog can still act.
+    If none of the three (0 V, disabled amplifiers, expiry) is confirmed, the motors may still carry current. The
+    watchdog is then not stopped and the board not closed, so that the watchdog can still act.
     """
     errors: list[str] = []
     _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), errors)
@@ -621,7 +627,7 @@ class Rig:
             raise RigFault(fault if fault.startswith(self.board.name) else f"{self.board.name}: {fault}")
 
     def run(self, commands: Floats) -> None:
-        """Apply current commands [A], shape (n, 2), and record one sample per command for :meth:`take`.
+        """Apply commands of the motor currents [A], shape (n, 2), and record one sample per command for :meth:`take`.
 
         Raises
         ------

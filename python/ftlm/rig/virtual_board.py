@@ -173,7 +173,7 @@ class VirtualBoard:
         self._require_arm().rest(guard, self._random.standard_normal((samples, 4)), self._output_volts)
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply current commands [A], shape (n, 2), to the simulated arm, and record one sample per command."""
+        """Apply commands of the motor currents [A], shape (n, 2), to the simulated arm; record one sample for each."""
         if not self._started:
             raise RigFault("virtual rig: the task is not started; call start() first")
         self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
@@ -187,7 +187,7 @@ class VirtualBoard:
         self._started = False
 
     def let_expire(self) -> bool:
-        """Wait until the watchdog has expired; return whether it has, with outputs at 0 V."""
+        """Wait for the watchdog to expire, and return whether it has expired and the outputs are at 0 V."""
         page, process = self._page, self._process
         if page is None:
             return True

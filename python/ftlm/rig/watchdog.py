@@ -1,9 +1,9 @@
 """Output registers and watchdog process of the virtual rig. The process stops the motors if the program ends.
 
-As a script with the path of a register file, the module monitors the heartbeat of the program. It imports nothing from
-ftlm and no slow module. Its rules are those of the real board. On expiry, the analog outputs take their expiration
-states only if these are set and the digital lines are set to tristate. Otherwise they keep their values. After an
-expiry, the outputs remain locked until the watchdog is cleared.
+If the module is run as a script with the path of a register file, it monitors the heartbeat of the program. It imports
+nothing from ftlm and no slow module. Its rules are those of the real board. On expiry, the analog outputs take their
+expiration states only if these are set and the digital lines are set to tristate. Otherwise they keep their values.
+After an expiry, the outputs remain locked until the watchdog is cleared.
 """
 
 from __future__ import annotations
@@ -111,10 +111,11 @@ def create_page_file() -> Path:
 
 
 def watch(path: str, *, keep: bool) -> None:
-    """Monitor the heartbeat in a register file, and apply the expiration states if it stops for the timeout.
+    """Monitor the heartbeat in a register file; apply the expiration states if it stops for longer than the timeout.
 
-    The function returns when the program closes the registers, or when the program has ended and, if the watchdog was
-    started, has expired. With `keep` False the file is then removed.
+    The function returns when the program closes the registers. If the program has ended without doing so, the function
+    returns after the watchdog has expired, or at once if the watchdog was not started. The file is then removed unless
+    `keep` is True.
     """
     page = RegisterPage(path)
     parent = os.getppid()
@@ -148,7 +149,8 @@ def watch(path: str, *, keep: bool) -> None:
 def trip(page: RegisterPage, now: float) -> None:
     """Mark the watchdog as expired, and apply the expiration states to the outputs by the rules of the real board.
 
-    `now` is the time [s] that is recorded as the time of expiry. Repeated calls override concurrent writes.
+    `now` is the time [s] that the first call records as the time of expiry. Repeated calls apply the states again, and
+    thus override outputs that the program has written in the meantime.
     """
     if not page.has_expired:
         page.set("tripped", now)

@@ -66,9 +66,10 @@ class Record:
         Power series of the sensor filter on the block pulses, if the filter is applied to every signal that was not
         measured through it; otherwise None.
     initial
-        Initial conditions of the run, with a decision for ``"auto"``.
+        Initial conditions of the run; for ``"auto"``, those that were chosen.
     offset
-        Offset option of the structure; ``"none"`` for a level, which is subtracted from the samples.
+        Offset option of the structure; ``"none"`` if this option is ``"level"``, because the levels are already
+        subtracted from the samples.
     states
         Number of initial states of the sensor filter, estimated for each filtered output together with its initial
         terms.
@@ -140,9 +141,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smo
     """Return the block-pulse record of a run for a structure, with delays and sensor filter applied.
 
     The record has a row for each signal and each non-linear term. Between samples, outputs are linear and inputs follow
-    the intersample behavior of the run. `m` is the number of block pulses. A number above that of the sampling
-    intervals is allowed only without a comparison with measurements. With `filtered`, the sensor filter is applied to
-    signals that were not measured through it, as the equation error requires. With `smooth`, signals are smoothed if a
+    the intersample behavior of the run. `m` is the number of block pulses. It may exceed the number of sampling
+    intervals only if nothing is compared with measurements. With `filtered`, the sensor filter is applied to signals
+    that were not measured through it; the equation error requires this. With `smooth`, signals are smoothed if a
     non-linear term contains their derivatives. Missing samples of outputs are interpolated, and must not be fitted.
 
     Raise FtlmError for a missing signal, a signal whose squares underflow, a delay of an output or a missing sample of
@@ -230,7 +231,9 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
 
 
 def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
-    """Return a signal of a run, or the sign of its rate (prefix ``coulomb_``), in the form that the Rust core takes.
+    """Return a signal of a run in the form that the Rust core takes.
+
+    For a name with the prefix ``coulomb_``, the signal is the sign of the derivative of the signal after the prefix.
 
     Raise DataError if the run lacks the signal, and ModelError for a delay of an output or too large a lead.
     """
@@ -294,7 +297,7 @@ def apply_input_nonlinearity(run: Run, structure: Structure) -> Run:
 def check_derivative_orders(run: Run, structure: Structure, order_values: Mapping[str, float] | None = None) -> None:
     """Raise ModelError for a term whose order is too high for the samples of its signal.
 
-    For an equation of order alpha, the order of a signal other than its output must be below alpha + 1. The order of a
+    In an equation of order alpha, the order of every signal except the output must be below alpha + 1. The order of a
     zero-order-hold input must be at most alpha, because jumps have no derivative. `order_values` are values of free
     orders by name; terms with other free orders are not checked.
     """
@@ -504,7 +507,7 @@ def order_grid_tuple(
 
 
 def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
-    """Return the constant of an affine order, and its weight of each free order in `names` (0 if absent)."""
+    """Return the constant of an affine order, and the weight of each free order in `names` (0 for an absent one)."""
     weights = dict(order.weights)
     return order.constant, [weights.get(n, 0.0) for n in names]
 

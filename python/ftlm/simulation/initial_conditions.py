@@ -61,7 +61,8 @@ class StartSettings:
     Parameters
     ----------
     quiet_rows
-        Minimum number of samples before an input changes that can show rest ("quiet" samples).
+        Minimum number of samples before the first change of an input ("quiet" samples) that are accepted as evidence of
+        rest.
     sigmas
         Number of standard errors within which slope, standard deviation and mean of quiet samples are consistent
         with noise.
@@ -71,17 +72,18 @@ class StartSettings:
         Noise assumed for a noise-free signal, as a fraction of its standard deviation.
     drift_share
         Maximum standard error of a drift in the quiet samples, extrapolated to the whole run, as a fraction of the
-        output's standard deviation. It is checked only if an input begins at a nonzero value and an input changes more
-        than once.
+        output's standard deviation. It is checked only if at least one input begins at a nonzero value, and at least
+        one input changes more than once.
     outlier_share
         Maximum fraction of quiet samples that may be outliers; one outlier is always allowed.
     rounding
         Change of an input, relative to its largest value, below which it counts as constant.
     slow_share
-        Change of an output between samples, as a fraction of its median change, below which it counts as slow. The
-        noise must be smaller as well.
+        Maximum change of an output between two samples, as a fraction of its median change, at which the output counts
+        as slow. The output is only tested if its noise is below this change as well.
     moving_share
-        Minimum fraction of samples in which an output is not slow. A slow start of such an output shows rest.
+        Minimum fraction of samples in which an output must not be slow, so that a slow start of this output is evidence
+        of rest.
     white_inflation
         Variance inflation of the mean of the residuals (1 for white noise) above which the structure is regarded as
         incomplete.
@@ -112,8 +114,9 @@ class RestEvidence:
     Parameters
     ----------
     rows
-        Number of samples in which inputs and outputs are constant before an input changes. It is 1 if only the outputs
-        are at rest, at zero. It is 0 if no input changes after the second sample, so that rest is an assumption.
+        Number of samples in which inputs and outputs are constant before an input changes. It is 1 if the evidence is
+        that the outputs start slowly at zero. It is 0 if no input changes after the second sample; rest is then an
+        assumption.
     levels
         Constant value of each output before the run.
     inputs
@@ -184,7 +187,10 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
 
 
 def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
-    """Return evidence of rest from outputs that start at zero and change slowly at first, for any inputs; else None."""
+    """Return the evidence that outputs start at zero and change slowly at first; None if they do not.
+
+    The inputs may be arbitrary.
+    """
     series = [run[n] for n in outputs]
     if run.sample_times is not None or not all(map(is_rest, series)) or not _starts_slowly(series):
         return None
@@ -192,7 +198,10 @@ def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]
 
 
 def _starts_slowly(outputs: Sequence[Floats]) -> bool:
-    """Whether outputs that change in most samples, at least one, change little between their first two samples."""
+    """True if every output that changes in most samples changes little between its first two samples.
+
+    False if no output changes in most samples.
+    """
     conclusive = False
     for samples in outputs:
         noise = START_SETTINGS.sigmas * math.sqrt(2.0) * noise_at_start(samples)
@@ -243,9 +252,9 @@ def _slope_weight(rows: int) -> float:
 def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     """Return the structure with initial conditions and offset for runs whose plant was at rest before the first sample.
 
-    Initial terms and offsets that the user gave are kept. ``"auto"`` becomes ``"rest"``, but is kept if a run may have
-    been in motion. The offset becomes ``"level"`` if outputs or inputs were at rest at nonzero values, or if it is
-    ``"constant"`` and no input changes.
+    Initial terms and offsets that the user gave are kept. The initial conditions ``"auto"`` become ``"rest"``, but
+    remain ``"auto"`` if a run may have been in motion. The offset becomes ``"level"`` if outputs or inputs were at rest
+    at nonzero values, or if it is ``"constant"`` and no input changes.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):

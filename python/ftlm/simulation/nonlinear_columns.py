@@ -21,7 +21,10 @@ SMOOTHING_POINTS, SMOOTHING_DEGREE = 31, 3
 
 
 def nonlinear_columns(structure: Structure) -> dict[str, Expression]:
-    """Return the expressions of the non-linear terms by the names of their rows in a record, in order of appearance."""
+    """Return the expressions of the non-linear terms by the names of their rows in a record.
+
+    They have the sequence of the terms.
+    """
     return {t.column: t.nonlinear for e in structure.equations for t in e.terms if t.nonlinear is not None}
 
 
@@ -112,7 +115,10 @@ def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> 
 
 
 def smooth_locally(values: Floats) -> Floats:
-    """Return values smoothed by local polynomials (Savitzky and Golay 1964); fewer than 31 values stay unchanged."""
+    """Return values smoothed by local polynomials (Savitzky and Golay 1964).
+
+    An array of fewer than 31 values is returned unchanged.
+    """
     points, half = SMOOTHING_POINTS, SMOOTHING_POINTS // 2
     if values.size < points:
         return values

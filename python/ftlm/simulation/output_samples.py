@@ -73,8 +73,8 @@ class OutputSamples:
     refinement
         Number of block pulses per sampling interval on the finest grid; 1 for an exact simulation.
     change
-        Change of the samples of each output in the last halving of the step, relative to its largest value; infinite
-        with fewer than three grids.
+        For each output, the change of its samples in the last halving of the step, relative to its largest value;
+        infinite with fewer than three grids.
     """
 
     outputs: Floats
@@ -84,7 +84,7 @@ class OutputSamples:
 
 
 def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
-    """Return the distinct exponents e of the powers t^e that enter an equation, in ascending order.
+    """Return the distinct exponents e of the powers t^e that enter an equation, sorted from lowest to highest.
 
     The powers are the initial terms and the offset. `states` initial states of a sensor filter are represented by the
     exponents -1, -2 and so on. All orders must be fixed.
@@ -142,7 +142,7 @@ def simulate_samples(
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Return simulated samples, shape (outputs, N), and coefficients of initial terms by output and exponent.
 
-    Samples are at the uniform sample times of the run, or at given `times` [s], and not finite if the simulation
+    Samples are at the uniform sample times of the run, or at given `times` [s]. They are not finite if the simulation
     diverges. The simulation uses `every` block pulses per sampling interval. `initial` are given initial terms; with
     None, they are fitted to the run.
     """

@@ -161,6 +161,6 @@ def exact_samples(
 ) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
     """Return exact samples (outputs, N) of a model with integer orders, and its initial terms (exponent, coefficient).
 
-    None if the model must be discretized.
+    The result is None if the model must be discretized.
     """
     return core.exact_samples(terms, stop_flag())

@@ -1,1 +1,1 @@
-"""Structures: orders, equations, input non-linearities, sensor filters and their language."""
+"""Structures: orders, equations, input non-linearities and sensor filters, and the syntax of equation texts."""

@@ -51,8 +51,8 @@ class Element:
     parameters
         Name suffix and unit of each parameter. The suffix is empty if the parameter has the name of the element.
     impedance
-        Function of s and the parameters that returns the impedance and its derivatives. They are with respect to the
-        logarithm of each positive parameter, and with respect to an exponent itself.
+        Function of s and the parameters that returns the impedance and its derivatives. Derivatives are with respect to
+        the logarithm of each positive parameter, but with respect to an exponent itself.
     ratio
         Function of the parameters that returns numerator and denominator of the impedance as sums of powers of s; None
         if the impedance is not such a ratio.

@@ -60,7 +60,7 @@ class Term:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Signals of the term, in order of first use."""
+        """Signals of the term, in the sequence in which they first occur."""
         if self.nonlinear is None:
             return (self.signal,)
         return tuple(dict.fromkeys(signal for signal, _ in self.nonlinear.channels))
@@ -232,7 +232,7 @@ class Friction:
 
     @property
     def numbers(self) -> list[float]:
-        """Coulomb coefficient, then coefficient and speed of a Stribeck term; no parameter may be free."""
+        """Coulomb coefficient and, with a Stribeck term, its coefficient and speed; no parameter may be free."""
         stribeck_term = self.stribeck
         return [
             float(v)
@@ -243,7 +243,7 @@ class Friction:
         ]
 
     def with_numbers(self, values: Sequence[float]) -> Friction:
-        """Return the friction with other parameter values, which have the sequence of :attr:`numbers`."""
+        """Return the friction with new parameter values, given in the sequence of :attr:`numbers`."""
         coefficient, *near = values
         stribeck_term = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
         return replace(self, coefficient=coefficient, more=stribeck_term)
@@ -262,7 +262,7 @@ class Friction:
 
 
 def _format_coefficient(coefficient: str | float, factor: float) -> str:
-    """Return a friction coefficient as text, multiplied by minus its negative factor."""
+    """Return -`factor` times a friction coefficient as text; it has no minus sign, because `factor` is negative."""
     if isinstance(coefficient, str):
         return coefficient if factor == -1 else f"{-factor!r} {coefficient}"
     return f"{-factor * coefficient!r}"
@@ -397,7 +397,7 @@ class Equation:
             )
 
     def check_input_orders(self, outputs: Sequence[str]) -> None:
-        """Raise ModelError if the order of an input is not below alpha, so that the output jumps with the input.
+        """Raise ModelError if the order of an input is not below alpha, as the output would then jump with the input.
 
         Equations with friction or non-linear terms must pass this check. Friction depends on the velocity of the
         output, and a non-linear term on the values of the output within a block pulse, so both require a continuous
@@ -425,22 +425,22 @@ class Equation:
 
     @property
     def nonlinear_terms(self) -> tuple[Term, ...]:
-        """Non-linear terms, in order of appearance."""
+        """Non-linear terms, in the sequence in which they occur."""
         return tuple(t for t in self.terms if t.nonlinear is not None)
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the signals: the output, then the others in order of appearance."""
+        """Names of the signals: the output, then the others in the sequence in which they first occur."""
         return tuple(dict.fromkeys([self.output, *(s for t in self.terms for s in t.signals)]))
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Names of the free orders, in order of appearance."""
+        """Names of the free orders, in the sequence in which they first occur."""
         return tuple(dict.fromkeys(n for o in (self.order, *(t.order for t in self.terms)) for n in o.names))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
-        """Names of the free coefficients, in order of appearance."""
+        """Names of the free coefficients, in the sequence in which they first occur."""
         friction = () if self.friction is None else self.friction.names
         return (*(t.coefficient for t in self.terms if isinstance(t.coefficient, str)), *friction)
 

@@ -60,7 +60,7 @@ class Expression:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """(signal, order of its derivative) pairs in the expression, in order of first use."""
+        """(signal, order of its derivative) pairs in the expression, in the sequence in which they first occur."""
         if self.operation == "channel":
             return ((self.signal, self.value),)
         return tuple(dict.fromkeys(c for argument in self.arguments for c in argument.channels))

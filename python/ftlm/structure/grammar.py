@@ -164,7 +164,10 @@ class EquationParser(TokenReader):
         return self
 
     def _check_delayed_signals(self) -> None:
-        """Raise ModelError for a delayed output, a signal differentiated on the left-hand side, and for two delays."""
+        """Raise ModelError if an output has a delay, or if a signal has two different delays.
+
+        Signals that are differentiated on the left-hand side are outputs.
+        """
         outputs = {item.signal for item in self.left if item.order.names or item.order.constant}
         late = next((signal for signal in self.delays if self.delays[signal] != 0.0 and signal in outputs), None)
         signal = self._twice_delayed if late is None else late
@@ -183,7 +186,10 @@ class EquationParser(TokenReader):
         return terms
 
     def _sum(self, *, is_lhs: bool = False, closed: bool = False) -> list[ParsedTerm]:
-        """Parse a sum up to the first token that cannot continue it; store offset and friction, return other terms."""
+        """Parse a sum up to the first token that cannot continue it, and return its terms.
+
+        Its offset and friction are stored instead of returned.
+        """
         terms: list[ParsedTerm] = []
         for sign in self._signs():
             if self._is_offset():
@@ -246,7 +252,7 @@ class EquationParser(TokenReader):
         return factor
 
     def _continues_after_name(self) -> bool:
-        """Whether the next name is a coefficient, because a signal, a derivative or a sum follows it."""
+        """Whether the next name is a coefficient, which is the case if a signal, a derivative or a sum follows it."""
         kind, value, _ = self._peek(1)
         if self._peek()[1] in self._signals:
             return False
@@ -746,7 +752,10 @@ class EquationParser(TokenReader):
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
-        """Whether a token ends a transfer function: its input name if `is_named`, otherwise the end of its term.
+        """True if a token ends a transfer function.
+
+        If `is_named`, this is the name of the input at its end; otherwise it is the next plus or minus sign or the end
+        of the text.
 
         `symbols` are the three tokens after the token.
         """

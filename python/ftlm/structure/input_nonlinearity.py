@@ -141,14 +141,17 @@ class InputNonlinearity:
 
 
 def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlinearity]:
-    """Return non-linearities in the order in which they act: dead zones, then saturations."""
+    """Return non-linearities in the sequence in which they act: dead zones, then saturations."""
     return sorted(limits, key=lambda limit: limit.law == "saturation")
 
 
 def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
-    """Return the non-linearities with new values for one kind (`law`), by input, in the order in which they act."""
+    """Return the non-linearities in the sequence in which they act, with one kind of them replaced.
+
+    Those of the kind `law` are replaced by new ones with `values` by input.
+    """
     others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()

@@ -82,7 +82,8 @@ def equation(
         given exponents. ``"auto"`` chooses rest in three cases: the outputs start at zero, they are constant in at
         least five samples before an input changes, or the inputs are constant over the run (with a finding). A nonzero
         level of the outputs is then estimated, and the first value of each input is subtracted. Otherwise ``"auto"``
-        chooses Caputo for integer orders or if the data require no more, else history.
+        chooses ``"caputo"`` if all orders are integers or the data require no further initial terms, and ``"history"``
+        if not.
     sensor_filter
         Known filter through which some signals were measured; see :class:`ftlm.SensorFilter`.
     offset

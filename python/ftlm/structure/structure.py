@@ -81,7 +81,8 @@ class Hints:
     highest_order_range
         (lower, upper) interval in which the highest order of an equation usually lies; None for a default interval.
     nominal_orders
-        Typical values of free orders by name. They give additional initial guesses if every free order has values.
+        Typical values of free orders by name. They give additional initial guesses, but only if there are typical
+        values for every free order.
     order_names_by_coefficient
         Names of free orders by the coefficient of their term. :meth:`Structure.equation` uses them for the free orders
         that replace expressions of an order law.
@@ -280,7 +281,7 @@ class Structure:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of all signals: outputs in the order of their equations, then the others alphabetically."""
+        """Names of all signals: outputs in the sequence of their equations, then the others alphabetically."""
         return (*self.outputs, *sorted({s for e in self.equations for s in e.signals} - set(self.outputs)))
 
     @property
@@ -329,7 +330,7 @@ class Structure:
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Names of the free orders: first those that are the whole order of a term, then those only in expressions."""
+        """Names of the free orders: first those that equal the order of a term, then those only in expressions."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
         alone = [o.names[0] for o in orders if o.is_single]
         return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
@@ -382,8 +383,8 @@ class Structure:
     def equation(self, output: str) -> Structure:
         """Return the equation of one output as a structure, with measured coupling and without order laws.
 
-        An order that is an expression of free orders becomes one free order, or 0 for a term of inputs only. Numbers
-        and single free orders are unchanged.
+        An order that is an expression of free orders becomes a single free order. In a term without modeled outputs, it
+        becomes 0. Numbers and single free orders are unchanged.
 
         Raises
         ------
@@ -487,7 +488,7 @@ class Structure:
 
     @property
     def limits(self) -> tuple[InputNonlinearity, ...]:
-        """Saturations and dead zones of inputs, in the order in which they act."""
+        """Saturations and dead zones of inputs, in the sequence in which they act."""
         return () if isinstance(self.input_nonlinearities, UnsetType) else self.input_nonlinearities
 
     @property
@@ -570,7 +571,9 @@ def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
 
 
 def restrict_structure(structure: Structure, equations: tuple[Equation, ...], **changes: Any) -> Structure:
-    """Return a structure with the given equations and only the options of their orders and signals.
+    """Return a structure with other equations, and only those options that concern them.
+
+    Grids, delays, non-linearities and filtered signals are kept if their order or signal occurs in the equations.
 
     `changes` are new values of other fields.
     """

@@ -1,4 +1,4 @@
-"""Automatic structure of one output: integer-order transfer functions and variants, then fractional orders.
+"""Automatic selection of the structure of one output: integer-order forms and variants, then fractional orders.
 
 The variants have zeros, delays, friction or an offset.
 """
@@ -104,7 +104,8 @@ class IntegerOrderForm:
 def _with_offset(structure: Structure, offset: str) -> Structure:
     """Return a structure with an offset; for an integrating plant ``"level"`` becomes ``"constant"``.
 
-    No level of the output describes the response of an integrating plant to the offset of an input sensor.
+    The offset of an input sensor makes the output of an integrating plant ramp, which a constant level of the output
+    cannot describe.
     """
     level = "constant" if structure.integrates else "level"
     return replace(structure, offset=check_offset(level if offset == "level" else offset))
@@ -159,8 +160,8 @@ class OutputProblem:
     def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
         """Return the delays [s] by input: a number, or an interval (lower, upper) in which the delay is estimated.
 
-        With `delayed`, inputs without a given delay get a free one. Otherwise only given delays that exclude 0 are
-        returned.
+        With `delayed`, the result has every input, with a free delay where the user gave none. Otherwise it has only
+        the given delays that are above 0, or whose lower bound is above 0.
         """
         inputs = [n for n in self.drivers if n in self.runs[0].inputs]
         delays = {n: d for n, d in self.delays.items() if n in inputs}
@@ -205,7 +206,7 @@ class AutomaticSelection:
     feedback: tuple[str, ...] = field(default=(), init=False)
 
     def run(self) -> list[Trial]:
-        """Fit the candidates, validate the best ones, and return the trials of this evaluator."""
+        """Fit the candidates, validate the best ones, and return all trials of the `evaluator`."""
         fits = self._fit_integer_orders()
         if fits:
             # High orders overfit under colored noise, so the best form of each order is validated, whatever its BIC.
@@ -260,9 +261,9 @@ class AutomaticSelection:
         return fits
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
-        """Return the inputs that depend on the output through feedback, by the residuals of the best form.
+        """Return the inputs that depend on the output through feedback, as tested on residuals of the best form.
 
-        The form must not have direct feedthrough.
+        This form must not have direct feedthrough.
 
         Feedback and direct feedthrough both correlate an input with the output in the same sample. With negative
         feedback the correlation and the static gain have opposite signs.
@@ -285,7 +286,7 @@ class AutomaticSelection:
         return tuple(names)
 
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
-        """Return the fits extended by those of neighbors of the best forms, sorted by BIC.
+        """Return the given fits and further fits of neighbors of the best forms, sorted by BIC.
 
         A form of high order can approximate a missing property, such as a level or direct feedthrough. The search
         therefore moves to neighbors that have the property at a lower order, while BIC decreases.
@@ -433,7 +434,10 @@ class AutomaticSelection:
 
 
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
-    """Return the form with the lowest BIC of each order; BIC uses the variance inflation of the same order."""
+    """Return the form with the lowest BIC for each order.
+
+    The BIC of an order uses the smallest variance inflation among the fits of this order.
+    """
     forms = [f for f in fits if f.form is not None]
     orders = sorted({f.form.order for f in forms if f.form})
     return [g.form for n in orders if (g := _rank([f for f in forms if f.form and f.form.order == n])[0]).form]
@@ -461,14 +465,17 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
-    """Return the decrease of the lowest BIC by forms with a property; 0 if no form has the property."""
+    """Return by how much a property lowers the lowest BIC of all forms; 0 if no form has the property."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
 def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
-    """Return the frequency [rad/s] of the oscillatory mode at order 2, or else of the pole at order 1; default 1."""
+    """Return the natural frequency [rad/s] of an underdamped form of order 2.
+
+    Without such a form, return the pole frequency of a form of order 1, or else 1.
+    """
     for order in (2, 1):
         for item in fits:
             if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (

@@ -47,10 +47,10 @@ POINTS_PER_TASK = 16
 
 
 class TaskPool(Protocol):
-    """Protocol of a pool that maps a function over items and keeps their order."""
+    """Protocol of a pool that applies a function to items and returns the results in the sequence of the items."""
 
     def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results for the items in the same order."""
+        """Return the results of `work` for all items, in the sequence of the items."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,8 @@ class BaseModel:
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
         """Return the coefficients of the output terms at a grid point.
 
-        They are g ω^(α-ν) for a term of order ν, with g = 1 for the lowest order.
+        The coefficient of a term of order ν is -g ω^(α-ν) with the frequency ω, where g is 1 for the lowest order and
+        the damping for the other order.
         """
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
@@ -138,7 +139,7 @@ class BaseModel:
 
 @dataclass
 class Products:
-    """Inner products of the column responses and of the residual without inputs.
+    """Inner products between the responses of the columns and the residual of the model without inputs.
 
     ``values`` has the shape (grid points, runs, columns + 1, columns + 1); the last row and column are the residual.
     """
@@ -357,7 +358,7 @@ class SubsetScorer:
     validation_runs
         Index of the validation run in each fold.
     sizes
-        Sum of squares of the output of each run about its mean.
+        For each run, the sum of squared deviations of the output from its mean.
     """
 
     columns: tuple[Column, ...]
@@ -367,7 +368,7 @@ class SubsetScorer:
 
     @classmethod
     def of(cls, base: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
-        """Return the scorer of a base model and its folds.
+        """Return the scorer for the columns of a base model and the folds of a validation.
 
         `spread` are the variances of the output in each run, and `ends` are the boundaries of the runs among the
         compared samples.
@@ -409,7 +410,11 @@ class SubsetScorer:
         return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(solutions[points[-1], -1].tolist()))
 
     def score_all(self, products: Products) -> dict[tuple[int, ...], SubsetScore]:
-        """Return the scores of all subsets; if there are too many, only the best of each size are extended."""
+        """Return the scores of all subsets.
+
+        If there are too many, subsets are extended column by column from the best ones of each size, and the remaining
+        ones are not scored.
+        """
         values = products.values
         pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)
         choices: dict[str, list[int]] = {}

@@ -204,7 +204,10 @@ class NestedStructures:
         return any(term in e.terms and term.column == e.output for e in self.structure.equations)
 
     def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
-        """Return the variant with all terms of the outputs at distinct integer orders, and all mandatory terms."""
+        """Return the variant with all output terms at distinct integer orders and all mandatory terms; None if invalid.
+
+        `top` are the integer values of the highest orders by name.
+        """
         droppable = self.droppable
         whole: dict[str, float] = dict(top)
         names_used: list[str] = []
@@ -286,7 +289,7 @@ class NestedStructures:
         return variant
 
     def larger(self, variant: Variant) -> Iterator[Change]:
-        """Yield every valid variant with one more term, free order or offset."""
+        """Yield every valid variant with one more term, free order, offset, free input parameter or friction term."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
@@ -308,7 +311,10 @@ class NestedStructures:
                 yield Change(name, replace(variant, frictions=variant.frictions | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
-        """Yield every valid variant with one term, free order or offset fewer."""
+        """Yield every valid variant with one optional element removed or one free order fixed to an integer.
+
+        Optional elements are terms, the offset, free input parameters and friction terms.
+        """
         candidate = self.build(variant)
         for item in candidate.equations:
             for term in item.terms:
@@ -388,7 +394,7 @@ def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structu
 
 
 def _content(structure: Structure) -> str:
-    """Return a text that identifies a candidate up to parameter names and the order of its terms."""
+    """Return a text that identifies a candidate up to parameter names and the sequence of its terms."""
     if structure.has_order_law or structure.coefficient_law:
         return repr(structure)
     rest = (

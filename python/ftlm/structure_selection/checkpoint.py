@@ -52,7 +52,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     @classmethod
     def of(cls, runs: Sequence[Run], candidates: object, validation_runs: Sequence[Run], words: str) -> Request:
-        """Return the request of a selection; `words` describe the validation."""
+        """Return the first record of the checkpoint file of a selection. `words` describe the validation."""
         return cls(
             ALGORITHM_VERSION,
             __version__,
@@ -62,7 +62,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
         )
 
     def difference(self, other: Request) -> str | None:
-        """Return text on the first difference from another request; None if both are equal."""
+        """Return text on the first of runs, candidates and validation that differs from another request, else None."""
         words = {
             "runs": "of other runs",
             "candidates": "of other candidates",
@@ -87,7 +87,7 @@ class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ref
 
     @classmethod
     def of(cls, error: FtlmError) -> FitError | None:
-        """Return the stored form of an error; None for an internal error, which is no property of a candidate."""
+        """Return the stored form of an error; None for an internal error, which the candidate did not cause."""
         return next((cls(n, str(error)) for n, kind in CANDIDATE_ERRORS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
@@ -110,7 +110,7 @@ class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fi
         return cls(joint, isinstance(joint.initial, History))
 
     def inconsistency(self) -> str | None:
-        """Return text on inconsistent stored data; None if the data are consistent."""
+        """Return text that states how the stored data are inconsistent; None if they are consistent."""
         joint, count = self.joint, len(self.joint.names)
         if (joint.covariance.shape, joint.finest_grid_values.shape) != ((count, count), (count,)):
             return f"a covariance or values of another size than its {count} parameters"
@@ -177,7 +177,9 @@ class Store:
             raise
 
     def _take(self, number: int, payload: bytes, request: Request) -> None:
-        """Compare the first record with the request, or load the result from any other record.
+        """Compare the first record with the request, or store the result in any other record for later use.
+
+        `number` is the number of the record and `payload` its content.
 
         Raise DataError if the record is unexpected or inconsistent, or belongs to another selection.
         """
@@ -213,7 +215,10 @@ class Store:
             raise DataError(f"store {path} contains a selection {difference}; choose another file")
 
     def _expect(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
-        """Return an answer of the expected kind; raise DataError for another kind."""
+        """Return a stored result if its type is `kind`, otherwise raise DataError.
+
+        `description` is the name of the expected result in the message.
+        """
         if isinstance(answer, kind):
             return answer
         words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
@@ -232,7 +237,7 @@ class Store:
         write: Callable[[Result], Answer | None],
         read: Callable[[Answer], Result],
     ) -> Result:
-        """Return the stored result of a step, or compute and store it.
+        """Return the result of a step from the file, or compute it and store it there.
 
         `write` and `read` convert a result to and from its stored form. A result for which `write` returns None is not
         stored.

@@ -303,7 +303,7 @@ class Trial:
 
     @property
     def parts(self) -> dict[str, float]:
-        """Fit in percent on each part (output of a run or block) of the validation data, in the order of the scores."""
+        """Fit [%] on each part of the validation data (output of a run or block), in the sequence of `scores`."""
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
@@ -313,7 +313,7 @@ class Trial:
 
     @property
     def mean_relative_error(self) -> float:
-        """Mean log relative standard error of the parameters; lower is better."""
+        """Mean of the logarithm of the parameters' relative standard errors; lower is better."""
         relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
         return float(np.mean([math.log(min(max(r, 1e-12), 1e12)) for r in relative])) if relative else 0.0
 
@@ -343,13 +343,13 @@ def fit(
     refine: bool = True,
     near: JointFit | None = None,
 ) -> JointFit:
-    """Return the best output-error fit from some initial guesses; without any, from automatic ones.
+    """Return the best output-error fit from the initial guesses `starts`, or from automatic ones if there are none.
 
-    `near` is a fit of this structure to nearly the same runs, from which the fit starts. Raise the last error if every
-    fit fails.
+    If `near` is given, which is a fit of this structure to nearly the same runs, the fit starts from it alone. Raise
+    the last error if every fit fails.
 
-    A parameter that an initial guess omits starts at 0 or 1. Friction coefficients start at 0, where the gradient may
-    vanish. Automatic initial guesses are therefore added.
+    If an initial guess omits a parameter, this parameter starts at 0 or 1. The gradient may vanish at such values, for
+    example at a friction coefficient of 0. Automatic initial guesses are therefore added.
     """
     fixed_structure = fix_initial_conditions(structure, runs)
     if near is not None:
@@ -448,9 +448,9 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
     """Return a lower bound of the validation score from the fit to all data alone; -inf if no bound can be given.
 
     Consider a second fit, which omits the data of one fold. Over all data, its sum of squares cannot be smaller than
-    that of the first fit. Over the data that it uses, its sum of squares cannot be larger. On the fold, its sum of
-    squares is therefore at least that of the first fit. For several outputs this holds for the weighted sum of squares
-    only.
+    that of the first fit. Over the data that the second fit uses, its sum of squares cannot be larger than that of the
+    first fit on the same data. On the data of the fold, its sum of squares is therefore at least that of the first fit.
+    For several outputs this holds for the weighted sum of squares only.
     """
     if not joint.converged:
         return -math.inf
@@ -505,7 +505,8 @@ def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
 def residual_variance_inflation(joint: JointFit) -> float:
     """Return the largest variance inflation of the residuals over runs and outputs, at least 1.
 
-    It is the ratio of the variance of a sum of residuals to that of white noise of the same power.
+    The variance inflation is the ratio of the variance of the sum of the residuals to that of the sum of white noise of
+    the same power.
     """
     return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 

@@ -225,7 +225,7 @@ class Selection(BestIdentification):
         return f"{self.best.summary(self.validated)}\n\n{self.ranking_text()}"
 
     def ranking_text(self) -> str:
-        """Return the table of the candidates and the reason of the choice, as text."""
+        """Return the table of the candidates and the reason for the choice, as text."""
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates validated: {self.validation}"]
         lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):

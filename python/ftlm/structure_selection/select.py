@@ -181,9 +181,9 @@ def select(
     are free, so candidates could not be compared. Each step of forward selection takes one fit for each possible
     addition. For records of more than about 1800 samples the candidates are prescreened on subsampled records, and only
     survivors are fitted. With three or more input terms in one equation and validation on whole runs, selection starts
-    from the best subset of these terms. Every subset at integer orders is scored in closed form for this purpose, with
-    the coefficients of output terms on a grid. For a list of more than 200 candidates a ``UserWarning`` estimates the
-    remaining time after the first ones.
+    from the best subset of these terms. For this purpose, every subset at integer orders is scored in closed form, with
+    the coefficients of output terms on a grid. For a list of more than 200 candidates, a ``UserWarning`` states the
+    estimated remaining time after the first fits.
     """
     workers = check_threads(threads)
     several = as_runs(runs)
@@ -242,7 +242,11 @@ def _run_selection(
     every: Mapping[str, Structure],
     problems_by_output: Sequence[OutputProblem],
 ) -> Selection:
-    """Return the selection among the structures `every`, those nested in `searched`, or automatic ones."""
+    """Return the selection among automatic structures, or among given ones and those nested in them.
+
+    Automatic structures are used if there are `problems_by_output`. Otherwise, the structures in `every` and those
+    nested in the structures in `searched` are used.
+    """
     if problems_by_output:
         selection = _select_automatically(work, problems_by_output)
         winner = selection.trials[selection.chosen]
@@ -422,8 +426,9 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
     """Return ranked trials with their Schwarz criteria (BIC).
 
-    The effective number of samples follows from the residuals of the best trial. Those of the trial with the whitest
-    residuals are not suitable, because a high order can fit drifts and disturbances and still predict worse.
+    The effective number of samples follows from the autocorrelation of the residuals of the best trial. The trial with
+    the whitest residuals is not suitable for this purpose, because a model of high order can fit drifts and
+    disturbances and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
     return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, inflation)) for t in ranked]
@@ -503,8 +508,8 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 
     The best trial is the best of many, so a limit of one standard error would reject a true structure in one case of
     ten. If one block contains information that the others lack, the residual of the true structure on this block is
-    more than 5 % larger. Very strong evidence on all samples then makes it eligible. With too few folds for a t-test,
-    it is eligible only within 5 %.
+    more than 5 % larger. The true structure is then eligible if the evidence for it on all samples is very strong. With
+    too few folds for a t-test, its residual must also be at most 5 % larger.
     """
     differences = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
@@ -519,6 +524,8 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
     """Return the indices of eligible trials under a preference for integer orders, and text on fractional orders.
+
+    `near` are the indices of the trials that predict as well as the best one.
 
     Fractional orders are eligible if their residuals are significantly smaller over the folds, by at least 1 %, than
     those of the best integer orders. They are also eligible if they predict as well and their Schwarz criterion is much

@@ -47,7 +47,7 @@ Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
 def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
-    """Return the indices of structures that are worth a fit on all samples, in ascending order.
+    """Return the ascending indices of the structures that are worth a fit on all samples.
 
     Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
     exceeds the lowest cost by the factor that the multistart uses for successive halving. At least `least` structures
@@ -149,7 +149,7 @@ class CandidateEvaluator:
     trials: list[Trial] = field(default_factory=list)
 
     def map_candidates(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results of a function for candidates, in the same order, with progress reports."""
+        """Return the results of a function for candidates, in the sequence of the candidates, with progress reports."""
         self.known_count += len(items)
         out: list[Result] = []
         with interruptible_pool(self.threads) as workers:
@@ -161,7 +161,7 @@ class CandidateEvaluator:
         return out
 
     def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results of a function for items, in the same order, without progress reports."""
+        """Return the results of a function for items, in the sequence of the items, without progress reports."""
         with interruptible_pool(self.threads) as workers:
             return list(workers.map(work, items))
 
@@ -225,7 +225,8 @@ def initial_guesses(
 ) -> list[dict[str, float]]:
     """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
-    Orders that become free start near their integer values in `whole`. A coefficient that is not in `values` starts at
+    Orders that are free in this structure but were fixed to integers in the nested one start near these integers, which
+    `whole` contains by name. A coefficient that is not in `values` starts at
     0. A friction parameter that is not in `values` is omitted.
     """
     problem = FreeProblem.of(structure)
@@ -261,7 +262,7 @@ class StepwiseSelection:
     keys: set[str] = field(default_factory=set)
 
     def run(self) -> list[Trial]:
-        """Run forward selection, then backward elimination; return all validated trials in order.
+        """Run forward selection, then backward elimination. Return all trials in the sequence of their validation.
 
         Each integer value of the highest orders gives its own initial structure, because the best of the simplest
         structures need not be nested in the best structure. With several inputs, one may act as a proxy for the others,
@@ -300,12 +301,15 @@ class StepwiseSelection:
         return list({key: c for c in changes if (key := self._key(c)) not in self.keys}.values())
 
     def _fit_roughly(self, changes: Sequence[Change]) -> list[tuple[Change, JointFit | FtlmError]]:
-        """Return each change with the fit of its structure, or the error; guesses are automatic, steps not refined."""
+        """Return each change with the fit of its structure, or with the error of the fit.
+
+        The fit starts from automatic initial guesses, and its time step is not refined.
+        """
         joints = self.work.map_candidates(lambda c: self.work.fit_candidate(self._build(c), [], refine=False), changes)
         return list(zip(changes, joints, strict=True))
 
     def _validate_failures(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Trial]:
-        """Return all trials after structures were added as failed trials, because none of them can be fitted."""
+        """Add a failed trial for each structure, because none of them can be fitted, and return all trials."""
         self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
         return self.work.trials
 
@@ -320,7 +324,7 @@ class StepwiseSelection:
     def _select_from_full(self) -> list[Trial]:
         """Select orders forward from integer orders and backward from free orders, if no term is optional.
 
-        Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders
+        Forward selection is skipped if the validation residual with integer orders far exceeds that with all orders
         free.
         """
         structure = self.inside.structure
@@ -342,7 +346,7 @@ class StepwiseSelection:
         return self._eliminate_from_ends(ends)
 
     def _select_from_subsets(self, subsets: Sequence[ScreenedSubset]) -> list[tuple[Trial, FittedVariant]]:
-        """Return the best fitted subset, and its extension by forward selection; [] if no subset can be fitted."""
+        """Return the best fitted subset, then its extension by forward selection; [] if no subset can be fitted."""
         if not subsets:
             return []
         best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
@@ -386,7 +390,7 @@ class StepwiseSelection:
     ) -> tuple[Trial, FittedVariant] | None:
         """Eliminate one term at a time from the full structure at integer orders, and return the best result.
 
-        None if the full structure has fewer than two terms more than `low`, or cannot be fitted.
+        The result is None if the full structure has fewer than two terms more than `low`, or cannot be fitted.
         """
         full = self.inside.richest(low.change.variant)
         if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
@@ -439,7 +443,10 @@ class StepwiseSelection:
         return trials
 
     def _fit_changes(self, at: FittedVariant, changes: Sequence[Change]) -> list[FittedVariant]:
-        """Fit changes from the optimum of `at`, and return the fits, best first; prescreening excludes poor changes."""
+        """Fit the structures of `changes` from the optimum of `at`, and return the fits, best first.
+
+        Structures that prescreening excludes are not fitted.
+        """
         values = at.joint.values_by_name
         starts: list[Start] = []
         for change in changes:
@@ -451,7 +458,10 @@ class StepwiseSelection:
         return self._by_criterion([(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
 
     def _by_criterion(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[FittedVariant]:
-        """Return fitted variants, lowest Schwarz criterion first; the smallest variance inflation of all is used."""
+        """Return fitted variants, lowest Schwarz criterion first.
+
+        The criterion of every variant uses the smallest of their variance inflations.
+        """
         fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
         if not fits:
             return []

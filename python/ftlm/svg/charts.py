@@ -373,7 +373,7 @@ class Landscape(Figure):
     scores
         Scores of shape (len(y), len(x)). A score is infinite if the pair is not a candidate or its simulation diverges.
     other_orders_note
-        Text on the values of the orders that are not on the axes.
+        Text that states the values of the orders that are not on the axes.
     score
         Name of the score for captions.
     correlation
@@ -484,7 +484,7 @@ def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Ma
 
 
 def _label_indices(count: int, most: int) -> list[int]:
-    """Return at most `most` equally spaced indices from 0 to count - 1, which mark the cells with a label."""
+    """Return at most `most` equally spaced indices from 0 to count - 1. Cells with these indices get a label."""
     return list(range(0, count, max(1, math.ceil((count - 1) / max(most - 1, 1)))))
 
 

@@ -254,8 +254,8 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
 def log_ticks(low: float, high: float, most: int) -> Ticks:
     """Return the ticks of a logarithmic axis from 10**low to 10**high, with decimal logarithms as tick values.
 
-    They are powers of ten, a 1-2-5 series for fewer than three powers, or linear ticks for a short interval. There are
-    about `most` powers at most.
+    The ticks are powers of ten, a 1-2-5 series if there would be fewer than three powers, or linear ticks for a short
+    interval. The number of powers is at most about `most`.
     """
     every = max(1, math.ceil((high - low) / most))
     first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
@@ -274,7 +274,9 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
 
 
 def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
-    """Return indices of points that represent a line: ends of constant intervals, or extreme values of blocks.
+    """Return indices of the points that are sufficient to draw a line.
+
+    These are the ends of intervals of constant value or, if there are too many of these, the extreme values of blocks.
 
     Parameters
     ----------

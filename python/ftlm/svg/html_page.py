@@ -30,7 +30,10 @@ NOT_IN_MODEL = "–"
 
 
 def cell_html(value: Cell) -> Markup:
-    """Return the HTML content of a table cell. A number is rounded, and an attribute has its full precision."""
+    """Return the HTML content of a table cell.
+
+    A number is shown rounded, and an HTML attribute contains it in full precision.
+    """
     if value is None:
         return Markup(NOT_IN_MODEL)
     if isinstance(value, str):
@@ -77,7 +80,10 @@ class Table:
     def from_groups(
         cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
     ) -> Table:
-        """Return a table from rows by heading; `options` are further arguments of the class."""
+        """Return a table whose rows are grouped under headings.
+
+        `rows` are the rows by heading, and `options` are further arguments of the class.
+        """
         starts = accumulate((len(each) for each in rows.values()), initial=0)
         flat = [row for each in rows.values() for row in each]
         return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
@@ -160,7 +166,10 @@ class Section:
 
 @cache
 def templates(package: str) -> Environment:
-    """Return the environment of the HTML templates in a package. Inserted text is escaped unless it is ``Markup``."""
+    """Return the Jinja environment with the HTML templates of a package.
+
+    Inserted text is escaped unless it is ``Markup``.
+    """
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,

@@ -53,7 +53,7 @@ _MAX_NUMBER = 2.0**62
 
 
 def check_arguments(decorated: Decorated) -> Decorated:
-    """Decorate a function such that an exception caused by a wrong argument becomes a ModelError.
+    """Decorate a function so that an exception caused by an argument of a wrong type becomes a ModelError.
 
     For a class, the constructor, the public methods and the operators in `_CHECKED_OPERATORS` are decorated. Arguments
     are compared with their annotations only after a call has failed, so successful calls take no additional time. Other
@@ -166,7 +166,7 @@ class _Names(dict[str, Any]):
 
 
 def _annotation(annotation: Any, names: _Names) -> Any:
-    """Return the type of an annotation that is given as text; an unknown type without an annotation."""
+    """Return the type that the text of an annotation denotes; `_UnknownType` if there is no annotation."""
     owner = types.SimpleNamespace(__annotations__={"value": annotation})
     return _UnknownType if annotation is inspect.Parameter.empty else get_type_hints(owner, {}, names)["value"]
 

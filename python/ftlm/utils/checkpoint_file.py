@@ -83,7 +83,9 @@ def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes
 
 
 class CheckpointFile:
-    """Open checkpoint file; raise DataError if it cannot be opened or belongs to another computation or program.
+    """Checkpoint file that stays open until :meth:`close` is called.
+
+    Raise DataError if the file cannot be opened or belongs to another computation or program.
 
     Parameters
     ----------

@@ -32,7 +32,10 @@ _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY",
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
-    """Return a path for writing; raise DataError for a folder, an existing file without `force`, a link or a device."""
+    """Return the path of a file to be written; raise DataError if it must not be written.
+
+    This is the case for a folder, a link, a device, and an existing file if `force` is False.
+    """
     file = Path(path)
     if file.is_dir():
         raise DataError(f"{file} is a folder; name a file in it")
@@ -56,7 +59,10 @@ def _link_status(file: Path) -> os.stat_result | None:
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
-    """Raise DataError for a path that cannot be written; call it before a long computation. None is skipped."""
+    """Raise DataError if a file cannot be written to one of the paths; a path that is None is skipped.
+
+    The function is called before a long computation, which would otherwise be lost.
+    """
     for path in paths:
         if path is None:
             continue
@@ -184,7 +190,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> byt
     path
         File to read.
     what, source
-        Name of the content, and kind of file to pass instead, for messages.
+        Name of the content, and kind of file that the user should pass, for error messages.
 
     Raises
     ------
@@ -226,7 +232,7 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
     path
         File to read.
     what, source
-        Name of the content, and kind of file to pass instead, for messages.
+        Name of the content, and kind of file that the user should pass, for error messages.
     kind
         Type of the content, a msgspec structure, which is returned.
 
@@ -273,7 +279,7 @@ class JsonFormat(Generic[F]):
     what
         Name of the content.
     source
-        Kind of file to pass instead, for error messages.
+        Kind of file that the user should pass, for error messages.
     kind
         Type of the content, a msgspec structure.
     schema

@@ -1,7 +1,7 @@
 """Linear algebra of tall-skinny matrices, computed by the Rust core on one thread.
 
-Multithreaded libraries are not used. Their threads wait actively for a tenth of a second after each factorization,
-which is longer than most computations of this module.
+Multithreaded libraries are not used, because their threads occupy the processor for a tenth of a second after each
+factorization. This is longer than most computations of this module take.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ PARALLEL_EFFICIENCY = 0.7
 
 
 def machine_slowdown() -> float:
-    """Return the current time per computation on one core, relative to the reference machine (timed FFTs)."""
+    """Return the current computing time on one core relative to the reference machine, as measured with FFTs."""
     values, count = np.ones(BENCHMARK_FFT_LENGTH), 0
     start_time = time.perf_counter()
     while time.perf_counter() - start_time < BENCHMARK_DURATION_S:
@@ -214,7 +214,10 @@ def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
 
 @cache
 def _end_with_parent(_process: int) -> None:
-    """Start a thread that ends this process when its parent ends; otherwise the process would wait forever."""
+    """Start a thread that ends this process when its parent process ends.
+
+    This process would otherwise wait forever.
+    """
     from multiprocessing import parent_process  # noqa: PLC0415 — pools alone import it
 
     parent = parent_process()

@@ -115,7 +115,7 @@ def white_noise(samples: Floats) -> float:
 
 
 def robust_deviation(values: Floats) -> float:
-    """Return a robust standard deviation of zero-mean normal values, from the median of their absolute values."""
+    """Return a robust estimate of the standard deviation of zero-mean normal values, from their median magnitude."""
     return float(np.median(np.abs(values))) / MAD_OVER_SIGMA if values.size else 0.0
 
 
@@ -123,9 +123,8 @@ def huber_excess(few: Floats, many: Floats) -> float:
     """Return the Huber loss of a smaller model minus that of a larger model, in units of the noise variance.
 
     `few` and `many` are the residuals of the two models. If the smaller model is sufficient, the difference is
-    chi-squared distributed, even with outliers. Its number of degrees of freedom is that of the additional parameters
-    of the larger model (doi:10.1214/aoms/1177703732). The result is infinite if `few` has values that are not
-    finite.
+    chi-squared distributed, even with outliers. The number of degrees of freedom is the number of additional parameters
+    of the larger model (doi:10.1214/aoms/1177703732). The result is infinite if `few` has values that are not finite.
     """
     scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
     if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
@@ -180,7 +179,10 @@ def chi_squared_99(degrees: int) -> float:
 
 
 def variance_inflation(series: Floats) -> float:
-    """Return the variance of the sum of a series over that of white noise of equal variance, at least 1 (Bartlett)."""
+    """Return the ratio of the variance of a sum of samples to that for white noise, at least 1 (Bartlett).
+
+    The white noise has the same variance per sample.
+    """
     return _core.variance_inflation(series)
 
 

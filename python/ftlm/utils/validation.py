@@ -150,12 +150,19 @@ def nearest(word: object, names: Iterable[object]) -> str:
 
 
 def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
-    """Return a DataError for invalid rows: object, what is wrong, first row (from 0), number of rows and remedy."""
+    """Return a DataError for invalid rows.
+
+    The message states the object, what is wrong, the first invalid row (from 0), the number of such rows and the
+    remedy.
+    """
     return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
 
 
 def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]:
-    """Return {signal: column} from None, a name, a list of names or a mapping; raise DataError for other values."""
+    """Return the column of each signal by name; raise DataError if `column_names` has an invalid type.
+
+    Valid are None, a name, a list of names and a mapping.
+    """
     if column_names is None:
         return {}
     if isinstance(column_names, str):

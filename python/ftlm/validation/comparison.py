@@ -370,8 +370,8 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
 def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
     """Return the runs as a tuple, and the number of block pulses per run.
 
-    Raise DataError if an output of the model is constant in a run, or an input of a run. Raise ModelError if a run is
-    too short for the number of pulses.
+    Raise DataError if an output of the model is constant in a run, or if a run has it as an input. Raise ModelError if
+    a run is too short for the number of pulses.
     """
     check_model(model)
     several = as_runs(runs)
@@ -539,7 +539,7 @@ def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dic
 def near_identity_findings(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
 ) -> list[Finding]:
-    """Return findings on outputs that the simulation explains poorly, or far worse than the equation error suggests.
+    """Return findings on outputs simulated poorly, or far less accurately than the equation error suggests.
 
     If a term of the output has nearly the order of the equation, the equation predicts any smooth output from itself.
     The equation error is then small for a wrong model as well, but the output error is not.

@@ -455,7 +455,7 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
 def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
     """Yield a finding on each input that depends on past outputs, or for which this test is inconclusive.
 
-    It names the output with the largest test statistic. See :func:`feedback_test`.
+    The finding names the output with the largest test statistic. See :func:`feedback_test`.
     """
     rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     signals = {name: run[name][:rows] for name in (*inputs, *outputs)}

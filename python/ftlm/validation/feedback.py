@@ -68,7 +68,7 @@ RIDGE_SHARE = 1e-10
 
 @dataclass(frozen=True)
 class FeedbackTest:
-    """Result of the test whether an input depends on past values of an output (feedback).
+    """Result of a test of whether an input depends on past values of an output (feedback).
 
     Parameters
     ----------
@@ -79,7 +79,8 @@ class FeedbackTest:
     reason
         Reason for the conclusion as text; empty if there is none.
     ratio
-        Test statistic divided by its limit, which is the 99.5 % quantile in open loop over all sets of regressors.
+        Largest test statistic over all sets of regressors, divided by its limit. In open loop, the probability that the
+        ratio exceeds 1 is about 0.5 %.
     share
         Fraction of the variance of the input innovation that past outputs explain.
     rows
@@ -90,8 +91,8 @@ class FeedbackTest:
         Correlation between the innovations of input and output in the same sample, divided by its 99.5 % limit, with
         its sign. Feedback without delay and direct feedthrough both cause it.
     response
-        Part of the input that past residuals explain, one array per run in the unit of the input; empty without
-        feedback.
+        Part of the input that past residuals of the output explain, one array per run in the unit of the input; empty
+        without feedback.
     """
 
     state: FeedbackState
@@ -119,10 +120,11 @@ def feedback_test(
     """Test whether an input depends on past outputs: feedback in Granger's sense (doi:10.2307/1912791).
 
     The innovation of the input is its residual after regression on its own past and on the other inputs. In open loop
-    it is independent of past outputs, provided that this past is long enough and that no other input depends on both
-    the output and this input. A heteroskedasticity-robust score test (White, doi:10.2307/1912934) tests whether past
-    residuals, their differences, their low-pass part and past innovations of the output predict it. The present
-    residual is not used, because feedback within one sample cannot be distinguished from direct feedthrough.
+    the innovation is independent of past outputs, provided that the regression includes enough lags and that no other
+    input depends on both the output and this input. A heteroskedasticity-robust score test (White, doi:10.2307/1912934)
+    tests whether past residuals, their differences, their low-pass part and past innovations of the output predict the
+    innovation of the input. The present residual is not used, because feedback within one sample cannot be
+    distinguished from direct feedthrough.
 
     Parameters
     ----------
@@ -207,7 +209,7 @@ def _fill_missing(residuals: Floats) -> Floats:
 
 
 def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
-    """Whether all changes of a signal are multiples of at least two samples apart, as in a generated signal.
+    """Whether a signal changes only at multiples of a common interval of at least two samples, as a generated one does.
 
     `changes` are the sample indices of the changes in each run.
     """
@@ -233,7 +235,7 @@ def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
 
 
 def _line_regressors(u: Floats) -> list[Floats]:
-    """Return cosines and sines at the spectral lines of an input, which lags cannot predict."""
+    """Return cosines and sines at spectral lines of an input, whose periodic parts lagged samples do not predict."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
@@ -279,7 +281,7 @@ def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -
 
 
 def _score_ratio(innovation: Floats, columns: Floats) -> float:
-    """Return the self-normalized score statistic of an innovation and regressors, divided by its limit."""
+    """Return the self-normalized score statistic of an innovation and regressors, divided by its critical value."""
     score = columns.T @ innovation
     products = columns * innovation[:, None]
     spread = products.T @ products
@@ -289,7 +291,7 @@ def _score_ratio(innovation: Floats, columns: Floats) -> float:
 
 
 def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Floats]:
-    """Return the largest :func:`_score_ratio` over the sets of regressors, and the normalized columns of that set."""
+    """Return the largest :func:`_score_ratio` over sets of regressors, and the normalized columns of the set."""
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
     sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
@@ -299,7 +301,7 @@ def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Fl
 
 
 def _local_color(w: Floats) -> float:
-    """Return the mean squared autocorrelation over short blocks, divided by its limit for white noise."""
+    """Return the mean squared autocorrelation over short blocks, divided by the upper limit for white noise."""
     count = w.size // LOCAL_ROWS
     if count < 4:
         return 0.0
@@ -311,7 +313,7 @@ def _local_color(w: Floats) -> float:
 
 
 def _local_past(w: Floats, past: Floats) -> float:
-    """Return the fraction of an innovation that `past` explains in short blocks, divided by its limit."""
+    """Return the share of an innovation that `past` explains in short blocks, over its limit for independent series."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
@@ -373,7 +375,7 @@ class _Innovations:
         self.slow = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
 
     def _clip_outliers(self, missed: list[Floats]) -> list[Floats]:
-        """Return residuals, centered and divided by their standard deviation, with far outliers clipped.
+        """Return the residuals `missed`, centered and divided by their standard deviation, with far outliers clipped.
 
         Outliers only reduce the power of the test.
         """
@@ -397,7 +399,7 @@ class _Innovations:
         return out
 
     def _rows(self, offset: int) -> NDArray[np.intp]:
-        """Return the stacked rows whose lagged regressors, delayed by `offset` samples, all lie in the same run."""
+        """Return the indices of the stacked rows whose regressors, delayed by `offset` more samples, lie in one run."""
         skip = max(INNOVATION_COUNTS) + 2 + offset
         return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
 
@@ -410,7 +412,7 @@ class _Innovations:
         return np.column_stack([now, now - self.residuals[rows - lag - 1], self.slow[rows - lag], *innovations])
 
     def _ratio(self, offset: int, clipped: Floats) -> tuple[float, Floats, NDArray[np.intp]]:
-        """Return the largest statistic over its limit, with its regressors and rows.
+        """Return the largest ratio of a score statistic to its critical value, with its regressors and rows.
 
         `offset` is an additional delay of the outputs in samples.
         """
@@ -471,10 +473,10 @@ class _Innovations:
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:
-        """Return the statistic of the output innovation in the same sample, divided by its limit, with its sign.
+        """Return the signed score statistic of the output innovation in the same sample, divided by its critical value.
 
-        It detects integral control, in which the past input already contains the past outputs, so that past outputs do
-        not improve its prediction.
+        This statistic detects integral control. There the past input already contains the past outputs, so they do not
+        improve the prediction of the input.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
@@ -483,10 +485,11 @@ class _Innovations:
         return math.copysign(ratio, float(clipped @ column[:, 0]))
 
     def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
-        """Return the smallest statistic over its limit under the hypothesis that the input was measured with noise.
+        """Return the least ratio of the score statistic to its critical value over assumed noise levels of the input.
 
-        Corrected least squares are computed for several noise levels of the input. If the input is noisy, the output
-        reveals the true past input better than its measurement, which can look like feedback.
+        For each noise level, the normal matrix of the regression is corrected for the noise. If the input is noisy, the
+        past output contains information on the true past input that the measured input lacks. This can look like
+        feedback.
         """
         past, y = self.past[rows], self.inputs[rows]
         weighted = past * self.weights[rows][:, None]
@@ -513,8 +516,8 @@ class _Innovations:
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
         """Return the part of the input that the feedback explains, one array per run.
 
-        The explained innovations pass through the autoregression of the input on its own past. The part that is
-        correlated with the residual of the same sample also counts as feedback.
+        The explained innovations pass through the autoregression of the input on its own past. The part of the input
+        that is correlated with the residual of the same sample also counts as feedback.
         """
         now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
         columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])

@@ -529,17 +529,17 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
-        """Return the noise part of an ARX model fitted to residuals and one input; an AR model without an input.
+        """Return the noise part of an ARX model of residuals and one input; of an AR model if ``signal`` is empty.
 
-        An AR model of the residuals alone would also describe the response to a periodic or slow input, and its test
-        would not detect this response. Responses to other inputs count as noise.
+        An AR model of the residuals alone would also describe the response to a periodic or slow input, and the test of
+        independence would not detect this response. Responses to other inputs count as noise.
         """
         through, start, innovations, parameters = _core.arx_model(series, [signal] if signal else [], lags)
         rows = sum(row.size for row in innovations)
         return cls(through, start, innovations, rows / max(rows - parameters, 1))
 
     def whiten(self, series: list[Floats]) -> list[Floats]:
-        """Return series filtered by the whitening filter, from the sample of the first innovation on."""
+        """Return series filtered by the whitening filter, starting at the sample of the first innovation."""
         lead = self.start - (self.filter.size - 1)
         return [np.ascontiguousarray(row[lead:]) for row in whiten_series(series, self.filter)]
 
@@ -563,7 +563,7 @@ class NoiseModel:
 def _independence(
     series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first: int
 ) -> CorrelationTest:
-    """Return the test of cross-correlations at lags from ``first`` on against a simultaneous 99 % band."""
+    """Return the test of the cross-correlations at all lags >= ``first`` against a simultaneous 99 % band."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
@@ -584,7 +584,7 @@ def _independence(
 
 
 def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
-    """Return the variance of a cross-correlation, as the mean over lags >= 0 of products of the squared signals."""
+    """Return the variance of a cross-correlation: the normalized mean product of the squared signals at lags >= 0."""
     powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
     total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
     each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
@@ -602,13 +602,13 @@ def sign_tanh_slope(velocities: Sequence[Floats]) -> float:
 
 
 def friction_term(output: str, coefficient: str, tanh_slope: float = math.inf) -> str:
-    """Return the text of a Coulomb friction term: ``sign(D y)``, or ``tanh(s y)`` for a finite slope s."""
+    """Return a friction term as text: ``sign(D y)``, or ``tanh(s y)`` of slope s for an output y in velocity."""
     velocity = f"sign(D {output})" if math.isinf(tanh_slope) else f"tanh({tanh_slope:.3g} {output})"
     return f"- {coefficient}*{velocity}"
 
 
 def failed_tests(tests: Residuals) -> list[Finding]:
-    """Return findings on failed and undecided tests, and on detected feedback."""
+    """Return findings on failed tests, undecided tests and detected feedback."""
     findings = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):

@@ -19,7 +19,7 @@ use crate::series_system::System;
 /// Without such a filter, the regressors are pure integrals, in which drift dominates if the record is long.
 const FILTER_POLE_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
 
-/// Ratio of the output error after a step to the least error found until then, above which the step is halved.
+/// Ratio of the output error after a step to the smallest output error so far, above which the step is halved.
 const MAX_ERROR_RATIO: f64 = 1.2;
 /// Maximum number of consecutive step halvings.
 const MAX_STEP_HALVINGS: usize = 4;

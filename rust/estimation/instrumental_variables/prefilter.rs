@@ -11,7 +11,8 @@ use crate::regressors::Record;
 use crate::series::{self, reciprocal, Buffers, Kernel};
 use crate::signal::block_pulse::PulseMeans;
 
-/// Ratio of the peak magnitudes of a response, second to first half, above which it counts as unstable.
+/// Ratio of the peak magnitude in the second half of a response to that in the first half, above which the response
+/// counts as unstable.
 const INSTABILITY_PEAK_RATIO: f64 = 2.0;
 
 /// Return the first m coefficients of 1/D(z), damped if 1/D is unstable, and true if they are damped.
@@ -136,8 +137,9 @@ const RESONATOR_DAMPING: f64 = 0.2;
 
 /// Relative norm below which a basis column of [`project`] counts as linearly dependent on the previous columns.
 ///
-/// Such a column is excluded. Its remaining direction contains almost nothing of the responses, but as much noise as
-/// any other direction. It would also be determined by rounding errors (10⁻¹¹ for columns of a thousand pulses).
+/// Such a column is excluded. Its component outside the span of the previous columns contains almost nothing of the
+/// responses, but as much noise as any other direction. Rounding errors (10⁻¹¹ for columns of a thousand pulses) would
+/// also determine the direction of this component.
 const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
 /// Add noise-free substitutes ([`project`]) for all signals except the inputs to a record.

@@ -94,7 +94,8 @@ impl<'a> EquationSpectra<'a> {
         self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
     }
 
-    /// Return the data of one step, with the given substitute spectrum of each term or else its measured spectrum.
+    /// Return the data of one step. `clean` returns the substitute spectrum of a term; if it returns None, the measured
+    /// spectrum is used.
     pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> InstrumentSource<'b> {
         let own = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();

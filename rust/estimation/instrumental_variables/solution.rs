@@ -8,7 +8,8 @@
 use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
-/// Maximum permitted number of iterations. An iteration that has not converged by then oscillates.
+/// Maximum permitted number of iterations. An iteration that needs more than this usually oscillates without
+/// converging.
 const MAX_ITERATIONS: usize = 1000;
 
 /// Termination criteria of the iteration.
@@ -192,9 +193,10 @@ fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
 
-/// Orthogonalize a column with the function `clear`, a second time if its norm has halved, and normalize it.
+/// Orthogonalize a column with the function `clear`, and normalize it. The orthogonalization is repeated once if it has
+/// at least halved the norm.
 ///
-/// The column is given as one part per record. Return false if its remainder is at rounding level.
+/// The column is given as one part per record. Return false if the orthogonalized column is at rounding level.
 fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
     let whole = stacked_norm(pieces);
     let (mut before, mut remainder) = (whole, whole);

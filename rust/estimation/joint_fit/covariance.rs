@@ -9,9 +9,9 @@ use crate::signal::statistics::{
     WHITENESS_LAGS,
 };
 
-/// Exponent e of the number of autocovariance lags in the robust covariance, 4 N^e for N samples.
+/// Exponent e in the number of autocovariance lags of the robust covariance, which is 4 N^e for N samples.
 const LAG_POWER: f64 = 1.0 / 3.0;
-/// Minimum assumed fraction of the noise variance that remains in the residuals of a fit.
+/// Minimum fraction of the noise variance that is assumed to remain in the residuals of a fit.
 const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
 /// Return the row-major covariance matrix of the parameters; it is robust to autocorrelated residuals.
@@ -82,9 +82,9 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<V
 /// `squares` is their sum of squares.
 ///
 /// The computation uses the singular values of the Jacobian with rows scaled to unit norm, because the normal equations
-/// would lose half of the digits. Singular values at rounding level count as zero, and their directions as not
-/// identifiable. Covariances with a parameter of infinite variance are NaN. The cost is O(p² m + p m log m) for p
-/// parameters and m residuals.
+/// would lose half of the digits. Singular values at rounding level count as zero, and the corresponding parameter
+/// directions as not identifiable. Covariances with a parameter of infinite variance are NaN. The cost is O(p² m + p m
+/// log m) for p parameters and m residuals.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if
@@ -226,8 +226,9 @@ fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
 /// Return the long-run covariance of the summed scores, the middle factor of the sandwich covariance, row-major.
 ///
 /// `jacobian` has one row per parameter. `series` contains the residuals by run and output, NaN for missing samples.
-/// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610). The weights act like autocovariances, so the sum
-/// over lags is computed as a circular convolution. The cost is O(p² m + p m log m) for p parameters and m residuals.
+/// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610). The weighted sum over lags has the form of a
+/// product with a Toeplitz matrix, so it is computed as a circular convolution. The cost is O(p² m + p m log m) for p
+/// parameters and m residuals.
 ///
 /// # Errors
 /// [`Error::Length`] if the residuals and the rows of the Jacobian differ in length.

@@ -24,7 +24,7 @@ use crate::signal::statistics::{mean, median, white_noise_deviation};
 
 /// Fraction of the progress of a fit that is complete after its multistart.
 const MULTISTART_PROGRESS_SHARE: f64 = 0.5;
-/// Fraction of the remaining multistart progress that each sweep over the candidates takes.
+/// Fraction of the remaining multistart progress that each sweep over the candidates completes.
 const SWEEP_PROGRESS_SHARE: f64 = 0.3;
 /// Noise standard deviation assumed in a coarse fit, relative to the standard deviation of the output.
 const COARSE_RESIDUAL_RATIO: f64 = 0.01;
@@ -89,7 +89,8 @@ impl OutputScale {
 /// Initial guesses of a fit: multistart, one initial guess, or warm start.
 #[derive(Debug, Clone)]
 pub enum Initialization {
-    /// Multistart from automatic initial guesses, or the candidates of an earlier one, plus given initial guesses.
+    /// Multistart from the given initial guesses and from automatic ones. The candidates of an earlier multistart can
+    /// replace the automatic ones.
     Multistart {
         /// The given initial guesses, each with the values of all free parameters.
         known: Vec<Vec<f64>>,
@@ -155,7 +156,8 @@ pub struct FitProblem<'a> {
 impl<'a> FitProblem<'a> {
     /// Return the objective with weights `outputs`.
     ///
-    /// Unless `refine` is true, it has the looser tolerance for comparisons.
+    /// Unless `refine` is true, the objective has the looser convergence tolerance of fits that are only compared with
+    /// other fits.
     fn grid(&self, outputs: Vec<f64>, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = Weights { outputs, robust_weights: None };
         let source: &'a Recordings = self.source;
@@ -394,8 +396,8 @@ fn reweight_candidate<'a>(
 /// Return the best survivor of the multistart, fitted to all samples.
 ///
 /// For long records, the survivor is selected on their first part and then fitted to all samples. If that fit fails,
-/// the selection is repeated on all samples. It is also repeated if the cost rises and another survivor has a lower
-/// cost.
+/// the selection is repeated on all samples. It is also repeated if the cost per residual is much higher than on the
+/// first part and another survivor has a lower cost on all samples.
 fn select_on_part(
     problem: FitProblem<'_>,
     survivors: &[Candidate],
@@ -437,7 +439,7 @@ fn has_better_candidate(best: &Candidate, candidates: &[Candidate], grid: &Objec
     Ok(false)
 }
 
-/// Fit the survivors with the objective `near` and return the best one.
+/// Fit each survivor with the objective `near` and return the best one.
 fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
     let free = problem.free;
     let fit = |candidate: &Candidate, evaluations| {

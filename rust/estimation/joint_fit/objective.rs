@@ -17,7 +17,8 @@ pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
 ///
 /// Such a fit is only compared with other fits.
 const COMPARISON_LIKELIHOOD_TOLERANCE: f64 = 2e-4;
-/// Maximum acceptable discretization error, relative to the root mean square residual or, if larger, the noise.
+/// Maximum acceptable discretization error, relative to the root mean square residual or to the noise, whichever is
+/// larger.
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Maximum number of block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;
@@ -215,7 +216,8 @@ impl<'a> Objective<'a> {
 
     /// Return true if halving the step changes the simulated samples significantly relative to the residuals.
     ///
-    /// The residuals contain at least the noise, and the model error of an incomplete structure.
+    /// The change is compared with the root mean square residual, or with the noise if the noise is larger. With an
+    /// incomplete structure, the residuals also contain the model error.
     ///
     /// # Errors
     /// An error if the runs cannot be sampled at half the step ([`Recordings::experiments`]). [`Error::Interrupted`]
@@ -243,8 +245,8 @@ impl<'a> Objective<'a> {
 
     /// Return the indices of results, sorted by the larger of their costs on their own grid and on this finer grid.
     ///
-    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit can use this mode to
-    /// follow noise, but its simulation is not reproduced on any other grid.
+    /// The pulse scheme of a stiff equation can have a mode that alternates from pulse to pulse. A fit can use this
+    /// mode to follow noise, but the simulation of such a fit differs on every other grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.

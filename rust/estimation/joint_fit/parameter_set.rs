@@ -127,8 +127,8 @@ impl ParameterSet {
     /// Return the problem with coordinates for an optimization from `start`.
     ///
     /// The coordinate of a nonzero coefficient is its logarithm. With nonlinear terms or `plain`, it is the coefficient
-    /// itself, because initial guesses may have wrong signs. Stribeck velocities always have logarithms. The parameters
-    /// with the indices `fixed` are fixed at their values in `start`.
+    /// itself, because initial guesses may have wrong signs. The coordinate of a Stribeck velocity is always its
+    /// logarithm. The parameters with the indices `fixed` are fixed at their values in `start`.
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
@@ -199,7 +199,8 @@ impl ParameterSet {
 
     /// Return the usual integer values of the free orders, limited to their bounds.
     ///
-    /// The order of an output is 2. Its own terms have the orders 1 and 0, and input terms have the order 0.
+    /// The highest order of each equation is 2. Its autoregressive terms have the orders 1 and 0, and its input terms
+    /// have the order 0.
     #[must_use]
     pub fn integer_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
@@ -254,10 +255,10 @@ fn bounds(structure: &ParametricStructure, orders: &[String]) -> Vec<(f64, f64)>
     orders.iter().map(of).collect()
 }
 
-/// Default upper bound of a free order: at least 3.
+/// Default upper bound of a free order, which is at least 3.
 ///
-/// It is raised to the highest fixed order n of the equations that contain this order. If the order is the highest of
-/// an equation (`above`), it is raised to n + 1.
+/// If the equations that contain the free order have a fixed order n > 3, the bound is raised to n. For the highest
+/// order of an equation (`above`), it is raised to n + 1 for n > 2.
 fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool) -> f64 {
     let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
     let numbers =
@@ -290,7 +291,7 @@ impl TimeScaling {
         }
     }
 
-    /// Natural logarithm of the unit of time in seconds.
+    /// Natural logarithm of the scaled unit of time, expressed in seconds.
     #[must_use]
     pub fn unit(&self) -> f64 {
         self.unit.log_unit()
@@ -305,9 +306,9 @@ impl TimeScaling {
         (0..self.size).map(of).collect()
     }
 
-    /// Return the relative decrease of parameter `i` in seconds due to a change of the orders by `step`.
+    /// Return the relative decrease of the value of parameter `i` in seconds if the orders change by `step`.
     ///
-    /// The value of the parameter in the scaled unit of time is constant.
+    /// The value of the parameter in the scaled unit of time is held constant.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {

@@ -197,7 +197,8 @@ pub struct OptimizationResult {
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms by run and equation. With friction or nonlinear terms, initial states by run.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Orthonormal basis of the weighted responses to the initial terms, by run; empty after several evaluations.
+    /// Orthonormal basis of the weighted responses to the initial terms, by run; empty if more than one evaluation was
+    /// allowed.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,

@@ -28,11 +28,12 @@ pub enum Loss {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct RobustSummary {
-    /// Number of residuals beyond 1.345 standard deviations, which are downweighted. Of normal noise, this is 18 %.
+    /// Number of residuals beyond 1.345 standard deviations, which are downweighted. For normal noise, this is 18 % of
+    /// all residuals.
     pub reduced_weight_count: usize,
     /// Number of residuals beyond five standard deviations.
     pub outliers: usize,
-    /// Number of residuals.
+    /// Number of residuals, without missing samples.
     pub samples: usize,
 }
 

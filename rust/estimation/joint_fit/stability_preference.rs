@@ -24,7 +24,7 @@ const STUDENT_T_QUANTILE_99: f64 = 2.54;
 ///
 /// Without this rule, an instability in the last segment alone would not be significant.
 const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
-/// Maximum number of stable candidates of the multistart from which a stable optimum is searched.
+/// Maximum number of stable candidates of the multistart from which the search for a stable optimum starts.
 const MAX_STABLE_CANDIDATES: usize = 3;
 /// Maximum number of evaluations of each stable candidate that continues after a short fit.
 const EVALUATIONS_PER_CANDIDATE: usize = 60;
@@ -253,7 +253,8 @@ impl StableSearch<'_, '_> {
 /// Return true if the result `best` fits significantly better than `other`, by Vuong's test of non-nested models.
 ///
 /// The test compares the mean squares over segments of the runs (Vuong, doi:10.2307/1912557; for autocorrelated
-/// residuals Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071). With fewer than two segments, the result is true.
+/// residuals Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071). If there are fewer than two segments, no test is
+/// possible, and the result is true.
 #[must_use]
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, other: &OptimizationResult) -> bool {

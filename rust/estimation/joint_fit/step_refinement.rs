@@ -14,9 +14,10 @@ const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
 /// Increase of the negative log-likelihood per sample, due to halving the step, above which other survivors are fitted.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Minimum number of block pulses over all runs at which the step error is corrected without fits on finer grids.
+/// Minimum number of block pulses over all runs. With at least this number, the step error is corrected without fits on
+/// finer grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
-/// Maximum number of corrections with one pair of finer grids.
+/// Maximum number of corrections with the same pair of finer grids.
 ///
 /// Each correction multiplies the remaining error by about the relative discretization error of the grid.
 const MAX_CORRECTIONS: usize = 4;
@@ -63,8 +64,8 @@ pub struct OptimumStatistics {
 
 /// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
 ///
-/// On a coarse grid, an optimization can follow a flat valley to the limit of its domain, where a finer grid makes no
-/// progress. Then the other survivors, `others`, are optimized on the finer grid as well.
+/// On a coarse grid, an optimization can follow a flat valley to the limit of its domain. From there, an optimization
+/// on a finer grid makes no progress. Then the other survivors, `others`, are optimized on the finer grid as well.
 ///
 /// # Errors
 /// The error of a simulation that fails. [`Error::Beyond`] if residuals overflow. [`Error::NotFinite`] if the Jacobian
@@ -284,7 +285,8 @@ fn extrapolated_start(
     }
 }
 
-/// Return the best other candidate, with converged weights; None if none fits better than the result `stalled`.
+/// Return the best fit that starts from one of `others`, with converged weights; None if no such fit is better than the
+/// result `stalled`.
 ///
 /// `stalled` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires stability.
 ///
@@ -322,8 +324,9 @@ fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -
 
 /// Return the extrapolated limit or the optimum of the finest grid, whichever fits better on half the step.
 ///
-/// If poorly determined parameters have a curved valley, a straight extrapolation leaves it. If the residuals are
-/// linear along the line and the grids agree, the limit is returned without this comparison.
+/// If poorly determined parameters have a curved valley, a straight extrapolation leaves the valley. If the residuals
+/// change linearly between the optimum and the limit and the grids agree, the limit is returned without this
+/// comparison.
 fn select_limit_or_optimum(
     best: &OptimizationResult,
     grid: &Objective<'_>,

@@ -223,7 +223,7 @@ pub struct ParametricStructure {
 impl ParametricStructure {
     /// Return a structure of uncoupled equations without bounds, laws or free input parameters.
     ///
-    /// Measured signals are the inputs.
+    /// A signal of another equation enters an equation with its measured values.
     #[must_use]
     pub fn new(signals: Vec<String>, equations: Vec<ParametricEquation>, initial: Initial) -> Self {
         Self {

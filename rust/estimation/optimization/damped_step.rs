@@ -143,9 +143,10 @@ impl LinearizedProblem {
         (step, decrease)
     }
 
-    /// Return the step with secant curvature over the parameters that are not eliminated.
+    /// Return the scaled step that minimizes the quadratic model with secant curvature, and the predicted relative
+    /// decrease of the cost.
     ///
-    /// Return also the predicted relative decrease of the cost, or None if the quadratic model has no minimum.
+    /// The step changes only the parameters that are not eliminated. Return None if the quadratic model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
         let step = self.step_within_bounds(|is_fixed| self.minimize_with_curvature(is_fixed, damping, curvature))?;
         let decrease = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
@@ -159,7 +160,7 @@ impl LinearizedProblem {
 
     /// Return the scaled step within bounds, by an active-set iteration.
     ///
-    /// `step_of` returns the step for given flags of fixed parameters, or None.
+    /// `step_of` returns the step for given flags of fixed parameters, or None if there is no step.
     fn step_within_bounds(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
         let mut is_fixed = self.is_fixed.clone();
         let mut step = loop {
@@ -260,8 +261,8 @@ impl LinearizedProblem {
 
 /// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor `r` of [J | e], with s = 0 for fixed parameters.
 ///
-/// λ is `damping`, except for the first `projected` parameters. These are eliminated and have the smallest damping.
-/// Each constraint (normal, room) means normal · s ≤ room.
+/// λ is `damping`, except for the first `projected` parameters. These are eliminated and have the damping
+/// [`MIN_DAMPING`]. Each constraint (normal, room) means normal · s ≤ room.
 fn triangular_damped_step(
     r: &[f64],
     is_fixed: &[bool],
@@ -428,7 +429,8 @@ pub trait LeastSquaresProblem {
         false
     }
 }
-/// Ratio of the prediction errors at the last step above which the next step uses the better model.
+/// Minimum ratio of the prediction errors of the two models at the last step for the next step to change to the better
+/// model.
 ///
 /// The two models are those without and with secant curvature.
 const MIN_PREDICTION_IMPROVEMENT: f64 = 1.5;
@@ -549,7 +551,8 @@ impl<P> ValleyExtrapolation<P> {
 
     /// Return an extrapolation step in coordinates, or None.
     ///
-    /// The last steps must have a common direction, and the remaining number of `evaluations` must suffice.
+    /// The result is not None if the last steps have a common direction and the remaining number of `evaluations`
+    /// suffices.
     pub(crate) fn propose_step(&mut self, evaluations: usize) -> Option<Vec<f64>> {
         if self.trial_start.is_some() || self.steps.len() < EXTRAPOLATION_STEPS || evaluations <= MAX_TRIAL_EVALUATIONS
         {

@@ -301,7 +301,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         }
     }
 
-    /// Shorten the step until it decreases the cost, or return the reason for termination.
+    /// Shorten the step until it decreases the cost. Return this step, or the reason for termination.
     ///
     /// Return None if parameters with kinks must be fixed first.
     fn find_descent_step(

@@ -7,7 +7,8 @@ use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
 use crate::linalg::small::back_substitute;
 
-/// Relative norm of a response outside the span of the other responses below which it counts as dependent on them.
+/// Relative norm of the component of a response outside the span of the other responses, below which the response
+/// counts as linearly dependent.
 ///
 /// The responses are those to the initial terms.
 pub(crate) const RANK_TOLERANCE: f64 = 1e-12;
@@ -35,8 +36,8 @@ impl<P> Evaluation<P> {
     /// Eliminate the linear coefficients and the initial terms from the residuals of each experiment.
     ///
     /// `columns` contains, by experiment, the weighted responses to the initial terms. Each response has the index of
-    /// its equation, or None for a constant level of the output. The function `of` returns the orthonormal basis of
-    /// these responses and the effects of the linear coefficients on the samples.
+    /// its equation, or None for a constant level of the output. The function `of` returns two items for an experiment:
+    /// the orthonormal basis of these responses, and the effects of the linear coefficients on the samples.
     pub(crate) fn eliminate(
         &mut self,
         linear: &[usize],

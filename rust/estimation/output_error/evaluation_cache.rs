@@ -28,7 +28,7 @@ const MAX_POWERS_SHORT_RECORD: usize = 64;
 /// Shorter runs would need unnecessarily long transforms.
 const MIN_LENGTH_RATIO: f64 = 0.7;
 
-/// Cache of the runs with the same step and filter, for the length of the longest run.
+/// Cache that runs with the same step and filter share. Its series have the length of the longest run.
 ///
 /// It contains kernels, powers of time, and the inverse A⁻¹ of the system matrix at the last point.
 struct GridCache {
@@ -70,7 +70,8 @@ pub(crate) struct EvaluationCache {
     grid: Rc<RefCell<GridCache>>,
     /// Length to which series are padded for their spectra.
     pub(crate) total: usize,
-    /// Spectra of inputs without a free parameter, by signal and by the flag of a negative integration order.
+    /// Spectra of inputs without a free parameter, by signal and by a flag that is true for a negative integration
+    /// order.
     input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
     /// The weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
     impulses: HashMap<(usize, u64), Vec<f64>>,
@@ -162,7 +163,7 @@ impl EvaluationCache {
 
     /// Return the inverse of the system matrix, computed by `compute` if it is not cached.
     ///
-    /// The key `bits` contains the bits of the autoregressive terms.
+    /// The key `bits` contains the bit patterns of the numbers that define the autoregressive terms.
     ///
     /// # Errors
     /// The errors of `compute`.
@@ -186,7 +187,8 @@ impl EvaluationCache {
         }
     }
 
-    /// Return the spectrum of the input of a term of integration order `eta`, after its input nonlinearity.
+    /// Return the spectrum of the signal of an input term with integration order `eta`. If the input has a free
+    /// parameter, the signal is taken after its nonlinearity.
     ///
     /// The spectrum is padded for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn input_spectrum(
@@ -230,7 +232,7 @@ impl EvaluationCache {
         term
     }
 
-    /// Apply the sensor filter to a series that is not a signal of the record.
+    /// Apply the sensor filter to a series that is not a signal of the record; without a filter, return it unchanged.
     pub(crate) fn filter_series(&self, series: &[f64]) -> Vec<f64> {
         self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
     }

@@ -7,14 +7,16 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// One run of measured data: block-pulse means, with a sample at every `pulses_per_sample`-th edge of a pulse.
+/// One run of measured data as block-pulse means. The samples lie at every `pulses_per_sample`-th edge between pulses,
+/// or at nonuniform times.
 #[derive(Debug, Clone)]
 pub struct Experiment {
     /// Block-pulse means of all signals, shared by experiments that differ in weights only.
     pub record: Arc<Record>,
     /// Number of block pulses per sampling interval.
     pub pulses_per_sample: usize,
-    /// Samples of the output of each equation. There is one more uniform sample than there are sampling intervals.
+    /// Samples of the output of each equation. The number of uniform samples is the number of sampling intervals plus
+    /// one.
     pub samples: Vec<Vec<f64>>,
     /// Sensor filter of the simulated outputs, if any: its series, one value per pulse, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
@@ -212,7 +214,8 @@ impl Experiment {
         }
     }
 
-    /// Return true if an initial term with this exponent affects only the sensor filter of this output.
+    /// Return true if an initial term with this exponent represents only the initial state of the sensor filter of this
+    /// output.
     pub(crate) fn affects_only_filter(&self, output: usize, exponent: f64) -> bool {
         is_impulse(exponent)
             && (self.is_prefiltered || !self.record.is_filtered() || self.record.has_filter_transient(output))
@@ -320,7 +323,8 @@ impl Experiment {
         samples
     }
 
-    /// The weighted corrections of the samples, with all outputs concatenated; zero for filtered outputs.
+    /// Corrections `values` of the compared samples, multiplied by the weights, with all outputs concatenated. They are
+    /// zero for filtered outputs.
     pub(crate) fn weighted_corrections(&self, values: &[Vec<f64>]) -> Vec<f64> {
         let mut out = Vec::with_capacity(values.len() * self.compared_count());
         for (i, row) in values.iter().enumerate() {

@@ -1,9 +1,9 @@
 //! Direct feedthrough: the instantaneous effect of a term whose order equals the order of its equation.
 //!
 //! A sample is taken just after its input changes: y(t⁺) = y'(t) + G s(t⁺). Here y' is the output without feedthrough,
-//! s the input and G the gain of the feedthrough. The mean of the two pulses next to t contains G times their mean of
-//! s. The correction is G δ, where δ is s(t⁺) minus that mean. For a zero-order hold, δ is half a jump. For a linearly
-//! interpolated signal, it is a quarter of the second difference.
+//! s the input and G the gain of the feedthrough. The mean of y over the two pulses next to t contains G times the mean
+//! of s over these pulses. The correction is G δ, where δ is s(t⁺) minus that mean of s. For a zero-order hold, δ is
+//! half a jump. For a linearly interpolated signal, it is a quarter of the second difference.
 
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, ParameterPoint};
@@ -19,7 +19,7 @@ pub(crate) const FEEDTHROUGH_ORDER_TOLERANCE: f64 = 1e-9;
 pub(crate) struct Feedthrough {
     /// (I − C)⁻¹ with the feedthrough gains C between outputs, row-major; None without such gains.
     coupling_inverse: Option<Vec<f64>>,
-    /// Deviation δ of each input with feedthrough at the samples, and its derivative.
+    /// Deviation δ of each input with feedthrough at the compared samples, and the derivative of δ.
     ///
     /// δ is the value just after a sample time minus the mean of the two adjacent pulses. The derivative is that with
     /// respect to the free parameter of the input.
@@ -28,7 +28,8 @@ pub(crate) struct Feedthrough {
     terms: Vec<Vec<bool>>,
     /// (I − C)⁻¹ B δ by output and sample, unweighted.
     ///
-    /// δ are the deviations of the inputs, B their feedthrough gains, and C those between outputs.
+    /// δ contains the deviations of the inputs, B the feedthrough gains from inputs to outputs, and C those between
+    /// outputs.
     values: Vec<Vec<f64>>,
 }
 
@@ -156,12 +157,12 @@ pub(crate) fn add_feedthrough_derivative(
     column.iter_mut().zip(experiment.weighted_corrections(&direct.apply_coupling(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Correction of the response to jumps and slope discontinuities of the inputs.
+/// Correction of the simulated samples for jumps and slope discontinuities of the inputs.
 ///
-/// In pulse means, this response is half a pulse early. The mean of the pulses on either side of a sample contains half
-/// of the response of the first pulse after it. At the sample itself, only the direct gain of this response is present.
-/// Without the correction, a first-order equation has an error proportional to the step. With an input derivative of
-/// order 0.6, the error is proportional to step^0.4.
+/// In pulse means, the response to a jump is half a pulse early. The mean of the two pulses next to a sample contains
+/// half of the response to the pulse that follows the sample. At the sample itself, only the direct gain of this
+/// response is present. Without the correction, a first-order equation has an error proportional to the step. With an
+/// input derivative of order 0.6, the error is proportional to step^0.4.
 pub(crate) struct JumpCorrection {
     /// Per signal: half of the change of the next pulse mean due to a jump or kink, at each compared sample.
     ///
@@ -197,7 +198,8 @@ impl JumpCorrection {
         Self { jumps }
     }
 
-    /// Gain of the first pulse of the response minus the direct gain, as a row-major matrix of outputs by signals.
+    /// Gain from each signal to each output within one pulse, minus the direct gain, as a row-major matrix (outputs ×
+    /// signals).
     ///
     /// `at_once` flags the terms with direct feedthrough.
     fn gains(
@@ -238,7 +240,8 @@ impl JumpCorrection {
         structures.iter().map(feedthrough).collect()
     }
 
-    /// Subtract the early part of the response, with the given gains, from weighted samples.
+    /// Subtract the part of the response that pulse means contain too early, with the given gains, from weighted
+    /// samples.
     ///
     /// If `slopes` is true, the derivatives of the jumps replace the jumps.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {

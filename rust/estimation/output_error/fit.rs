@@ -32,7 +32,8 @@ pub struct OutputErrorFit {
     pub initial: Vec<Vec<Vec<f64>>>,
     /// Exponents of the initial terms, by equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Orthonormal basis of the weighted responses to the initial terms, by record; empty after several evaluations.
+    /// Orthonormal basis of the weighted responses to the initial terms, by record; empty if more than one evaluation
+    /// was allowed.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
@@ -40,7 +41,7 @@ pub struct OutputErrorFit {
     pub status: Status,
 }
 
-/// Evaluation by block pulses, by exact states of integer orders, or by exact transforms of other orders.
+/// Simulation method: block pulses, exact states for integer orders, or exact transforms for other orders.
 enum Simulation<'a> {
     Pulses(Evaluation<Linearization>),
     Exact(Evaluation<ExactSimulation<'a>>),
@@ -171,7 +172,8 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         })
     }
 
-    /// Derivatives of the coefficients with respect to an order, with constant coefficients in the scaled unit of time.
+    /// Derivatives of the coefficients with respect to an order, if the coefficients in the scaled unit of time are
+    /// held constant.
     fn coupled_derivatives(&self, point: &ParameterPoint, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
@@ -227,7 +229,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
     }
 }
 
-/// Move a point by steps in its coordinates, within bounds. Return the new point and the largest change.
+/// Move a point by steps in its coordinates, within bounds. Return the new point and the largest change of a parameter.
 ///
 /// Changes of orders are absolute. Changes of coefficients are relative in the scaled unit of time. Changes of input
 /// parameters are relative to the interval between their bounds.

@@ -37,7 +37,7 @@ struct Run {
     jumps: HashMap<usize, Vec<Bin>>,
 }
 
-/// Linear dependence of the weighted samples of an experiment on linear coefficients and initial terms.
+/// Linear dependence of the weighted samples of an experiment on the eliminated coefficients and on the initial terms.
 pub(crate) struct SampledSimulation {
     /// Orthonormal basis of the weighted responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,
@@ -61,7 +61,7 @@ type Slopes = Vec<(f64, f64)>;
 
 /// Response of an equation to one input from zero initial conditions.
 ///
-/// The coefficients of the terms of this input are replaced by weights.
+/// In this response, `weights` replace the coefficients of the terms of this input.
 struct Column {
     /// Weight of each term of the equation. Only the weights of the terms of this input are used.
     weights: Vec<f64>,
@@ -436,7 +436,7 @@ impl Run {
         self.columns(experiment, requests.len(), functions.iter().copied().zip(spectra))
     }
 
-    /// Return the compared samples of `count` columns.
+    /// Return `count` columns of compared samples.
     ///
     /// Column i is the inverse transform of the sum of the `functions` with index i. A function with an input is
     /// multiplied by the transform of the jumps of that input. A function without an input is the response to initial

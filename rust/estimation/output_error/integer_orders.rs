@@ -150,7 +150,8 @@ impl Companion {
         (row, direct)
     }
 
-    /// Return the samples of s^j/A applied to an input or impulse, from the states and input values of its response.
+    /// Return the response of s^j/A to an input or impulse at the compared samples, from the states of 1/A and the
+    /// input values.
     ///
     /// `j` is at most the order.
     pub(crate) fn derivative(&self, (states, values): &(Vec<f64>, Vec<f64>), j: usize) -> Vec<f64> {
@@ -161,8 +162,9 @@ impl Companion {
 
     /// Return the response of 1/A to an input, or to an impulse if `input` is None.
     ///
-    /// `behind` is an output row with a direct gain. Its output is the input of a second 1/A in series. The response
-    /// consists of the states at the compared samples, and the input just after each. None on overflow.
+    /// `behind` is an output row with a direct gain. The output that they define is the input of a second system 1/A in
+    /// series. The response consists of the states at the compared samples, and the input just after each. None on
+    /// overflow.
     pub(crate) fn respond(
         &self,
         input: Option<&SourceInput<'_>>,
@@ -577,9 +579,10 @@ impl Source<'_> {
 }
 
 impl EquationSimulation<'_> {
-    /// Output row and direct gain of the initial terms of one source.
+    /// Output row and direct gain of the initial terms that a source of kind `kind` represents.
     ///
-    /// The terms have exponents `powers` and coefficients `values`.
+    /// `powers` and `values` are the exponents and coefficients of all initial terms of the equation. Terms of another
+    /// kind are ignored.
     #[allow(clippy::cast_possible_wrap)]
     fn initial_output(&self, kind: &SourceKind, powers: &[usize], values: &[f64]) -> (Vec<f64>, f64) {
         let n = self.companion.order;
@@ -692,7 +695,7 @@ impl ExactSimulation<'_> {
         Some(total)
     }
 
-    /// Add the derivative with respect to coefficient `j` to `column`, as far as it is due to autoregressive terms.
+    /// Add the contribution of the autoregressive terms to the derivative with respect to coefficient `j` to `column`.
     ///
     /// `column` contains weighted samples.
     #[allow(clippy::cast_possible_wrap)]

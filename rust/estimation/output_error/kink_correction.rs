@@ -2,8 +2,8 @@
 //!
 //! Block-pulse means smooth out the kinks after jumps of zero-order-hold inputs. The leading kinks of an output come
 //! from the input terms of its equation. In these terms, a signal is integrated with the order α − ν. α is the order of
-//! the equation, and ν that of the term. Further kinks come from these terms after one pass through the autoregressive
-//! terms. After several passes the terms are smoother, and their error decreases with the step.
+//! the equation, and ν that of the term. Further kinks arise when these terms pass once through the autoregressive
+//! terms. After several passes the response is smoother, and the error of its pulse means decreases with the step.
 
 use super::experiment::{Experiment, NonuniformSamples};
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
@@ -24,7 +24,7 @@ struct Kink {
     terms: Vec<usize>,
     /// Correction of the compared samples for coefficients of 1.
     values: Vec<f64>,
-    /// Derivative of this correction with respect to the integration order.
+    /// Derivative of the correction `values` with respect to the integration order.
     slopes: Vec<f64>,
 }
 

@@ -134,7 +134,8 @@ pub struct FreeModel {
     pub initial: Initial,
 }
 
-/// Minimum ratio of the denominator at the Nyquist frequency to its leading coefficient at an admissible point.
+/// Minimum ratio of the denominator of the block-pulse scheme at the Nyquist frequency to its leading coefficient. A
+/// point with a smaller ratio is not admissible.
 const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
@@ -225,7 +226,7 @@ impl FreeModel {
         input.law.apply(means, value, record.step(), self.value_before(means))
     }
 
-    /// Return the jumps of an input within pulses after its nonlinearity, each with its derivative.
+    /// Return the jumps that an input has within pulses after its nonlinearity, each with its derivative.
     ///
     /// The derivatives are those with respect to the free parameter of the input.
     pub(crate) fn apply_input_law_to_jumps(
@@ -346,10 +347,10 @@ pub struct FreeInput {
 impl InputLaw {
     /// Apply the nonlinearity to pulse means. Return the new means and their derivative with respect to the parameter.
     ///
-    /// `value` is the parameter, `step` the pulse width \[s\], and `before` the input before the first pulse. A delay
-    /// is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer number
-    /// of steps, its derivative is one-sided, toward longer delays. Limits act on every pulse separately, which is
-    /// exact for a zero-order hold.
+    /// `value` is the parameter, `step` the pulse width \[s\], and `before` the value of the input before the first
+    /// pulse. A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an
+    /// integer number of steps, its derivative is one-sided, toward longer delays. Limits act on every pulse
+    /// separately, which is exact for a zero-order hold.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
@@ -439,10 +440,12 @@ const MAX_LOG_FACTOR: f64 = 300.0;
 /// Difference below which two exponents of time count as equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// Exponent of time in the unit of a coefficient: constant, and weights of the free orders.
+/// Exponent of the unit of time in the scaling factor of a coefficient, as an affine function of the free orders: the
+/// constant, and one weight per free order.
 type TimePower = (f64, Vec<f64>);
 
-/// Logarithm of the unit of time, and the exponent of time of each coefficient; None for an unscaled coefficient.
+/// Unit of time in which coefficients are scaled: its logarithm, and its exponent in the scaling factor of each
+/// coefficient. The exponent is None for an unscaled coefficient.
 #[derive(Debug, Clone)]
 pub(crate) struct TimeUnit {
     unit: f64,
@@ -450,12 +453,12 @@ pub(crate) struct TimeUnit {
 }
 
 impl TimeUnit {
-    /// Return the unit of time of experiments.
+    /// Return the unit of time for the runs of `experiments`, with its exponent for each coefficient of the model.
     pub(crate) fn from_experiments(model: &FreeModel, experiments: &[Experiment]) -> Self {
         Self::from_log_spans(model, &experiments.iter().map(log_span).collect::<Vec<_>>())
     }
 
-    /// Return the unit of time of a model.
+    /// Return the unit of time for runs with the given `spans`, with its exponent for each coefficient of the model.
     ///
     /// It is the geometric mean of sampling interval and duration over all runs, divided by π. `spans` contains
     /// ln(sampling interval × duration) of each run, in seconds.
@@ -480,9 +483,9 @@ impl TimeUnit {
         })
     }
 
-    /// Relative decrease of a coefficient in seconds per unit of a free order.
+    /// Return the relative decrease −∂ln c/∂ν of a coefficient c, in units of seconds, with respect to a free order ν.
     ///
-    /// The value of the coefficient in the scaled unit of time is constant.
+    /// The derivative is taken at a constant value of the coefficient in the scaled unit of time.
     pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
@@ -496,7 +499,7 @@ fn log_span(experiment: &Experiment) -> f64 {
     libm::log(interval) + libm::log(m * step)
 }
 
-/// Exponent of time of each coefficient; None for an unscaled coefficient.
+/// Return the exponent of the unit of time in the scaling factor of each coefficient; None for an unscaled coefficient.
 fn time_powers(model: &FreeModel) -> Vec<Option<TimePower>> {
     consistent_powers(model).unwrap_or_else(|| {
         // Exponents conflict if one coefficient occurs with several orders. Under a coefficient law, no coefficient is
@@ -511,7 +514,8 @@ fn is_scaled(model: &FreeModel, coefficient: usize) -> bool {
     matches!(model.coordinates[coefficient], Coordinate::Plain | Coordinate::Logarithm)
 }
 
-/// Exponent α − ν of the first term that has this coefficient alone; None if it is unscaled or there is no such term.
+/// Return the exponent α − ν of the first term whose coefficient is this one alone, not a product; None if there is no
+/// such term or the coefficient is unscaled.
 fn time_power(model: &FreeModel, coefficient: usize) -> Option<TimePower> {
     if !is_scaled(model, coefficient) {
         return None;
@@ -530,7 +534,8 @@ fn order_difference(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
     std::iter::once(highest.constant - order.constant).chain(weights).collect()
 }
 
-/// Exponents of time that are consistent with all products of coefficients, by elimination; None if they conflict.
+/// Solve for the exponent of the unit of time of each coefficient, such that the product of the coefficients of every
+/// term has the exponent α − ν; None if the terms conflict.
 fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     let (count, orders) = (model.coordinates.len(), model.order_bounds.len());
     // One row per product: exponents of the coefficients, and the exponent of time of the product.

@@ -298,7 +298,7 @@ impl FreeModel {
         Ok((response, solved))
     }
 
-    /// Pulse means of the input of a term of integration order `eta`, after the input nonlinearity.
+    /// Pulse means of the signal `signal` as a term of integration order `eta` uses them, after the input nonlinearity.
     pub(crate) fn input_means<'a>(
         &self,
         record: &'a Record,
@@ -308,9 +308,10 @@ impl FreeModel {
         self.law_of(signal).map_or_else(|| record.term_signal(signal, eta), |law| &acted[law].0)
     }
 
-    /// Determine the initial terms of an experiment, and add its residuals and terms to `out`.
+    /// Estimate the initial terms of an experiment by linear least squares, and append its residuals, initial terms and
+    /// linearization to `out`.
     ///
-    /// The initial terms follow from a projection of the residuals on their responses.
+    /// The estimates follow from a projection of the residuals on the responses to the initial terms.
     fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation<Linearization>) -> Result<()> {
         let RestSimulation { mut part, mut residuals, free } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
@@ -446,7 +447,7 @@ pub(crate) struct Linearization {
 impl Linearization {
     /// Effect of a parameter on the weighted samples, from its effect on the pulse means.
     ///
-    /// Parameters are ordered: orders, coefficients, input parameters.
+    /// Parameters are numbered in the sequence orders, coefficients, input parameters.
     pub(crate) fn parameter_effect(
         &self,
         parameter: usize,

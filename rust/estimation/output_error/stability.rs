@@ -6,11 +6,12 @@ use std::f64::consts::PI;
 const DOMINANCE_RATIO: f64 = 1e3;
 /// Maximum step in ln ω.
 const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
-/// Minimum step in ln ω. A pole that is closer to the imaginary axis counts as on the axis.
+/// Minimum step in ln ω. A pole counts as on the imaginary axis if its relative distance from the axis is smaller.
 const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
 /// Maximum change of the angle of the curve between two points \[rad\].
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
-/// Difference below which two exponents of s are merged. They are distinguishable only above ω = e^1000.
+/// Difference below which two exponents of s are merged. Powers of s whose exponents differ by less are distinguishable
+/// only above ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;
 /// Number of computed zeros in the right half-plane above which the equation counts as unstable.
 ///

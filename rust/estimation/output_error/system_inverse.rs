@@ -138,12 +138,13 @@ impl<'a> RightHandSides<'a> {
 /// Pulse means of every output.
 pub(crate) type PulseMeans = Vec<Vec<f64>>;
 
-/// Inverse of the system matrix A of the equations A y = b, up to the length of the longest run.
+/// Inverse of the matrix A in the system A y = b of the equations. Its series are as long as the longest run.
 pub(crate) struct SystemInverse {
     /// Solver that divides by A; None with running sums.
     solver: Option<RefCell<Solver<'static>>>,
     inverse: OnceCell<Inverse>,
-    /// Cache of the responses to initial terms, by equation and bits of the exponent, if several runs share it.
+    /// Cache of the responses to initial terms, by index of the equation and bit pattern of the exponent. It is used if
+    /// several runs share this inverse.
     initial_responses: RefCell<HashMap<(usize, u64), Rc<PulseMeans>>>,
 }
 
@@ -171,7 +172,8 @@ impl SystemInverse {
         self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
     }
 
-    /// Return the inverse A⁻¹, with spectra for products of [`SPECTRUM_FACTORS`] series of the longest run.
+    /// Return the inverse A⁻¹. Its spectra, if it has any, are padded so that products of [`SPECTRUM_FACTORS`] series
+    /// of the longest run have no aliasing.
     ///
     /// # Errors
     /// An error if the series do not match the matrix ([`Solver::solve`]).
@@ -348,7 +350,8 @@ impl Operator {
         (is_integer && nearest <= MAX_SUMS as f64).then_some(nearest as usize)
     }
 
-    /// Spectrum of the kernel, or of its derivative, for products of [`SPECTRUM_FACTORS`] series.
+    /// Spectrum of the kernel, or of its derivative if `slope` is true, padded for products of [`SPECTRUM_FACTORS`]
+    /// series.
     pub(crate) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
         let compute = || {
             Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), SPECTRUM_FACTORS * self.m) })
@@ -371,7 +374,7 @@ pub(crate) struct InitialTerm {
     slope: OnceCell<Vec<f64>>,
 }
 
-/// Filter series with its spectrum for products of [`SPECTRUM_FACTORS`] series.
+/// Series of a filter, with its spectrum padded for products of [`SPECTRUM_FACTORS`] series.
 pub(crate) struct SeriesFilter {
     series: Vec<f64>,
     spectrum: Kernel,
@@ -405,7 +408,7 @@ impl InitialTerm {
         }
     }
 
-    /// Derivative of t^e with respect to e, before the filter.
+    /// Pulse means of the derivative of t^e with respect to e, before the filter.
     pub(crate) fn slope(&self) -> &[f64] {
         let of = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
         self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))

@@ -21,9 +21,9 @@ const CHECKPOINT_PULSES: usize = 1 << 21;
 const BOUND_CHUNK_CANDIDATES: u64 = 512;
 /// Number of candidates that one parallel task ranks by the Gram matrix alone, at about 1 ns per candidate.
 const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
-/// Number of slices on which branch and bound over boxes is tried if candidates are hard to exclude. It is used if
-/// boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude nothing make a search
-/// 50 % longer.
+/// Number of slices on which branch and bound over boxes is tried if candidates are hard to exclude. Branch and bound
+/// is then used if boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude
+/// nothing make a search 50 % longer.
 const TRIAL_SLICES: u64 = 32;
 /// Maximum ratio of the number of candidates to the number of candidates that boxes exclude. At a larger ratio, boxes
 /// cost more time than they save.
@@ -79,8 +79,8 @@ impl<'a> BatchEvaluation<'a> {
     }
 
     /// Screen the candidates in the index range `bounds` and simulate those that no bound excludes, starting at the
-    /// position `place`. Return false if the position belongs to another evaluation order, which may occur on another
-    /// kind of processor.
+    /// position `place`. Return false if the position belongs to another evaluation sequence, which may occur on
+    /// another kind of processor.
     pub(super) fn evaluate_batch(
         &mut self,
         bounds: (u64, u64),
@@ -166,8 +166,8 @@ impl<'a> BatchEvaluation<'a> {
     }
 
     /// Split the candidates `start … end − 1` of a batch into chunks, one per parallel task: (first candidate,
-    /// candidate after the last one, slice). A chunk with a slice is processed by branch and bound, other chunks are
-    /// small.
+    /// candidate after the last one, slice). A chunk with a slice is processed by branch and bound. A chunk without one
+    /// has at most [`GRAM_CHUNK_CANDIDATES`] candidates.
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<GridSlice>)> {
         let mut chunks = Vec::new();
         // With boxes, a chunk must not extend far into the next slice.
@@ -192,7 +192,7 @@ impl<'a> BatchEvaluation<'a> {
         chunks
     }
 
-    /// Simulate the candidates `open` in this order, starting at the position `place`, and add their rows to
+    /// Simulate the candidates `open` in the given sequence, starting at the position `place`, and add their rows to
     /// `top_rows`. If `counted` is true, counts and checkpoints are updated.
     pub(super) fn simulate_open(
         &mut self,
@@ -315,8 +315,8 @@ impl<'a> BatchEvaluation<'a> {
     }
 }
 
-/// Return a digest of the evaluation order of candidates, below 2^63 and never 0. It is the 64-bit FNV-1a hash of their
-/// indices without the last bit.
+/// Return a digest of the evaluation sequence of candidates, below 2^63 and never 0. It is the 64-bit FNV-1a hash of
+/// their indices without the last bit.
 fn digest(open: &[OpenCandidate]) -> u64 {
     let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
     let whole =

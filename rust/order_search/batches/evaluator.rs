@@ -4,8 +4,8 @@
 //! Candidates are processed in batches. The coefficients of all candidates of a batch are computed in parallel SIMD
 //! lanes, and a lower bound excludes most candidates. The remaining ones are simulated in ascending order of an
 //! estimate of their score. Each simulation stops once its partial sum exceeds the worst score in the result table. An
-//! excluded candidate cannot enter the table. The table therefore equals that of brute force, and candidates of equal
-//! score are ordered by index.
+//! excluded candidate cannot enter the table. The table therefore equals that of brute force. Candidates of equal score
+//! are sorted by index.
 //!
 //! Successive batches form generations of 1, 2, 4, … batches. The result of a batch depends only on the batch and on
 //! the rows found before its generation. Result and counts are therefore bitwise reproducible on processors of one
@@ -177,7 +177,8 @@ impl<'a> BatchEvaluator<'a> {
     ///
     /// `seed` lists index and raw score (Σ|e| or Σe²) of the best rows found before the generation. `from` resumes a
     /// checkpoint of the same range and seed. It must contain all rows found since the start of the range. The range is
-    /// restarted if the checkpoint belongs to another evaluation order, which may occur on another kind of processor.
+    /// restarted if the checkpoint belongs to another evaluation sequence, which may occur on another kind of
+    /// processor.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`] after a stop request. [`crate::error::Error::Structure`] for batches, a
@@ -308,19 +309,20 @@ fn is_invalid_score(score: f64) -> bool {
 }
 
 /// Number of candidates per batch if they are ranked by the Gram matrix alone (16 ns per candidate). A batch takes long
-/// enough to justify sending it to another machine, and so short that its loss is acceptable.
+/// enough to justify sending it to another machine, and is short enough that its loss is acceptable.
 const BATCH_SIZE_GRAM: u64 = 1 << 18;
 /// Number of candidates per batch if lower bounds exclude candidates before simulation (about 1 µs per candidate).
 const BATCH_SIZE_BOUNDED: u64 = 1 << 16;
 /// Number of candidates per batch if all are simulated.
 const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
-/// Minimum number of candidates of a search for branch and bound over boxes. Above it, the batch size grows with the
-/// grid up to [`MAX_BATCH_SIZE`], because tables of a slice that two batches share are computed twice.
+/// Minimum number of candidates in a search that uses branch and bound over boxes. Above it, the batch size grows with
+/// the grid up to [`MAX_BATCH_SIZE`], because tables of a slice that two batches share are computed twice.
 pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
 /// Maximum number of candidates per batch.
 const MAX_BATCH_SIZE: u64 = 1 << 22;
-/// Minimum number of candidates of a search for the expensive bounds (unstable zeros and linearized test vectors), if
-/// candidates are ranked by simulation. A smaller search would end before these bounds are built.
+/// Minimum number of candidates in a search that uses the expensive bounds (unstable zeros and linearized test
+/// vectors). These bounds apply only if candidates are ranked by simulation. A smaller search would end before these
+/// bounds are built.
 const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
 /// Maximum number of candidates of a search with refined coefficients that skips the initial sample. It is one batch.
 pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
@@ -352,8 +354,8 @@ pub fn batch_count(candidates: u64, options: &Options) -> u64 {
     candidates.div_ceil(batch_size(candidates, options))
 }
 
-/// Return the end of each generation of batches: 1, 3, 7, … and finally the number `rounds` of batches. A generation
-/// ends before the batch with this number.
+/// Return the end of each generation of batches: 1, 3, 7, … and finally the number `rounds` of batches. Each of these
+/// numbers is that of the first batch after the generation.
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;

@@ -25,9 +25,9 @@ const MAX_SEARCH_VECTORS: usize = 16;
 /// first. Estimates are cheap, and low scores from a large part of the grid exclude most of it.
 const RANKED_CANDIDATES: u64 = 1 << 18;
 
-/// Inverse of a fraction of the sample. The expensive bounds (unstable zeros and linearized test vectors) save time if
-/// the other bounds leave at least this fraction. Measured: 0.3 to 2 % are not excluded (9 % at twice the noise) if the
-/// grid contains a true equation, and 53 to 100 % otherwise.
+/// Maximum ratio of the number of candidates in the sample to the number that the other bounds do not exclude, up to
+/// which the expensive bounds (unstable zeros and linearized test vectors) save time. Measured: 0.3 to 2 % are not
+/// excluded (9 % at twice the noise) if the grid contains a true equation, and 53 to 100 % otherwise.
 const HARD_SEARCH_OPEN_RATIO: usize = 8;
 
 /// Best candidates of the initial sample, the selected test vectors, and whether expensive bounds save time.
@@ -123,8 +123,9 @@ impl BatchEvaluation<'_> {
     }
 }
 
-/// Select at most `most` test vectors that together exclude most candidates of a sample, by greedy selection. `each`
-/// gives the bound of each test vector for each candidate. Return the indices of the selected vectors.
+/// Select at most `most` test vectors by a greedy algorithm, so that together they exclude as many candidates of a
+/// sample as possible. `each` gives the bound of each test vector for each candidate. Return the indices of the
+/// selected vectors.
 fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut selection: Vec<usize> = Vec::new();

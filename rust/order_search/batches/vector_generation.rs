@@ -26,7 +26,7 @@ const TAILORED_SAMPLE_RATIO: u64 = 512;
 const TAILORED_SAMPLE_BLOCK: u64 = 16;
 /// Number of blocks of candidates that are screened between two checks of the number of candidates found.
 const BLOCKS_PER_SCREENING: u64 = 1 << 11;
-/// Number of candidates found that no bound excludes, at which sampling stops.
+/// Number of unexcluded candidates in the sample at which sampling stops.
 const OPEN_SAMPLE_CANDIDATES: usize = 512;
 /// Maximum number of tailored test vectors that are built in one pass of vector generation.
 const MAX_TRIAL_VECTORS: usize = 32;
@@ -86,9 +86,9 @@ impl BatchEvaluation<'_> {
         Ok((open, each))
     }
 
-    /// Generate tailored test vectors that together exclude most candidates not yet excluded at this limit of the raw
-    /// score (Σ|e| or Σe²). The first pass (`pass` 0) includes a vector for the best row. The result has no vectors if
-    /// they save no time or memory is lacking.
+    /// Generate tailored test vectors that together exclude as many as possible of the candidates not yet excluded at
+    /// this limit of the raw score (Σ|e| or Σe²). The first pass (`pass` 0) includes a vector for the best row. The
+    /// result has no vectors if they save no time or memory is lacking.
     pub(super) fn generate_tailored_vectors(
         &self,
         limit: f64,
@@ -170,20 +170,22 @@ const MAX_LINEARIZED_SAMPLE: u64 = 1 << 19;
 const LINEARIZED_SAMPLE_RATIO: u64 = 8;
 /// Number of consecutive candidates in a block of the sample for linearized test vectors.
 const LINEARIZED_SAMPLE_BLOCK: u64 = 8;
-/// Minimum number of candidates of the grid that a linearized test vector must exclude. Also the minimum number not yet
-/// excluded for building another vector. Building a vector costs as much as ten to twenty simulations.
+/// Minimum number of candidates of the grid that a linearized test vector must exclude. Another vector is built only if
+/// at least this number of candidates is not yet excluded. Building a vector costs as much as ten to twenty
+/// simulations.
 const MIN_LINEARIZED_EXCLUSIONS: f64 = 32.0;
-/// Maximum number of linearized test vectors for the same orders of the output terms.
+/// Maximum number of linearized test vectors per combination of orders of the output terms.
 const MAX_LINEARIZED_VECTORS: usize = 24;
-/// Maximum number of linearized test vectors that exclude too few candidates, for the same orders of the output terms.
+/// Maximum number of linearized test vectors that exclude too few candidates, per combination of orders of the output
+/// terms.
 const MAX_FAILED_VECTORS: usize = 6;
 /// Maximum memory of all linearized test vectors \[bytes\].
 const MAX_LINEARIZED_BYTES: u64 = 1 << 30;
 
 impl BatchEvaluation<'_> {
-    /// Generate linearized test vectors for each combination of orders of the output terms. They exclude candidates of
-    /// a sample that no bound excludes at this limit of the raw score (Σ|e| or Σe²). `None` if no vector saves time or
-    /// memory is lacking.
+    /// Generate linearized test vectors for each combination of orders of the output terms. They are built for the
+    /// candidates of a sample that no other bound excludes at this limit of the raw score (Σ|e| or Σe²). `None` if no
+    /// vector saves time or memory is lacking.
     pub(super) fn generate_linearized_vectors(&self, limit: f64) -> Result<Option<LinearizedVectors>> {
         let problem = &self.candidate_index.problem;
         let mut linearized_vectors = problem.empty_linearized_vectors();

@@ -3,7 +3,8 @@
 //! For each grid value of the order, x is the regressor column. The vector û is x made orthogonal to the fixed-order
 //! columns of the slice and scaled to unit norm. Let l be the linear interpolation of a quantity f between the ends of
 //! an interval. Then f deviates from l by at most one eighth of the squared length times the largest second difference.
-//! This follows from f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
+//! This follows from f_i − l_i = −Σ_j G_ij Δ²f_j, where lo and hi are the ends of the interval, and G is a nonnegative
+//! matrix with Σ_j G_ij = (i − lo)(hi − i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
@@ -14,7 +15,7 @@ pub(super) type Wide = [f64; LANE_COUNT];
 pub(super) const ZERO_LANES: Wide = [0.0; LANE_COUNT];
 
 /// Products of a column x with a group of test vectors t: ⟨t, x⟩ and g‖t‖, each as real and imaginary part. Here g is
-/// the projection of Fᵀt on t, and F is the kernel matrix of x. For a column of another signal than the output, g is 0.
+/// the projection of Fᵀt on t, and F is the kernel matrix of x. For a column of a signal other than the output, g is 0.
 pub(super) type VectorProducts = [Wide; 4];
 
 /// Maxima over one interval of an order, for one group of [`LANE_COUNT`] test vectors.
@@ -23,7 +24,8 @@ pub(super) struct Node {
     /// Four maxima over the interval of grid values. The first two are second differences of ⟨t, û⟩ and g‖t‖ along the
     /// order. The third is ‖Fᵀt − g t‖. The fourth bounds the difference of Fᵀt − g t from its value for the
     /// fixed-order output column. Here t is a test vector, and û is the column of the varying order, orthogonal to the
-    /// fixed-order columns and of unit norm. F is its kernel matrix, and g is the projection of Fᵀt on t.
+    /// fixed-order columns and of unit norm. F is the kernel matrix of the varying column, and g is the projection of
+    /// Fᵀt on t.
     pub(super) second_differences: [Wide; 4],
 }
 
@@ -41,7 +43,7 @@ pub(super) struct Level {
     /// Largest sum of coefficient moduli, by interval of grid values.
     pub(super) coefficient_sums: Vec<CoefficientSums>,
     /// Largest second differences of the coefficients of the normalized column (orthogonal to the fixed-order columns,
-    /// of unit norm) on the fixed-order columns. The entries are ordered by interval, then by fixed-order column.
+    /// of unit norm) on the fixed-order columns. The entries are sorted by interval, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
     /// Maxima of quantities of the test vectors, by interval of grid values, then by group of test vectors.
     pub(super) nodes: Vec<Node>,
@@ -57,7 +59,7 @@ pub(super) struct RemainingColumns<'a> {
     pub(super) inverse: &'a [f64],
     /// Trace of `inverse`, at least 1.
     pub(super) trace: f64,
-    /// Rounding-error bound of the product of two unit-norm columns.
+    /// Upper bound of the rounding error in the inner product of two unit-norm columns.
     pub(super) rounding: f64,
     /// Index in `columns` of a column of the output, if there is one. A varying column may also belong to the output.
     /// The coefficients of the two columns may then cancel.
@@ -131,12 +133,12 @@ pub(super) struct AxisTable {
     /// column.
     pub(super) shared: Vec<f64>,
     /// Coefficients, with the opposite sign, of the normalized column (orthogonal to the fixed-order columns, of unit
-    /// norm) on the fixed-order columns. Ordered by grid value, then by fixed-order column.
+    /// norm) on the fixed-order columns. The entries are sorted by grid value, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
-    /// Negative sum, by grid value, of two coefficients of the normalized column (orthogonal to the fixed-order
-    /// columns, of unit norm). They belong to the fixed-order output column and to the regressor column itself if it is
-    /// an output column. The second is converted to the scale of the first. Empty if no fixed-order column belongs to
-    /// the output.
+    /// Sum, with the opposite sign, of two coefficients of the normalized column (orthogonal to the fixed-order
+    /// columns, of unit norm), by grid value. They belong to the fixed-order output column and to the regressor column
+    /// itself if it is an output column. The second is converted to the scale of the first. Empty if no fixed-order
+    /// column belongs to the output.
     pub(super) joint_coefficients: Vec<f64>,
     /// Products of the normalized column (orthogonal to the fixed-order columns, of unit norm) with the test vectors,
     /// by grid value, then by group of [`LANE_COUNT`] test vectors.

@@ -32,7 +32,7 @@ const SCREENING_LEVEL_SUM: usize = 4;
 /// Constants of branch and bound that all boxes of a search share.
 pub(crate) struct BranchAndBound {
     common: SearchConstants,
-    /// Rounding-error bound of the product of two unit-norm columns.
+    /// Upper bound of the rounding error in the inner product of two unit-norm columns.
     rounding: f64,
 }
 
@@ -330,8 +330,9 @@ pub fn box_bounds(records: &[Record], grid: &OrderGrid, options: &Options, index
     })
 }
 
-/// Return the candidates of the index range in the slice of the order grid containing `index` that no bound excludes.
-/// They include all candidates whose raw error (Σ|e| or Σe²) is at most `limit`. Empty if [`box_bounds`] is empty.
+/// Return the candidates in the index range `range` that no bound excludes, limited to the slice of the order grid that
+/// contains candidate `index`. They include all candidates whose raw error (Σ|e| or Σe²) is at most `limit`. Empty if
+/// [`box_bounds`] is empty.
 ///
 /// # Errors
 /// The errors of [`crate::order_search::batches::search`]: an option out of range, signals that the records lack, or

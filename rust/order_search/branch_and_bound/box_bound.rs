@@ -22,9 +22,9 @@ use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::simd::LANE_COUNT;
 
-/// Factor of the rounding-error bound of coefficients, far above the error of the elimination. The other factors are
-/// the trace of the inverse correlation matrix, the squared number of terms, and the sum of moduli of output and
-/// coefficients.
+/// Constant factor in the bound of the rounding error of a coefficient. It is far above the error of Gaussian
+/// elimination. The other factors of this bound are the trace of the inverse correlation matrix, the squared number of
+/// terms, and the sum of the output norm and the moduli of the coefficients.
 const ELIMINATION_ERROR: f64 = 16.0 * f64::EPSILON;
 
 /// Value of 1 − B² at or below which the two varying columns are numerically collinear. B is the inner product of these
@@ -153,10 +153,10 @@ pub(super) struct BoxQuantities {
     /// corner values. Here p and q are the coefficients of the two varying columns. The deviations are 0 if candidates
     /// are ranked by equation error, whose bound does not need them.
     pub(super) bilinear_deviation: [f64; 2],
-    /// Bounds of the curvature of p times a linear function of s, and of q times a linear function of t. Here −1 ≤ s, t
-    /// ≤ 1 are the coordinates in the box of orders, and p and q are the coefficients of the two varying columns. The
-    /// first bound sums the moduli of the coefficients of s and st in the bilinear form of p. The second sums those of
-    /// t and st in the form of q.
+    /// Upper bounds of the deviations of p s and q t from bilinear functions over the box of orders. Here −1 ≤ s, t ≤ 1
+    /// are the coordinates in the box, and the coefficients p and q of the two varying columns are approximated by
+    /// bilinear functions. The first bound is the sum of the moduli of the coefficients of s and st in the function for
+    /// p. The second is that of t and st in the function for q.
     pub(super) mixed_slopes: [f64; 2],
     /// Upper bound over the box of the part of the squared output norm that the two varying columns explain. It is 0
     /// unless candidates are ranked by equation error.
@@ -189,14 +189,14 @@ impl BoxQuantities {
 pub(super) struct Moduli {
     /// Modulus of the coefficient of each fixed-order column at the four corners.
     others: [[f64; 4]; MAX_REMAINING_COLUMNS],
-    /// Bound of the deviation over the box of orders of the coefficient of each fixed-order column from a bilinear
-    /// function, with its rounding error.
+    /// For each fixed-order column, an upper bound of how far its coefficient deviates from a bilinear function within
+    /// the box of orders. The bound includes rounding errors.
     rests: [f64; MAX_REMAINING_COLUMNS],
     /// Modulus, at each corner, of the sum of two coefficients that may cancel. They belong to the fixed-order output
     /// column and to the varying output column.
     sums: [f64; 4],
-    /// Bound of the deviation over the box of orders of the sum of the two coefficients of `sums` from a bilinear
-    /// function, with its rounding error.
+    /// Upper bound of how far the sum of the two coefficients of `sums` deviates from a bilinear function within the
+    /// box of orders. The bound includes rounding errors.
     sums_rest: f64,
 }
 
@@ -211,8 +211,9 @@ pub(super) struct CornerValues {
     /// g|. The sum is over the output columns with coefficient c and kernel matrix F. Here t is a test vector, and g is
     /// the projection of Fᵀt on t.
     pub(super) slack: [Wide; 4],
-    /// Bounds of the deviation from bilinear functions over the box of orders. The first is for the products of test
-    /// vectors with the equation error. The second is for the denominators of the bound with their slack.
+    /// Upper bounds of how far two quantities deviate from bilinear functions within the box of orders. The first
+    /// quantity is the product of a test vector with the equation error. The second is the denominator of the bound,
+    /// including its slack.
     pub(super) remainders: [Wide; 2],
 }
 
@@ -233,7 +234,8 @@ pub(super) struct SliceTables<'a> {
     /// F, and g is the projection of Fᵀt on t.
     base: Vec<VectorProducts>,
     /// Norms ‖Fᵀt − g t‖ for the fixed-order columns with kernel matrix F and the test vectors t, scaled by the inverse
-    /// column norm. Here g is the projection of Fᵀt on t. The order is by group of test vectors, then by column.
+    /// column norm. Here g is the projection of Fᵀt on t. The entries are sorted by group of test vectors, then by
+    /// column.
     rests: Vec<Wide>,
 }
 
@@ -685,15 +687,15 @@ pub(super) struct RowCoefficients {
 }
 
 impl RowCoefficients {
-    /// Return the index in the stored vectors of the candidate number `value` in row `row` of the slice.
+    /// Return the index, in the stored vectors, of candidate number `value` in row `row` of the slice.
     #[inline(always)]
     pub(super) fn at(&self, row: usize, value: usize) -> usize {
         (row - self.start) * self.len + value
     }
 
     /// Return the largest deviations of (p + q)/2 and (p − q)/2 from the given bilinear functions over a box of orders,
-    /// and the smallest 1 − B². Here p and q are the coefficients of the two varying columns, and B is the product of
-    /// these columns.
+    /// and the smallest 1 − B². Here p and q are the coefficients of the two varying columns, and B is the inner
+    /// product of these columns after normalization.
     #[inline(always)]
     pub(super) fn bilinear_deviation(
         &self,
@@ -736,7 +738,7 @@ impl RowCoefficients {
     }
 
     /// Return the smallest 1 − B² over a box of orders, and the largest part of the squared output norm that the two
-    /// varying columns explain. B is the product of these columns.
+    /// varying columns explain. B is the inner product of these columns after normalization.
     #[inline(always)]
     pub(super) fn max_explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
         let (mut independence, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);

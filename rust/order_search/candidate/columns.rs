@@ -21,7 +21,7 @@ impl<'a> RequiredRegressors<'a> {
         Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
     }
 
-    /// Add the initial terms that every equation with the highest order α requires.
+    /// Add the initial terms that every equation of order α = `alpha` requires.
     pub(crate) fn add_alpha(&mut self, alpha: f64) {
         if !self.alphas.insert(grains(alpha)) {
             return;

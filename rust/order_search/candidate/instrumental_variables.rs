@@ -11,7 +11,8 @@ use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
 use crate::series::Kernel;
 
-/// Ratio of the cutoff of the low-pass filter for the initial coefficients to the bandwidth of the output.
+/// Cutoff frequency of the low-pass filter, relative to the bandwidth of the output. Initial coefficients are estimated
+/// from the filtered signals.
 const START_BAND: f64 = 2.0;
 
 /// Spectra of one record, used for the refinement of all candidates.
@@ -61,7 +62,7 @@ impl Refiner {
     }
 
     /// Refine the coefficients of the terms (`coefficients`) and of the initial terms of each record (`weights`) in
-    /// place. Return the reason of a failure. The result is invalid after a stop request.
+    /// place. If the refinement fails, return the reason as the error. The result is invalid after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -103,8 +104,8 @@ impl Refiner {
     }
 }
 
-/// Return the bank of regressors and the output from which initial coefficients are estimated. Their signals are
-/// noise-free and low-pass filtered.
+/// Return the bank of regressors and the output from which initial coefficients are estimated. Both are computed from
+/// noise-free, low-pass filtered signals.
 ///
 /// # Errors
 /// [`Error::Structure`] for a signal that the record lacks, [`Error::Interrupted`] after a stop request

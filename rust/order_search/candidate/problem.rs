@@ -406,7 +406,8 @@ impl Problem {
         self.samples
     }
 
-    /// Return the column number in the banks of the fractional integral of order `eta` of a signal.
+    /// Return the column number, in the banks, of the regressor that is the fractional integral of order `eta` of
+    /// `signal`.
     pub(crate) fn position(&self, signal: usize, eta: f64) -> Result<usize> {
         self.index
             .get(Key::integral(signal, eta))

@@ -101,7 +101,8 @@ impl<'a> CommonFactor<'a> {
     }
 
     /// Append the indices into `columns` of the candidates that this bound does not exclude at a limit of the sum of
-    /// squared equation errors. `columns` ascends and gives the column of the varying term for each candidate.
+    /// squared equation errors. `columns` contains the column of the varying term for each candidate, sorted by
+    /// increasing index.
     #[inline(always)]
     pub(crate) fn append_open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
         // For frequent numbers of terms, the compiler generates loops of constant length.
@@ -151,7 +152,8 @@ impl<'a> CommonFactor<'a> {
         open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
     }
 
-    /// Return true for each of L candidates if no coefficients reduce its sum of squared equation errors to the limit.
+    /// Return one flag for each of L candidates. It is true if no coefficients reduce the sum of squared equation
+    /// errors of the candidate to the limit.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangular arrays of lanes, indexed by row and column
     fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {

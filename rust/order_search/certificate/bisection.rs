@@ -1,5 +1,5 @@
-//! Bisection of the cells (boxes of orders) of a region. It ends when no cell can contain an equation error far below
-//! the smallest error found.
+//! Bisection of the cells (boxes of orders) of a region. It ends when no cell can contain orders whose equation error
+//! is far below the smallest error found.
 
 use std::sync::atomic::Ordering;
 
@@ -57,7 +57,8 @@ pub struct Certificate {
     pub orders: Vec<f64>,
     /// Number of cells (boxes of orders) for which a bound was computed.
     pub cells: u64,
-    /// Number of open cells (boxes of orders): their bound is too small, and they cannot be bisected further.
+    /// Number of open cells (boxes of orders), whose bound is too small. They are at the finest level, or the maximum
+    /// number of cells is reached.
     pub open_cells: u64,
 }
 

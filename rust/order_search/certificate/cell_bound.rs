@@ -29,13 +29,13 @@ const BOUND_MARGIN: f64 = 1e-6;
 const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 
 /// Inner products of the regressor columns and their derivatives at the midpoint of a cell (box of orders). The columns
-/// and the measured output have unit norm. Derivatives are taken by the order of integration.
+/// and the measured output have unit norm. Derivatives are with respect to the order of integration.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellProducts {
     /// Number of terms of the equation.
     pub(super) k: usize,
     /// Products of the column of term i with the mth derivative of the column of term j, by m, then i, then j.
-    /// Derivatives are taken by the order of integration.
+    /// Derivatives are with respect to the order of integration.
     pub(super) products: [[Row; MAX_TERMS]; EXPANSION_COLUMNS],
     /// Products of the measured output with the mth derivative of the column of term j, by m, then j.
     pub(super) target: [Row; EXPANSION_COLUMNS],
@@ -45,7 +45,7 @@ pub(super) struct CellProducts {
     pub(super) rests: Row,
     /// Half width of the cell (box of orders) for each order of integration.
     pub(super) halves: Row,
-    /// Rounding-error bound of the product of two unit-norm columns.
+    /// Upper bound of the rounding error in the inner product of two unit-norm columns.
     pub(super) rounding: f64,
 }
 

@@ -30,7 +30,7 @@ const COLUMNS_PER_TASK: usize = 64;
 pub(super) struct Cell {
     /// Bisection level of the interval of each term.
     pub(super) level: [u8; MAX_TERMS],
-    /// Number of the interval of each term. It starts at this number times the width of the level.
+    /// Index of the interval of each term. The interval starts at this index times the interval width of its level.
     pub(super) at: [u32; MAX_TERMS],
     /// Lower bound of the relative squared residual that was proved for the parent cell.
     pub(super) inherited_bound: f64,
@@ -43,8 +43,8 @@ type LevelIntervals = Vec<(usize, usize)>;
 /// Tables of inner products for the bounds of cells (boxes of orders). A node is the midpoint of an interval of orders
 /// of integration of one signal.
 pub(super) struct GramTables {
-    /// Intervals of orders of integration of each term. A term of fixed order has no intervals but the index of its
-    /// node.
+    /// Intervals of orders of integration of each term, and index of its node. The intervals are None for a term of
+    /// fixed order, and the index is unused for other terms.
     terms: Vec<(Option<LevelIntervals>, usize)>,
     /// Highest bisection level of intervals with stored inner products.
     table_level: u8,
@@ -54,15 +54,16 @@ pub(super) struct GramTables {
     nodes: usize,
     /// Total number of samples of all records.
     samples: usize,
-    /// Products x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ of the derivatives of orders n and m of the columns at nodes i and j. Ordered by the pair
-    /// (n, m) of [`DERIVATIVE_PAIRS`], then j, then i.
+    /// Products x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ of the derivatives of orders n and m of the columns at nodes i and j. The entries are
+    /// sorted by the pair (n, m) of [`DERIVATIVE_PAIRS`], then by j, then by i.
     products: [Vec<f64>; DERIVATIVE_PAIRS.len()],
-    /// Products of the regressor columns and their derivatives by the order with the measured output, scaled to unit
-    /// norm. Ordered by derivative, then by node.
+    /// Inner products of the measured output, scaled to unit norm, with the regressor columns and their derivatives
+    /// with respect to the order. The entries are sorted by derivative, then by node.
     target: [Vec<f64>; EXPANSION_COLUMNS],
-    /// Upper bounds of the norms of a regressor column and its derivatives by the order, by node.
+    /// Upper bounds of the norms of a regressor column and its derivatives with respect to the order. There is one
+    /// array per node.
     sizes: Vec<[f64; EXPANSION_COLUMNS]>,
-    /// Upper bound of the remainder when a regressor column is expanded in a Taylor series in its order, by node. A node
+    /// For each node, an upper bound of the remainder of the Taylor series of a regressor column in its order. A node
     /// is an order about which columns are expanded.
     rests: Vec<f64>,
 }
@@ -104,8 +105,8 @@ fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
 struct NodeLayout {
     /// Signal, order of integration at the midpoint, and half width of each node.
     nodes: Vec<(usize, f64, f64)>,
-    /// Intervals of orders of integration of each term. A term of fixed order has no intervals but the index of its
-    /// node.
+    /// Intervals of orders of integration of each term, and index of its node. The intervals are None for a term of
+    /// fixed order, and the index is unused for other terms.
     terms: Vec<(Option<LevelIntervals>, usize)>,
 }
 
@@ -394,8 +395,8 @@ impl Region {
         self.terms[a] == self.terms[b] && self.terms[a].lowest < self.terms[a].highest
     }
 
-    /// Return the interval of the order α of the equation for which the first terms may have orders of integration
-    /// within these intervals. `None` if it is empty.
+    /// Return the interval of the order α of the equation that permits orders of integration of the first terms within
+    /// the intervals `within`. `None` if it is empty.
     pub(super) fn alpha_interval(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
         let (mut low, mut high) = self.alpha;
         for (term, &(a, b)) in within.iter().enumerate() {

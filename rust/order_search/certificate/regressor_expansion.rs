@@ -1,11 +1,11 @@
 //! Taylor expansion of a regressor I^η s in its order of integration η, with a bound of the remainder. I^η is the
 //! fractional integral of order η, and s a signal.
 //!
-//! The kernel v_n = Δ²n^{η+1} of I^η at distance n is differentiated by η term by term. Columns may be scaled, also by
-//! e^{−λ(η−η₀)}. If λ is the mean logarithmic slope of the column at η₀, the scaled column changes its direction but
-//! hardly its norm. The remainder follows from a bound of the fourth derivative by η. This derivative is a mean of
-//! d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses (sampling intervals), with the distance t. The terms of the bound increase
-//! with η for t ≥ 1.
+//! The kernel v_n = Δ²n^{η+1} of I^η at distance n is differentiated with respect to η, term by term. Columns may be
+//! scaled, also by e^{−λ(η−η₀)}. If λ is the mean logarithmic slope of the column at η₀, the scaled column changes its
+//! direction but hardly its norm. The remainder follows from a bound of the fourth derivative with respect to η. This
+//! derivative is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses (sampling intervals), with the distance t. The
+//! terms of the bound increase with η for t ≥ 1.
 
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
@@ -14,7 +14,7 @@ use crate::series::{Buffers, Kernel};
 
 /// Maximum number of terms of an equation with a certificate.
 pub(super) const MAX_TERMS: usize = 6;
-/// Highest derivative by the order of integration in the Taylor expansion of a regressor.
+/// Highest derivative, with respect to the order of integration, in the Taylor expansion of a regressor.
 pub(super) const EXPANSION_DEGREE: usize = 3;
 /// Number of columns of the expansion: the value and its derivatives.
 pub(super) const EXPANSION_COLUMNS: usize = EXPANSION_DEGREE + 1;
@@ -31,8 +31,8 @@ const FACTORIAL_TABLE: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
 /// Expansion of the regressor of one signal about one order of integration. Records are concatenated, and the value has
 /// unit norm.
 pub(super) struct RegressorExpansion {
-    /// Value and derivatives of the regressor by the order η, at the order η₀ of the expansion. Before differentiation
-    /// it is scaled by e^{−λ(η−η₀)}, with its mean logarithmic slope λ at η₀.
+    /// Value of the regressor and its derivatives with respect to the order η, at the order η₀ of the expansion. Before
+    /// differentiation it is scaled by e^{−λ(η−η₀)}, with its mean logarithmic slope λ at η₀.
     pub(super) columns: [Vec<f64>; EXPANSION_COLUMNS],
     /// Upper bounds of the norms of the value and the derivatives.
     pub(super) sizes: [f64; EXPANSION_COLUMNS],
@@ -44,7 +44,8 @@ pub(super) struct RegressorExpansion {
 struct BinomialSums {
     /// Order of integration η.
     eta: f64,
-    /// Sum Σ_k C(η+1, 2k) n^{−2k} over k ≥ 1, and its derivatives by η divided by factorials, by distance n.
+    /// Sum Σ_k C(η+1, 2k) n^{−2k} over k ≥ 1, and its derivatives with respect to η, divided by factorials. There is
+    /// one array per distance n.
     sums: Vec<[f64; EXPANSION_COLUMNS]>,
     /// Values n^{η+1} and ln n, by distance n.
     powers: Vec<(f64, f64)>,

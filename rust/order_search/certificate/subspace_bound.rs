@@ -1,9 +1,9 @@
 //! Lower bound of the squared equation error over a cell (a box of orders), for nearly dependent regressor columns.
 //!
 //! Such columns determine the coefficients poorly, and the bound of `cell_bound` is then too low to exclude a cell.
-//! This bound is the distance of the output from a subspace. The columns at the midpoint and their first two
-//! derivatives by the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the
-//! bound holds for coefficients of limited size.
+//! This bound is the distance of the output from a subspace. The subspace is spanned by the columns at the midpoint and
+//! their first two derivatives with respect to the order of integration. Columns elsewhere in the cell deviate from the
+//! subspace by third-order terms only, so the bound holds for coefficients of limited size.
 
 use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 
@@ -20,8 +20,8 @@ const MIN_RIDGE: f64 = 1e-11;
 const ROUNDING_MARGIN: f64 = 1e-9;
 
 /// Subspace spanned by the columns x, ωx′, ω²x″/2 of each term. Here ω is the half width of the cell (box of orders),
-/// and derivatives are taken by the order. In this scaling the coefficients of the derivatives are no larger than those
-/// of the values.
+/// and derivatives are with respect to the order of integration. In this scaling the coefficients of the derivatives
+/// are no larger than those of the values.
 pub(super) struct DerivativeSubspace {
     /// Term, order of the derivative, and scale factor of each column of the subspace.
     rows: [((usize, usize), f64); MAX_BASIS_ROWS],
@@ -37,7 +37,7 @@ pub(super) struct DerivativeSubspace {
     max_omitted_norm: f64,
     /// Lower bound of the norm, within the cell (box of orders), of a column that has norm 1 at the midpoint.
     min_column_norm: f64,
-    /// Rounding-error bound of the product of two unit-norm columns.
+    /// Upper bound of the rounding error in the inner product of two unit-norm columns.
     rounding: f64,
 }
 
@@ -56,8 +56,8 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Add a term: half width of its interval of orders, norms of its column and the derivatives, and remainder of its
-    /// expansion.
+    /// Add a term. `half` is the half width of its interval of orders, `sizes` holds the norms of its column and of the
+    /// derivatives, and `rest` is the remainder of its expansion.
     pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], rest: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
         for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED_DERIVATIVES } else { 1 }) {
@@ -71,7 +71,7 @@ impl DerivativeSubspace {
     }
 
     /// Compute the inner products of the columns. `product` and `along` return the products of two derivatives, and of
-    /// a derivative with the measured output. A derivative is given as (term, order).
+    /// a derivative with the measured output. A derivative is given as (term, order of the derivative).
     pub(super) fn fill(
         &mut self,
         product: impl Fn((usize, usize), (usize, usize)) -> f64,

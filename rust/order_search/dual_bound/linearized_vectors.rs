@@ -106,8 +106,9 @@ pub(crate) struct LinearizedVector {
     /// Rounding error ‖D₀ᵀv_m − G_mᵀt₀‖ of each first-order correction v_m of the test vector t₀, in the dual norm. D₀
     /// is the denominator, and G_m an orthogonalized kernel matrix.
     solution_residuals: Vec<f64>,
-    /// For each orthogonalized kernel, an upper bound of its sum of moduli, times the largest dual norm of a vector.
-    /// The moduli of its components are also included.
+    /// For each orthogonalized kernel G_m, an upper bound of the sum of moduli of its series, times the largest dual
+    /// norm of a vector with values of at most 1. The bound sums the moduli over all kernels of which G_m is a
+    /// combination.
     series_norms: Vec<f64>,
     /// Dual norms of the second-order terms ‖G_nᵀv_m + G_mᵀv_n‖ for n < m, then ‖G_mᵀv_m‖, for each m in sequence. G_m
     /// are orthogonalized kernel matrices, and v_m the first-order corrections of the test vector.
@@ -127,7 +128,7 @@ pub(crate) struct LinearizedVectors {
     rounding_bounds: RoundingBounds,
     /// Index of each column among the input columns, [`NO_INDEX`] for an output column.
     input_index: Vec<usize>,
-    /// Number of regressor columns of other signals than the output.
+    /// Number of regressor columns of signals other than the output.
     width: usize,
     /// Range of the vectors in `vectors` for given output columns: first vector, and vector after the last one.
     ranges: BTreeMap<Vec<usize>, (usize, usize)>,
@@ -141,7 +142,7 @@ pub(crate) struct VectorLookup {
     own: Vec<usize>,
     /// Regressor columns of the current candidate that are integrals of the output.
     next_own: Vec<usize>,
-    /// Range of the vectors for these output columns: first vector, and vector after the last one.
+    /// Range of the vectors for the output columns `own`: first vector, and vector after the last one.
     range: (usize, usize),
     /// Index, within this range, of the vector that excluded the most recent candidate.
     last_vector: usize,
@@ -434,7 +435,8 @@ struct RecordVectors {
 }
 
 impl RecordVectors {
-    /// Compute the first-order corrections of the test vector, and add to the norms that the bound needs.
+    /// Compute the first-order corrections of the test vector, and add this record to the norms that the bound
+    /// requires.
     fn add_corrections(&mut self, accumulator: &mut NormAccumulator, buffers: &mut Buffers) {
         let (m, k) = (self.divisor.len(), self.first_order_terms.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));

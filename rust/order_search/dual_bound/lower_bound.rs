@@ -203,14 +203,14 @@ impl Bound {
         self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
-    /// Return the bound with only the test vectors `which`, in this order. Their number is a multiple of
+    /// Return the bound with only the test vectors `which`, in the given sequence. Their number is a multiple of
     /// [`LANE_COUNT`].
     pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
         Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
     }
 
     /// Return a lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of the score that determines the
-    /// evaluation order.
+    /// evaluation sequence.
     ///
     /// For record r, `columns(r)` returns the columns and coefficients of the terms, then of the initial terms. The sum
     /// over records stops once the bound exceeds `limit`.

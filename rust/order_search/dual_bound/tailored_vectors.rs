@@ -53,7 +53,7 @@ struct CachedNorm {
     /// Dual norm ‖Dᵀt‖ plus its rounding-error bound, with the denominator D of the candidate and the test vector t.
     norm: f64,
     /// Factor in a₂ = share·a₁ + r. Here a₁ and a₂ are the products Fᵀt of the test vector t with the convolution
-    /// matrices F of the two output columns. The rest r is orthogonal to a₁.
+    /// matrices F of the two output columns. The remainder r is orthogonal to a₁.
     share: f64,
     /// Dual norms of a₁ and a₂ − share·a₁ as defined for `share`, NaN until they are computed.
     deviation_norms: [f64; MAX_CACHED_OWN_TERMS],
@@ -73,7 +73,7 @@ pub(crate) struct NormCache {
 }
 
 impl NormCache {
-    /// Return a cache of norms for candidates that are visited in index order.
+    /// Return a cache of norms for candidates that are visited by increasing index.
     pub(crate) fn for_adjacent_candidates() -> Self {
         Self { norms: Some(Vec::new()), ..Self::default() }
     }
@@ -244,8 +244,8 @@ impl TailoredVectors {
         false
     }
 
-    /// Return an upper bound of ‖Dᵀt‖ for a candidate with the same output columns as the cached norm. D is its
-    /// denominator and t the test vector.
+    /// Return an upper bound of ‖Dᵀt‖ for a candidate with the same output columns as the cached norm. D is the
+    /// denominator of the candidate, and t the test vector of the cached norm.
     #[inline(always)]
     fn norm_upper_bound(&self, cached: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
         let off = [own[0].1 - cached.own[0].1, own[1].1 - cached.own[1].1];
@@ -255,8 +255,8 @@ impl TailoredVectors {
         (cached.norm + along + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
     }
 
-    /// Compute how much ‖Dᵀt‖ changes per unit change of the coefficients, and store it in the cached norm. D is the
-    /// denominator and t the test vector.
+    /// Compute bounds of the change of ‖Dᵀt‖ per unit change of the coefficients, and store them in the cached norm. D
+    /// is the denominator of a candidate, and t the test vector of the cached norm.
     #[inline(always)]
     fn compute_deviation_norms(&self, cached: &mut CachedNorm) {
         let fitted = &self.vectors[cached.vector];
@@ -304,8 +304,8 @@ impl TailoredVectors {
         }
     }
 
-    /// Return the dual norm ‖t − Σ c Fᵀt‖ of a test vector t over output columns with convolution matrix F and
-    /// coefficient c. `None` if it exceeds `most` or cannot be computed safely.
+    /// Return the dual norm ‖t − Σ c Fᵀt‖, where t is a test vector. The sum is over the output columns, each with
+    /// convolution matrix F and coefficient c. `None` if it exceeds `most` or cannot be computed safely.
     #[inline(always)]
     fn norm_up_to_limit(&self, fitted: &TailoredVector, own: &[Weighted], most: f64) -> Option<f64> {
         // A NaN limit proves nothing. Products with coefficients below [`MAX_SAFE_MAGNITUDE`] do not overflow.
@@ -366,13 +366,14 @@ fn own_columns(bank: &Bank) -> Vec<usize> {
 /// Rounding-error bounds of products with test vectors t, |t| ≤ 1, over all records.
 pub(super) struct RoundingBounds {
     pub(super) norm: Norm,
-    /// Rounding-error bound of the product of a test vector with the equation error, per unit of the coefficient of
-    /// each column.
+    /// For each column, contribution per unit of its coefficient to the rounding-error bound of the product of a test
+    /// vector with the equation error.
     pub(super) rounding: Vec<f64>,
-    /// Rounding-error bound of the product of a test vector with the equation error, from the measured output alone.
+    /// Contribution of the measured output to the rounding-error bound of the product of a test vector with the
+    /// equation error.
     pub(super) target_rounding: f64,
-    /// For each output column, the sum of its kernel's moduli times the largest dual norm of a test vector. Zero for
-    /// other columns.
+    /// For each output column, the sum of the moduli of its kernel times the largest dual norm of a test vector. The
+    /// record with the largest value counts. Zero for other columns.
     pub(super) kernel_norms: Vec<f64>,
     /// Largest dual norm of a vector whose values are at most 1 in modulus.
     pub(super) max_dual_norm: f64,

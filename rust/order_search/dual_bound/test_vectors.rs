@@ -34,7 +34,7 @@ enum Window {
 }
 
 impl Window {
-    /// Return the value of the window at time `x`, as a fraction of the record length.
+    /// Return the value of the window at the time `x`, which is a fraction of the record length.
     fn at(self, x: f64) -> f64 {
         match self {
             Self::Taper(flat) if x <= flat => 1.0,
@@ -44,8 +44,9 @@ impl Window {
     }
 }
 
-/// Windows and the number of frequencies for each. They were chosen by measurements at three noise levels. The late
-/// taper excludes most candidates. The decays exclude candidates with an error early in the record.
+/// Windows and the number of frequencies for each. They were chosen by measurements at three noise levels. The taper
+/// that starts in the middle of the record excludes the most candidates. The exponential decays exclude candidates with
+/// an error early in the record.
 const WINDOW_FREQUENCY_COUNTS: [(Window, usize); 3] =
     [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
 
@@ -307,17 +308,18 @@ pub(crate) struct TestVectors {
     pub(crate) effects: Vec<[Wide; 4]>,
     /// Dual norms of the test vectors, by group of [`LANE_COUNT`] vectors.
     pub(crate) size: Vec<Wide>,
-    /// Rounding-error bound of the product of a test vector with the equation error, per unit of the coefficient of
-    /// each column.
+    /// For each column, contribution per unit of its coefficient to the rounding-error bound of the product of a test
+    /// vector with the equation error.
     pub(crate) rounding: Vec<f64>,
-    /// Rounding-error bound of the product of a test vector with the equation error, from the measured output alone.
+    /// Contribution of the measured output to the rounding-error bound of the product of a test vector with the
+    /// equation error.
     pub(crate) target_rounding: f64,
     /// Relative rounding-error bound of a sum over all samples of the record.
     pub(crate) unit: f64,
 }
 
-/// Maximum number of output columns of a candidate whose contributions to the denominator of the bound are bounded
-/// jointly.
+/// Maximum number of output columns of a candidate for which their contributions to the denominator are bounded
+/// jointly. With more output columns, each contribution is bounded separately.
 const MAX_JOINT_OWN_COLUMNS: usize = 4;
 
 impl TestVectors {
@@ -385,7 +387,8 @@ impl TestVectors {
         }
     }
 
-    /// Return the set with only the test vectors `which`, in this order. Their number is a multiple of [`LANE_COUNT`].
+    /// Return the set with only the test vectors with the indices `which`, in this sequence. Their number is a multiple
+    /// of [`LANE_COUNT`].
     pub(super) fn select_vectors(&self, which: &[usize]) -> Self {
         let groups = which.len() / LANE_COUNT;
         let pick = |source: &[Wide], g: usize| -> Wide {
@@ -427,9 +430,9 @@ impl TestVectors {
         pairs.fold(self.target_rounding, |sum, (&p, c)| sum + c.abs() * self.rounding[p])
     }
 
-    /// Return the lower bound of the norm of the error and an estimate of this norm, for each test vector of a group.
-    /// The arguments are columns and coefficients of the terms, then of the initial terms, and the rounding-error bound
-    /// of the products.
+    /// Return, for each test vector of a group, a lower bound of the norm of the error and an estimate of this norm.
+    /// `coefficients` belong to the columns `terms`, and `weights` to the columns `initial` of the initial terms.
+    /// `rounding` is the rounding-error bound of the products.
     #[inline(always)]
     pub(super) fn group_bounds(
         &self,
@@ -490,7 +493,7 @@ impl TestVectors {
 
     /// Return an upper bound of ‖Σ c (Fᵀt − g t)‖ for each test vector t of a group. The sum is over output columns
     /// with convolution matrix F and coefficient c, and g is the projection of Fᵀt on t. `own` lists row and
-    /// coefficient of each column. The coefficients may cancel.
+    /// coefficient of each column. Coefficients of opposite sign partly cancel in this bound.
     ///
     /// By summation by parts, the sum of all coefficients multiplies the norm of the first column. Each partial sum
     /// multiplies the path length to the next column.

@@ -20,8 +20,8 @@ use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::LANE_COUNT;
 
 /// Growth rates at which the paths run, per record length. In the plane of growth rate and angular frequency, a path
-/// encloses the part of a disc about 0 to the right of its rate. The radius of the disc is three times the rate. Modes
-/// that grow more slowly hardly increase the simulated output. If they grow faster, the simulation ends early.
+/// encloses the part of a disc about 0 to the right of its rate. The radius of the disc is three times the rate. Slower
+/// modes hardly increase the simulated output, and faster modes end the simulation early.
 const PATH_GROWTH_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
 /// Ratio of the radius of a path in the complex plane to its growth rate.
 const PATH_RADIUS_RATIO: f64 = 3.0;
@@ -204,9 +204,9 @@ impl PathSums {
         }
     }
 
-    /// Return the number of zeros inside a path of a weighted sum of columns plus the constant `one`. It is the winding
-    /// number of the values along the path. `left_out` bounds the omitted part: a constant, and a multiple of |z^M| for
-    /// M samples. `None` if the sum may be 0 on the path.
+    /// Return the number of zeros that a weighted sum of columns plus the constant `one` has inside a path. It is the
+    /// winding number of the values of the sum along the path. `left_out` bounds the omitted part: a constant, and a
+    /// multiple of |z^M| for M samples. `None` if the sum may be 0 on the path.
     #[inline(always)]
     fn count_zeros(
         &self,

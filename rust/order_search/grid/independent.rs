@@ -29,10 +29,11 @@ pub struct TermAxis {
 
 /// Grid of all orders of one equation: α from a list, the order ν of each term from its own axis.
 ///
-/// Orders of output terms satisfy 0 ≤ ν < α, other orders 0 ≤ ν ≤ α. A fixed order with a single α may exceed it by
-/// less than 1. Terms on inputs may have a negative order. The orders of one signal are distinct. Of interchangeable
-/// terms, the first has the larger order. Candidates are indexed in ascending order of α. For the same α, the last
-/// signal varies fastest, and the last of its orders fastest of all. Within an axis, orders descend.
+/// Orders of output terms satisfy 0 ≤ ν < α, other orders 0 ≤ ν ≤ α. If the grid has a single α, a fixed order of a
+/// signal other than the output may exceed it by less than 1. Terms on inputs may have a negative order. The orders of
+/// one signal are distinct. Of interchangeable terms, the first has the larger order. Candidates are indexed in
+/// ascending order of α. For the same α, the last signal varies fastest, and the last of its orders fastest of all.
+/// Within an axis, orders descend.
 #[derive(Debug, Clone)]
 pub struct OrderGrid {
     output: usize,
@@ -219,8 +220,8 @@ fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     values
 }
 
-/// Number of combinations of all orders of a signal but the last per stored count of allowed combinations. Counts in
-/// between are computed when needed.
+/// Number of prefixes (combinations of all orders of a signal but the last) between two stored counts of allowed
+/// combinations. Counts in between are computed when needed.
 pub(super) const PREFIX_STRIDE: usize = 64;
 
 /// Terms of one signal, their axes, and the pairs of orders that exclude each other.
@@ -231,7 +232,8 @@ pub(crate) struct Group {
     pub(crate) terms: Vec<usize>,
     /// Candidate orders of each term, descending.
     pub(crate) axes: Vec<Vec<f64>>,
-    /// Orders of term b that are allowed with order number i of term a, a < b, as the set `allowed[b][a][i]`.
+    /// Pairs of orders that are allowed. The set `allowed[b][a][i]` contains the orders of term b that are allowed with order
+    /// number i of term a, a < b.
     allowed: Vec<Vec<Vec<Bits>>>,
 }
 
@@ -384,8 +386,8 @@ impl Group {
         count
     }
 
-    /// Count the combinations of orders of this signal that are allowed for one order α. `first` gives the first axis
-    /// position in range for each order.
+    /// Count the combinations of orders of this signal that are allowed for one order α, and return the counts. `first`
+    /// gives the first axis position in range for each order.
     pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];

@@ -1,7 +1,7 @@
-//! Traversal of an order grid: in index order, by two-dimensional slices, or in a low-discrepancy order.
+//! Traversal of an order grid: by ascending index, by two-dimensional slices, or in a low-discrepancy sequence.
 //!
 //! A slice is a contiguous range of candidate indices over which only two orders vary, each through all of its values.
-//! In a low-discrepancy order, any number of first candidates is evenly distributed over the grid.
+//! The first candidates of a low-discrepancy sequence, however many, are evenly distributed over the grid.
 
 use crate::equation::{Structure, Term};
 use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
@@ -145,8 +145,8 @@ impl<'a> Cursor<'a> {
         0
     }
 
-    /// Return term and axis position if only the order of this term changes over this and the next `len` − 1
-    /// candidates, by one axis position each. `None` otherwise.
+    /// Return the term whose order alone changes over `len` candidates, from this one on, and its axis position. The
+    /// order changes by one axis position per candidate. `None` if there is no such term.
     #[inline]
     pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
         let slices = &self.grid.blocks[self.block].tuples;
@@ -157,8 +157,8 @@ impl<'a> Cursor<'a> {
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
     }
 
-    /// Return term, axis position and number of candidates, from this one on, over which only the order of this term
-    /// changes, by one axis position each. `None` if no order varies.
+    /// Return the term whose order alone changes over the next candidates, its axis position, and the number of these
+    /// candidates, including this one. The order changes by one axis position per candidate. `None` if no order varies.
     #[inline]
     pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
         let slices = &self.grid.blocks[self.block].tuples;
@@ -255,7 +255,8 @@ impl OrderGrid {
         all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
     }
 
-    /// Return an upper bound of the number of candidates of a slice in the same block, which has one order α.
+    /// Return an upper bound of the number of candidates of any slice that lies in the same block as `slice` and varies
+    /// the same two terms.
     pub(crate) fn max_slice_candidates(&self, slice: &GridSlice) -> u64 {
         let whole = self.groups.iter().find(|group| group.terms.contains(&slice.outer));
         let axis =

@@ -25,11 +25,11 @@ use crate::order_search::stage_join::join::{
 use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
 
-/// Ratio of the score limit to the best score of an equation in the first pass. This pass evaluates the candidates of
-/// one equation after the other.
+/// Ratio of the score limit to the best score of an equation in the first pass. The first pass evaluates the equations
+/// one after the other.
 const FIRST_LIMIT: f64 = 4.0;
-/// Minimum number of candidates of one equation that are evaluated between two updates of its best score, except for
-/// the first 256.
+/// Minimum number of candidates of one equation that are evaluated between two updates of the best score of this
+/// equation. The first update follows after 256 candidates.
 const CANDIDATES_PER_UPDATE: usize = 4096;
 
 /// Row of the result table: one combination of values of the free orders.
@@ -96,7 +96,7 @@ pub struct CoupledSearch<'a> {
 /// State of a search over coupled equations: scores of all candidates, and the candidates to evaluate next.
 ///
 /// The next candidates depend only on the outcomes of earlier ones, so candidates may be evaluated on any machine and
-/// in any order.
+/// in any sequence.
 pub struct SearchState {
     join: Join,
     entries: ScoreTables,
@@ -108,7 +108,8 @@ pub struct SearchState {
     limit_factor: f64,
     /// Candidates to evaluate next.
     pending_spans: Vec<Span>,
-    /// Total number of candidates to evaluate, as far as known.
+    /// Ratio of the score limit of the next evaluation of a candidate to the lower bound of its score. It is used while
+    /// the result table is not full.
     total: u64,
     /// Score (sum of score / scale over the equations) and index of the best combinations of free orders that are
     /// evaluated completely. Empty during the first pass.
@@ -197,8 +198,8 @@ impl<'a> CoupledSearch<'a> {
         Ok((search, state))
     }
 
-    /// Return the raw score (Σ|e| or Σe²) of an equation for its score divided by the scale of the equation, with a
-    /// margin for rounding.
+    /// Convert a score that is divided by the scale of its equation to a raw score (Σ|e| or Σe²), with a margin for
+    /// rounding.
     fn raw_limit(&self, equation: usize, score: f64) -> f64 {
         let scaled = score * self.tables[equation].scale;
         let raw = match self.options.norm {
@@ -209,7 +210,8 @@ impl<'a> CoupledSearch<'a> {
         raw * (1.0 + 1e-12)
     }
 
-    /// Evaluate these candidates. Return their outcomes in the sequence of the spans, with raw scores (Σ|e| or Σe²).
+    /// Evaluate the candidates of these spans. Return one outcome per candidate, with raw scores (Σ|e| or Σe²), in the
+    /// sequence of the spans.
     ///
     /// # Errors
     /// [`Error::Structure`] for candidates of another search, [`Error::Interrupted`] after a stop request.

@@ -4,11 +4,12 @@
 //! equation. A combination of values of all free orders is called a tuple.
 //!
 //! The free orders are divided into two halves, x = (a, b). The first half of the join contains the first equation, the
-//! second half the other equations. The orders of the equations of one half are the contribution of the own free orders
-//! plus an addend from the free orders of the other half. This addend has few distinct values. A row of the first half
-//! is (a, addend from b), a row of the second half (b, addend from a). Two rows are compatible if each contains the
-//! addend that the free orders of the other contribute. Compatible rows are stored in the same bucket. Every pair of
-//! rows in a bucket is a tuple, and every tuple occurs once. The product of the axes is never enumerated.
+//! second half the other equations. The orders of the equations of one half are a sum: the contribution of the free
+//! orders of this half, plus an addend from the free orders of the other half. This addend has few distinct values. A
+//! row of the first half is (a, addend from b), a row of the second half (b, addend from a). Two rows of different
+//! halves are compatible if the free orders in each row contribute the addend in the other row. Compatible rows are
+//! stored in the same bucket. Every pair of rows in a bucket is a tuple, and every tuple occurs once. The product of
+//! the axes is never enumerated.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -26,8 +27,8 @@ use crate::order_search::result::Failure;
 /// The free orders of the other half contribute this addend to the orders of the equations of this half.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HalfRow {
-    /// Number of the bucket. Rows of both halves in the same bucket are compatible. It is computed from the two addends
-    /// that compatible rows have in common.
+    /// Number of the bucket, computed from the two addends that compatible rows have in common. Rows of both halves in
+    /// the same bucket are compatible.
     bucket_id: u64,
     /// Contribution of the free orders of this half to the index of a combination of all free orders.
     pub(super) index: u64,
@@ -252,8 +253,8 @@ impl Join {
     }
 }
 
-/// Return the number of the combination of candidates with these orders of the equations of one half of the join. A new
-/// combination is appended. `key` and `ids` are workspace.
+/// Return the index of the combination of candidates that gives the equations of one half of the join these orders. A
+/// new combination is appended. `key` and `ids` are workspace.
 fn combination(
     grid: &OrderLawGrid,
     candidates: &mut [Candidates],
@@ -289,7 +290,8 @@ pub(super) struct ScoreEntry {
     pub(super) class: Class,
 }
 
-/// Class of a score entry: how reliable its value is. The class of a sum is the first failure, else the largest class.
+/// Class of a score entry: how reliable its value is. The class of a sum is the first failure. Without a failure, it is
+/// the largest class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     /// The score is exact.

@@ -226,10 +226,11 @@ fn list_failures(rows_of_bucket: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2],
     }
 }
 
-/// The failed combinations of free orders with the lowest indices, in any order of arrival.
+/// Collector of the failed combinations of free orders with the lowest indices. Combinations may be added in any
+/// sequence.
 struct FirstFailures {
     entries: Vec<(u64, Failure)>,
-    /// Index above which a combination is not among the first.
+    /// Index above which a combination cannot be among the listed failures.
     limit: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Bindings of the joint fit, and of a multistart whose candidates several fits can use.
+//! Bindings of the joint fit, and of a multistart that provides initial guesses for several fits.
 
 use std::sync::Arc;
 

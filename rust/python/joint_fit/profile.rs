@@ -24,7 +24,8 @@ type SurfaceTuple<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f6
 /// State of a fit, from a dictionary with these fields as keys. `estimate` holds the parameters extrapolated to zero
 /// step, and `on_grid` the parameters on the finest grid. `weights` holds the weights of the outputs, and `shares` the
 /// robust weights of the samples by run. `every` is the number of pulses per sampling interval. `settled` is true if
-/// the step has converged. With `steady`, no step leads from a stable model to an unstable one.
+/// the step has converged. If `steady` is true, no step of an optimization leads from a stable model to an unstable
+/// one.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct FitArg<'py> {

@@ -66,9 +66,9 @@ pub fn long_run_covariance<'py>(
     matrix(py, covariance, size)
 }
 
-/// Return the likelihood ratio of two nested regressions of `residuals` under autoregressive noise of an order of at
-/// most `most`. Rows of `few` and `many` are the regressors of both. `blocks` holds the (start, stop) indices of the
-/// samples by output and run.
+/// Return the likelihood ratio of two nested regressions of `residuals` under autoregressive noise, whose order is at
+/// most `most`. The rows of `few` and `many` are the regressors of the smaller and of the larger regression. `blocks`
+/// holds the (start, stop) indices of the samples by output and run.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn prediction_ratio(
@@ -163,7 +163,7 @@ pub fn portmanteau(py: Python<'_>, series: List<PyReadonlyArray1<'_, f64>>, lags
     })
 }
 
-/// Variance of a sum of the values of a series relative to that for white noise, at least 1.
+/// Return the variance of the sum of a series relative to its value for white noise, at least 1.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn variance_inflation(py: Python<'_>, series: PyReadonlyArray1<'_, f64>) -> PyResult<f64> {

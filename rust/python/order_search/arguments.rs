@@ -217,7 +217,8 @@ pub enum CountsArg {
 /// Partial result: (rows, counts, [(index, true if diverged, false if singular), …] of the failures).
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
 /// Checkpoint: (position, true if it replaces earlier results, partial result). The position is (index of the batch,
-/// number of its evaluated candidates, end, length and limit of the current chunk, digest of the evaluation order).
+/// number of its evaluated candidates, end, length and limit of the current chunk, digest of the sequence of
+/// evaluation).
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
 /// Convert a partial result to Python tuples.

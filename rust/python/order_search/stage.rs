@@ -168,7 +168,7 @@ impl StageSearch {
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
 
-    /// Add the outcomes of the pending candidates to the search state, in the order of `pending_spans`.
+    /// Add the outcomes of the pending candidates to the search state, in the sequence of `pending_spans`.
     fn record_outcomes(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         run_watched(py, None, |control| {
             let decoded = verdicts(values, kinds)?;

@@ -61,7 +61,7 @@ const MAX_FREQUENCY_STEP: f64 = PI;
 const MIN_POLE_DURATION: f64 = 1e-4;
 /// Minimum damping ratio of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
-/// Minimum number of runs on which initial guesses are compared, if there are as many.
+/// Minimum number of runs on which initial guesses are compared, if the data contain that many runs.
 const MIN_RUNS: usize = 2;
 /// Maximum number of delays for which initial guesses are refined.
 const CONTINUED_DELAYS: usize = 3;
@@ -75,10 +75,10 @@ type Pole = (f64, f64);
 struct Equation<'a> {
     model: FreeModel,
     experiments: &'a [Experiment],
-    /// Index and known factor of the coefficient of each output derivative, by ascending order of the derivative. The
-    /// factor is −1 for a term such as −a y.
+    /// Coefficient index and known factor of each derivative of the output that occurs in the equation, by ascending
+    /// order of the derivative. The factor is −1 for a term such as −a y.
     ///
-    /// The derivatives of lower order do not occur. Their number is `integrators`.
+    /// Derivatives of a lower order than the first entry do not occur in the equation. Their number is `integrators`.
     own: Vec<(usize, f64)>,
     integrators: usize,
     stop: &'a Stop,
@@ -149,8 +149,9 @@ pub fn integer_order_optima(
 
 /// Return the runs with the most excitation, on which the guesses of an equation are compared.
 ///
-/// Each input in turn adds the run in which it varies most. This ends with at least two runs, one run per input, and
-/// enough samples for a coarse fit. The fit to all runs starts from the guesses of these runs.
+/// Each input in turn adds the run in which it varies most. The selection ends when it contains at least two runs, as
+/// many runs as inputs, and enough samples for a coarse fit. The fit to all runs starts from the initial guesses that
+/// are found on the selected runs.
 fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment]) -> Vec<&'a Experiment> {
     let mut inputs: Vec<usize> = equation.terms.iter().map(|(signal, ..)| *signal).collect();
     inputs.retain(|signal| *signal != equation.output);
@@ -290,7 +291,8 @@ impl<'a> Equation<'a> {
 
     /// Return the delays at which a model with two poles and the integrators has the least cost, best first.
     ///
-    /// At most [`CONTINUED_DELAYS`] delays are returned. If there are no more, all are returned unsorted.
+    /// At most [`CONTINUED_DELAYS`] delays are returned. If `delays` contains no more than that, all of them are
+    /// returned unsorted.
     fn likely_delays(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         if delays.len() <= CONTINUED_DELAYS {
             return Ok(if delays.is_empty() { vec![Vec::new()] } else { delays.to_vec() });
@@ -435,7 +437,8 @@ impl<'a> Equation<'a> {
         mirrored
     }
 
-    /// Return the point with unstable poles reflected at the imaginary axis and fast poles below the Nyquist frequency.
+    /// Return the point with unstable poles reflected at the imaginary axis and fast poles moved below the Nyquist
+    /// frequency.
     fn stabilize(&self, point: &ParameterPoint) -> ParameterPoint {
         let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
         let poles = self.poles(point);

@@ -47,7 +47,8 @@ pub struct OrderGrids<'a> {
 }
 
 impl<'a> OrderGrids<'a> {
-    /// Return order grids on the given runs, with the number of threads and the bytes of memory per search.
+    /// Return a source of initial guesses for the given runs. Each grid search uses at most `threads` threads and
+    /// `memory` bytes.
     #[must_use]
     pub fn new(source: &'a Recordings, threads: usize, memory: u64, stop: &'a Stop) -> Self {
         Self { source, threads, memory, stop, low_passes: LowPassCache::default() }
@@ -55,10 +56,10 @@ impl<'a> OrderGrids<'a> {
 
     /// Return initial guesses of a parameter set, at several delays and limits if these are free.
     ///
-    /// # Errors
-    /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
-    /// duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints. [`Error::Interrupted`]
-    /// after a stop request. An error also if the runs have no block-pulse records or if a grid search fails.
+    /// # Errors [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for
+    /// friction, and for duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints.
+    /// [`Error::Interrupted`] after a stop request. Also an error if the runs have no block-pulse records or if a grid
+    /// search fails.
     pub fn candidates(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
         let frequencies = self.frequencies(free)?;
         if free.structure.inputs.is_empty() {
@@ -209,7 +210,8 @@ const MIN_LIMIT_RATIO: f64 = 0.1;
 /// Return initial guesses of the free delays and limits, each with a description.
 ///
 /// `fastest` is the highest bandwidth \[rad/s\] of an output. From a poor guess of the delay, a fit converges to a
-/// local optimum that is shifted by one period of an oscillation. A limit above all samples has no effect.
+/// local optimum that is shifted by one period of an oscillation. Initial guesses of a limit are below the largest
+/// input magnitude, because a limit above all samples has no effect.
 pub(super) fn input_points(free: &ParameterSet, source: &Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
     let inputs = &free.structure.inputs;
     let axes = inputs.iter().map(|item| input_axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;

@@ -160,9 +160,9 @@ impl GridSearch<'_> {
     }
 }
 
-/// Combine the rows of independent tables with the same rank; a shorter table repeats its last row.
+/// Merge the rows of the same rank (index) from independent tables into one row. A shorter table repeats its last row.
 ///
-/// Combined rows that lack a coefficient are omitted.
+/// Merged rows that lack a coefficient are omitted.
 pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStructure) -> Vec<GridRow> {
     let count = structure.coefficient_names().len();
     let merged = |rank: usize| {
@@ -231,10 +231,10 @@ const MAX_GUESSES_UNDER_ORDER_LAW: usize = 8;
 const ROWS_UNDER_ORDER_LAW: usize = 4000;
 /// Minimum difference in at least one order between two initial guesses; larger than one increment of the grid.
 const MIN_ORDER_SEPARATION: f64 = 0.35;
-/// Trial values of the other factors of a coefficient law.
+/// Trial values of all factors of a coefficient law except the first.
 ///
-/// A coefficient law is a product of factors. At fixed other factors, a coefficient follows from one in another
-/// equation.
+/// A coefficient law states that a coefficient is a product of factors. The first factor is a coefficient of another
+/// equation. It follows from the law if the coefficient and the other factors are given.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
 /// Absolute and relative difference below which two orders count as equal.
 const ORDER_TOLERANCES: (f64, f64) = (1e-9, 1e-5);
@@ -284,12 +284,12 @@ fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
     values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
 }
 
-/// Return candidates in which the coefficients of one equation follow from another one by the coefficient law.
+/// Return candidates in which coefficients of one equation follow from those of another equation by a coefficient law.
 ///
-/// The other coefficients are estimated by least squares. An example is the motor hub of a flexible arm, which is
-/// overdamped. Current and friction nearly cancel, and the link equation explains the rest of the acceleration equally
-/// well. An unconstrained estimate of the hub equation then converges to the link equation with the sign of the
-/// stiffness reversed.
+/// The other coefficients are estimated by least squares. The law is needed if unconstrained estimates have the wrong
+/// sign. An example is the motor hub of a flexible arm, which is overdamped. Current and friction nearly cancel, and
+/// the link equation explains the rest of the acceleration equally well. An unconstrained estimate of the hub equation
+/// then converges to the link equation with the sign of the stiffness reversed.
 pub(super) fn law_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -341,13 +341,14 @@ pub(super) fn law_candidates(
 
 /// Increment of the orders in the grid of initial guesses. A fit that starts within half an increment converges.
 const START_INCREMENT: f64 = 0.2;
-/// Number of grid points of an equation above which the orders of its input terms get fewer values.
+/// Maximum number of grid points of an equation. If there are more, the orders of the input terms get fewer grid
+/// values.
 const MAX_START_CANDIDATES: u128 = 200_000;
-/// Lower end of the interval of the highest orders if there is no prior knowledge.
+/// Lowest grid value of the highest order of an equation, if there is no prior knowledge of this order.
 const MIN_TYPICAL_ORDER: f64 = 0.2;
 /// Maximum initial guess of an order other than the highest order of an equation.
 const MAX_LOWER_TERM_ORDER: f64 = 2.0;
-/// Number of steps per unit of order to which grid values are rounded.
+/// Number of rounding steps per unit of order. Grid values are rounded to a whole number of these steps.
 const ROUNDING_STEPS_PER_ORDER: f64 = 1e9;
 
 /// Grid values of the free orders, by name.

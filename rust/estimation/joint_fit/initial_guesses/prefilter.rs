@@ -21,7 +21,7 @@ type LowPassKey = (u64, usize, u64);
 pub(super) struct LowPassCache(Mutex<Vec<(LowPassKey, Arc<Vec<f64>>)>>);
 
 impl LowPassCache {
-    /// Return the record with its signals and initial terms filtered by a low-pass filter.
+    /// Return a record whose signals and initial terms have passed a low-pass filter.
     ///
     /// The cutoff frequency is `corner` \[rad/s\]. Without one, the result is a copy of the record.
     pub(super) fn filter_record(&self, record: &Record, corner: Option<f64>) -> Result<Record> {

@@ -112,7 +112,8 @@ fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -
 
 /// Return the best points of the scan of one equation with fixed orders, sorted by root-mean-square output error.
 ///
-/// Each point has the best damping ratio of its frequency. The frequencies are relative to `frequency` \[rad/s\].
+/// There is one point per frequency, with the best damping ratio for that frequency. The frequencies are relative to
+/// `frequency` \[rad/s\].
 fn scan_equation(
     structure: &ParametricStructure,
     item: &ParametricEquation,

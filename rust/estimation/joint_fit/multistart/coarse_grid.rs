@@ -10,9 +10,10 @@ use crate::signal::statistics::mean;
 pub const MAX_COARSE_SAMPLES: usize = 1200;
 /// Minimum number of samples of each run in a coarse fit.
 const MIN_RUN_SAMPLES: usize = 400;
-/// Maximum decimation that does not require a check of the bandwidth.
+/// Maximum decimation factor that is used without a check of the bandwidth.
 const MAX_UNCHECKED_DECIMATION: usize = 10;
-/// Minimum number of samples per half period at the bandwidth of the outputs, after a larger decimation.
+/// Minimum number of samples per half period, at the bandwidth of the outputs, if the decimation factor exceeds the
+/// unchecked maximum.
 const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 6.0;
 /// Minimum ratio of the standard deviation of an output in the first part of a record to that in the whole record.
 const MIN_DEVIATION_RATIO: f64 = 0.7;

@@ -1,7 +1,7 @@
 //! Multistart for equations with friction: linear fits with the measured sign of the velocity are the initial guesses.
 //!
-//! With the measured sign of the velocity, the equation is linear. While the body sticks, the sign is noise. The
-//! resulting bias is acceptable for an initial guess. Fits without friction add guesses with several amounts of
+//! With the measured sign of the velocity, the equation is linear. While the body sticks, the measured sign is noise.
+//! The resulting bias is acceptable for an initial guess. Fits without friction add guesses with several amounts of
 //! friction. If no guess leads to the noise level, the optima of the structure without friction are further initial
 //! guesses. Stribeck friction starts from the best fits with Coulomb friction.
 
@@ -31,15 +31,15 @@ const COARSE_SAMPLES: usize = 1200;
 const MAX_BODY_ORDER: f64 = 2.0;
 /// Initial guesses of Coulomb friction, relative to the largest input force on the body.
 const COULOMB_FORCE_RATIOS: [f64; 4] = [0.01, 0.05, 0.2, 0.5];
-/// Initial guesses of Coulomb friction, relative to its estimate from the equation with measured velocity sign.
+/// Initial guesses of Coulomb friction, relative to the estimate from a fit with the measured sign of the velocity.
 const MEASURED_SIGN_RATIOS: [f64; 2] = [1.0, 0.3];
 /// Initial guesses of Stribeck friction, relative to Coulomb friction.
 const STRIBECK_COULOMB_RATIOS: [f64; 3] = [0.02, 0.2, 1.0];
 /// Initial guesses of the Stribeck velocity, relative to the root-mean-square speed of the body.
 const STRIBECK_SPEED_RATIOS: [f64; 3] = [0.05, 0.2, 0.6];
-/// Initial guesses of the inertia of the attached bodies, relative to the inertia of the body.
+/// Initial guesses of the inertia that attached bodies add to a body, relative to the inertia of the body itself.
 const LOAD_INERTIA_RATIOS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
-/// Maximum number of initial guesses in which each body has its own fraction of attached inertia.
+/// Maximum number of combinations of inertia ratios over all bodies. If there are more, all bodies get the same ratio.
 const MAX_LOAD_COMBINATIONS: usize = 64;
 /// Maximum difference of the orders of two terms that count as action and reaction between coupled equations.
 const MAX_REACTION_ORDER_GAP: f64 = 0.5;
@@ -53,10 +53,9 @@ pub(super) type Values = BTreeMap<String, f64>;
 
 /// Run the multistart of a problem with friction and return the candidates, best first.
 ///
-/// # Errors
-/// [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. An error also if the
-/// runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it returns
-/// one.
+/// # Errors [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. Also an error
+/// if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it
+/// returns one.
 pub fn run_friction_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     if !structure.has_friction() {
@@ -79,7 +78,8 @@ pub fn run_friction_multistart(free: &ParameterSet, context: MultistartContext<'
     Ok(reached)
 }
 
-/// Return initial guesses from the optima without friction, with zero friction and with fractions of the input force.
+/// Return initial guesses from the optima of the structure without friction. The Coulomb friction of a guess is zero or
+/// a fraction of the input force.
 fn guesses_from_frictionless_optima(
     free: &ParameterSet,
     context: MultistartContext<'_>,
@@ -219,7 +219,8 @@ pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> 
     Ok(Candidate::at(Iterate { point: free.problem.point(&at)?, states: Vec::new() }, origin))
 }
 
-/// Return the structure and recordings of some equations alone, with the other measured signals as inputs.
+/// Return the structure and the recordings of the given equations alone, in which the other measured signals are
+/// inputs.
 fn with_measured_inputs(
     structure: &ParametricStructure,
     source: &Recordings,
@@ -308,10 +309,10 @@ fn with_measured_sign(
     with_measured_inputs(&signed, &Recordings::new(runs)?, equations)
 }
 
-/// Return the order sets of the linear fits: integer orders and, if known, the typical orders.
+/// Return the sets of fixed orders at which the linear fits are made: integer orders and, if known, the typical orders.
 ///
-/// Orders that several equations share are poorly determined. An overdamped body has a different optimum at every
-/// order.
+/// The orders are not estimated in the linear fits, because the data determine them poorly. An overdamped body has a
+/// different optimum at every order.
 fn order_sets(free: &ParameterSet) -> Vec<Values> {
     let natural = |name: &String| free.structure.hints.natural.get(name).filter(|values| !values.is_empty());
     let (mut whole, mut other) = (Values::new(), Values::new());
@@ -357,11 +358,13 @@ fn fit_frictionless_equations(
     Ok(values)
 }
 
-/// Return initial guesses from bodies that are fitted in isolation, with the coupling forces of attached bodies added.
+/// Return initial guesses from fits of each body in isolation, to which the coupling forces of attached bodies are
+/// added.
 ///
-/// Coupling forces follow from action and reaction. The measured motion of its neighbors may explain the motion of a
-/// body without its input and friction. Therefore each body is fitted in isolation first. If `together`, the attached
-/// inertia is the same fraction of the inertia of every body. Otherwise each body has its own fraction.
+/// Each body is fitted in isolation first. Otherwise, the measured motion of the neighboring bodies could explain the
+/// motion of the body without its input and friction. The coupling forces then follow from the equality of action and
+/// reaction. If `together`, the attached inertia is the same fraction of the inertia of every body. Otherwise each body
+/// has its own fraction.
 fn loaded_body_guesses(
     free: &ParameterSet,
     context: MultistartContext<'_>,
@@ -410,7 +413,7 @@ fn loaded_body_guesses(
 
 /// Fit an isolated body with friction to its inputs.
 ///
-/// Return orders and coefficients by name. There are no coefficients if the fit has no solution.
+/// Return orders and coefficients by name. The map of coefficients is empty if the fit has no solution.
 fn fit_isolated_body(
     free: &ParameterSet,
     MultistartContext { source, stop, .. }: MultistartContext<'_>,
@@ -498,7 +501,7 @@ fn number((factor, coefficient): (f64, &Coefficient), values: &Values) -> f64 {
         }
 }
 
-/// Return initial guesses of Coulomb friction from the fit `candidate` with measured velocity sign.
+/// Return initial guesses of Coulomb friction from the fit `candidate`, which uses the measured sign of the velocity.
 ///
 /// Further guesses are fractions of the input force.
 fn coulomb_guesses(
@@ -619,7 +622,7 @@ fn stribeck_guesses(
 
 /// Root-mean-square speed of an output, in its unit per second.
 ///
-/// Speeds are averages over sampling intervals that are long enough for the motion to exceed the noise.
+/// Each speed is an average over one sampling interval of the decimated grid.
 #[allow(clippy::cast_precision_loss)]
 fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     let every = grid.sampling.decimation;
@@ -631,7 +634,8 @@ fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     Ok(root_mean_square(&speeds))
 }
 
-/// Largest root-mean-square force of one input on a body, in the unit of D^α y for the output y and order α.
+/// Largest root-mean-square force that one input exerts on a body, in the unit of D^α y for the output y and order α.
+/// Only input terms of fixed order 0 count.
 fn largest_input_force(source: &Recordings, item: &ParametricEquation, values: &Values) -> Result<f64> {
     let mut largest: f64 = 0.0;
     for term in item.input_terms().filter(|term| !term.order.is_free() && term.order.constant == 0.0) {

@@ -25,13 +25,14 @@ pub(super) const MAX_FINAL_SURVIVORS: usize = 3;
 pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
 /// Ratio of a coefficient to its initial guess below which it counts as 0.
 ///
-/// In logarithmic coordinates, an optimization stops at e^-20 times the initial guess.
+/// In logarithmic coordinates, a coefficient cannot reach 0; its lower limit is e^-20 times the initial guess.
 const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
 /// Ratio of the cost per residual to the noise floor up to which the residuals count as noise.
 const MAX_NOISE_COST_RATIO: f64 = 1.2;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
-/// Relative difference of all parameters, or absolute difference of orders, below which two candidates are the same.
+/// Relative difference of each parameter below which two candidates are the same iterate, and absolute difference of
+/// each order below which two candidates can be the same optimum.
 const SAME_PARAMETER_TOLERANCE: f64 = 0.02;
 /// Relative tolerance of the orders of the same optimum, added to the absolute tolerance.
 const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
@@ -136,7 +137,7 @@ struct Rung<'a> {
 }
 
 impl Rung<'_> {
-    /// Optimize one candidate. Return None if its simulation is not finite.
+    /// Optimize one candidate. Return None if the optimization fails, for example because the simulation is not finite.
     fn optimize(&self, candidate: &Candidate) -> Result<Option<Candidate>> {
         let settings = MinimizationSettings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         let place = &candidate.result.iterate;
@@ -171,7 +172,7 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut candidates: Vec<Candida
 /// Split the candidates of a short fit into those that continue and the others.
 ///
 /// A candidate continues if its budget is exhausted. `floor` is the cost per residual of the noise alone. If some
-/// candidate has converged at this noise floor, only candidates without a larger cost continue.
+/// candidate has converged at this noise floor, only candidates whose cost is not higher continue.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
     candidates: Vec<Candidate>,
     floor: f64,

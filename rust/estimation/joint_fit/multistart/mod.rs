@@ -2,8 +2,8 @@
 //!
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
 //! samples. Some candidates start from optima of integer orders, with the orders freed ([`IntegerOrderProblem`]),
-//! others from order grids. Optima of submodels are further candidates of the full problem. A submodel has one term
-//! less ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Equations with friction start from linear fits
+//! others from order grids. Optima of submodels are further candidates of the full problem. A submodel lacks one term
+//! ([`ReducedProblem`]) or has one fixed order ([`FixedOrderProblem`]). Equations with friction start from linear fits
 //! ([`run_friction_multistart`]). Equations with nonlinear terms start from fits with the measured values of their
 //! expressions ([`run_nonlinear_multistart`]).
 

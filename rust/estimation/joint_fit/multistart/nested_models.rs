@@ -1,4 +1,4 @@
-//! Submodels of a structure: one term less, one fixed order, or integer orders.
+//! Submodels of a structure: without one term, with one fixed order, or with integer orders.
 
 use std::collections::BTreeMap;
 
@@ -64,12 +64,14 @@ impl ReducedProblem {
     }
 }
 
-/// Return the submodels with one term less; empty if the structure has an order law or a coefficient law.
+/// Return the submodels with one term removed or one coefficient fixed; empty if the structure has an order law or a
+/// coefficient law.
 ///
-/// An autoregressive term is removed if its equation has several. The coefficient of an input term of fixed order is
-/// set to 0 if there are several input terms and the equations are not coupled. The signals of one machine are
-/// correlated, so there can be optima in which one signal replaces the others. For the same reason, a coefficient with
-/// a known physical value is fixed at that value.
+/// One submodel per autoregressive term lacks this term, if its equation has several autoregressive terms. The
+/// coefficient of an input term of fixed order is set to 0 if there are several input terms and the equations are not
+/// coupled. The signals of one machine are correlated, so there can be optima in which one signal replaces the others.
+/// For the same reason, there is one submodel per coefficient of known physical value, in which this coefficient is
+/// fixed at that value.
 #[must_use]
 pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     let structure = &free.structure;
@@ -142,10 +144,12 @@ impl IntegerOrderProblem {
     }
 }
 
-/// Return submodels with integer orders: the usual ones, those nearest to `near`, and each with one order changed.
+/// Return submodels with integer orders: the usual orders, those nearest to `near`, and all variants of either set in
+/// which one order has another integer value.
 ///
-/// An input coefficient may change its sign between two integer orders, and an optimization cannot cross that change.
-/// The nearest integer orders therefore need not be the best. Combinations without a valid equation are omitted.
+/// An input coefficient may have opposite signs at two integer orders, and an optimization cannot pass through zero
+/// between them. The nearest integer orders therefore need not be the best. Combinations without a valid equation are
+/// omitted.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn integer_order_problems(free: &ParameterSet, near: &[f64]) -> Vec<IntegerOrderProblem> {
@@ -209,7 +213,7 @@ pub struct FixedOrderProblem {
 }
 
 impl FixedOrderProblem {
-    /// Restrict a candidate of the full problem to this submodel, without a change of the coefficients in scaled time.
+    /// Restrict a candidate of the full problem to this submodel. The coefficients in scaled time are unchanged.
     #[must_use]
     pub fn restrict(&self, source: &Candidate, time_scaling: &TimeScaling) -> Candidate {
         let mut scaled_values = time_scaling.to_scaled(&source.result.values());
@@ -235,7 +239,8 @@ impl FixedOrderProblem {
 
 /// Return the submodels with one order fixed at an integer, if there are several free orders.
 ///
-/// The optima of the submodels are candidates, because no submodel may fit better than the full problem.
+/// The optima of the submodels become candidates of the full problem, so that no submodel fits better than the full
+/// problem.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {

@@ -1,10 +1,10 @@
 //! Multistart for equations with nonlinear terms: linear fits with the measured values of the expressions.
 //!
-//! With measured values, a derived signal is one more input. The order grids of these linear equations give initial
-//! guesses, which are ranked by simulations of the nonlinear equations. Derivatives of measured signals are computed
-//! from raw and from smoothed samples. With friction, the guesses are output-error fits of the linear equations.
-//! Without friction, such fits add guesses only if no other guess reaches the noise level. In the same case, fits
-//! without the nonlinear terms add guesses, too.
+//! If a nonlinear expression is evaluated with measured values, it is one more input of a linear equation. The order
+//! grids of these linear equations give initial guesses, which are ranked by simulations of the nonlinear equations.
+//! Derivatives of measured signals are computed from raw and from smoothed samples. With friction, the guesses are
+//! output-error fits of the linear equations. Without friction, such fits add guesses only if no other guess reaches
+//! the noise level. If none does, fits without the nonlinear terms add guesses, too.
 
 use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, run_friction_multistart, values_of};

@@ -23,7 +23,8 @@ use crate::recording::{Recordings, Sampling};
 ///
 /// If no candidate reaches the noise, further initial guesses are computed.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
-/// Approximate number of intervals, over all runs, of a sampling on which initial guesses of integer orders are found.
+/// Approximate number of sampling intervals, over all runs, to which initial guesses of problems of integer orders are
+/// fitted.
 const GUESS_INTERVALS: usize = 2000;
 /// Number of leading intervals of a long record, over all runs, to which submodels and survivors are fitted.
 pub const SELECTION_INTERVALS: usize = 6000;
@@ -126,8 +127,8 @@ fn integer_order_multistart(
 
 /// Return the samplings on which initial guesses of integer orders are found.
 ///
-/// A long record has two samplings. Its first part is for fast poles and delays. The whole record, decimated, is for
-/// slow poles. A short record has none, because all its samples are used.
+/// For a long record, there are two samplings: the first part of the record for fast poles and delays, and the whole
+/// record, decimated, for slow poles. For a short record, the list is empty, because all samples are used.
 fn guess_samplings(
     free: &ParameterSet,
     source: &Recordings,
@@ -196,7 +197,8 @@ fn multistart_without_history<'a>(
 
 /// Return the best candidate of each submodel of integer orders, embedded in the full problem.
 ///
-/// The integer orders are near the usual ones and near those of the first guess.
+/// The submodels have the usual integer orders, those nearest to the orders of the first initial guess, and variants of
+/// both.
 fn integer_order_optima(
     free: &ParameterSet,
     context: MultistartContext<'_>,
@@ -217,8 +219,9 @@ fn integer_order_optima(
 /// Optimize a submodel from its initial guesses and return its optima, best first.
 ///
 /// The best `survivor_count` guesses continue after the prescreening. `level` is the cost per residual of the full
-/// problem. Optima that can compete with it, and the best one, get the second budget. For integer orders, the leading
-/// intervals of long records suffice. The result is empty if the submodel is invalid, such as with two equal terms.
+/// problem. The best optimum, and every optimum whose cost is near `level`, get the second budget. For integer orders,
+/// the leading intervals of long records suffice. The result is empty if the submodel is invalid, such as with two
+/// equal terms.
 fn optimize_submodel(
     free: &ParameterSet,
     context: MultistartContext<'_>,
@@ -245,9 +248,9 @@ fn optimize_submodel(
 impl<'a> MultistartState<'a> {
     /// Optimize all initial guesses with a step that is short enough for the best candidate.
     ///
-    /// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
-    /// halved until this no longer changes the simulation of the best candidate significantly. Optima of integer orders
-    /// are initial guesses on each grid.
+    /// On a coarse grid, the simulation of a stiff equation may be unstable, and the cost has spurious optima. The step
+    /// is halved until this no longer changes the simulation of the best candidate significantly. Optima of integer
+    /// orders are initial guesses on each grid.
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
@@ -275,7 +278,7 @@ impl<'a> MultistartState<'a> {
         }
     }
 
-    /// Add the optima of submodels as candidates: with one term less, with one fixed order, and without offsets.
+    /// Add the optima of submodels as candidates: with one term removed, with one fixed order, and without offsets.
     fn add_nested_models(&mut self) -> Result<()> {
         if self.candidates.is_empty() {
             return Ok(());
@@ -319,7 +322,8 @@ impl<'a> MultistartState<'a> {
         self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
-    /// Add the optimum with one order fixed, because the full problem must not fit worse.
+    /// Add the optimum with one order fixed as a candidate, so that the full problem does not fit worse than this
+    /// submodel.
     fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
         let level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
         if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.context.floor {

@@ -16,7 +16,8 @@ use crate::signal::statistics::white_noise_deviation;
 
 /// Time over which a velocity is averaged, as a fraction of the duration of the run.
 const VELOCITY_SPAN_FRACTION: f64 = 0.01;
-/// Minimum displacement within that time that counts as sliding, in standard deviations of the noise.
+/// Minimum displacement during the averaging time of the velocity at which a body counts as sliding, in standard
+/// deviations of the noise.
 const VELOCITY_NOISE_RATIO: f64 = 5.0;
 /// Maximum number of iterations in which the friction force at rest is recomputed from the input forces.
 const MAX_REST_ITERATIONS: usize = 4;

@@ -4,7 +4,7 @@ use super::likelihood::{ProfileLikelihood, Refit, MAX_REFIT_EVALUATIONS};
 use crate::error::Result;
 use crate::estimation::joint_fit::problem::OptimizationResult;
 
-/// Maximum relative difference between the root of the cost rise and its threshold at a converged bound.
+/// Maximum relative difference between the square root of the cost rise and the threshold at a converged bound.
 ///
 /// Newton's next step must also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
 const RISE_TOLERANCE: f64 = 0.1;
@@ -20,16 +20,18 @@ const MAX_BOUND_DISTANCE: f64 = 1e3;
 const MIN_FIRST_STEP_RATIO: f64 = 0.01;
 /// Minimum scale of a bracket, relative to the distance of its outer end from the optimum.
 ///
-/// The scale is the magnitude of the parameter at the inner end, at most the distance of the outer end. A bracket is
-/// narrow if its width is at most [`BOUND_TOLERANCE`] times this scale.
+/// The scale is the magnitude of the parameter at the inner end, but at most the distance of the outer end from the
+/// optimum. A bracket is narrow if its width is at most [`BOUND_TOLERANCE`] times this scale.
 const BRACKET_SCALE_RATIO: f64 = 0.1;
 /// Minimum factor by which one step increases the distance from the optimum.
 const MIN_STEP_FACTOR: f64 = 1.1;
 /// Maximum factor by which one step increases the distance from the optimum.
 const MAX_STEP_FACTOR: f64 = 4.0;
-/// Maximum ratio of the rises of the root cost in two successive steps at which the cost counts as leveling off.
+/// Ratio of the increases of the square root of the cost rise in two successive steps, below which the cost counts as
+/// leveling off.
 const LEVELING_RATIO: f64 = 0.5;
-/// Minimum relative margin of the extrapolated root cost to the threshold at which the cost counts as leveling off.
+/// Relative margin by which the extrapolated square root of the cost rise must stay below the threshold for the cost to
+/// count as leveling off.
 const LEVELING_MARGIN: f64 = 0.05;
 /// Minimum distance of a step from both ends of its bracket, as a fraction of the bracket width.
 const BRACKET_MARGIN: f64 = 0.05;
@@ -55,7 +57,7 @@ impl Interval {
 
     /// Shift the finite bounds by `by` and limit them to the bounds of the parameter.
     ///
-    /// `by` is the difference between the optima on the extrapolated grid and on the profile grid.
+    /// `by` is the estimate, extrapolated to step 0, minus the optimum on the grid of the profile.
     pub(super) fn shift(mut self, by: f64, (low, high): (f64, f64)) -> Self {
         for end in [&mut self.low, &mut self.high].into_iter().filter(|end| end.is_finite()) {
             *end = (*end + by).clamp(low, high);
@@ -85,7 +87,8 @@ pub enum BoundOutcome {
 /// Search for one bound of the interval of a parameter.
 ///
 /// At a refit, the derivative of the cost with respect to the parameter is the slope of the profile. If the cost is a
-/// parabola, the root of its rise is a linear function of the parameter. One refit then suffices.
+/// parabola, the square root of its rise above the optimum is a linear function of the parameter. One refit then
+/// suffices.
 pub struct BoundSearch {
     /// Index of the parameter.
     pub parameter: usize,
@@ -101,18 +104,18 @@ pub struct BoundSearch {
     farthest: f64,
     /// Distance of the next refit from the optimum.
     distance: f64,
-    /// Distance from the optimum of the last refit whose cost is below the threshold.
+    /// Distance between the optimum and the last refit whose cost is below the threshold.
     inside: f64,
-    /// Distance from the optimum of the first refit whose cost is above the threshold.
+    /// Distance between the optimum and the nearest refit whose cost is above the threshold; infinite if there is none.
     outside: f64,
     /// Result of the last refit whose cost is below the threshold.
     within: OptimizationResult,
-    /// Result of the refit that the exhausted budget interrupted.
+    /// Result of the refit that was interrupted when the budget was exhausted; the next refit starts from it.
     origin: Option<OptimizationResult>,
     refits: usize,
-    /// Root of the cost rise at the previous step.
+    /// Square root of the cost rise at the previous step.
     reached: f64,
-    /// Increase of this root in the previous step.
+    /// Increase of the square root of the cost rise in the previous step.
     gained: f64,
     points: Vec<(f64, f64)>,
     evaluations: usize,
@@ -279,7 +282,8 @@ impl BoundSearch {
         None
     }
 
-    /// Distance of the midpoint of the bracket from the optimum; a geometric mean if both values have the same sign.
+    /// Distance from the optimum to the midpoint of the bracket. The midpoint is a geometric mean if the parameter has
+    /// the same sign at both ends.
     fn bracket_midpoint(&self) -> f64 {
         let (inner, outer) = (self.start + self.side * self.inside, self.start + self.side * self.outside);
         if inner * outer > 0.0 {

@@ -18,11 +18,12 @@ pub const MAX_REFIT_EVALUATIONS: usize = 120;
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
 /// Maximum shift of the optimum, relative to the parameter. A shift within this or the previous limit is accepted.
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
-/// Tolerance of a refit, as a fraction of the rise of the sum of squares at one standard error.
+/// Convergence tolerance of a refit, as a fraction of the rise of the sum of squares at one standard error.
 const REFIT_TOLERANCE: f64 = 1e-4;
-/// Decrease of the sum of squares that indicates another optimum, as a fraction of its rise at one standard error.
+/// Minimum decrease of the sum of squares that indicates another optimum, as a fraction of the rise at one standard
+/// error.
 const LOWER_OPTIMUM_MARGIN: f64 = 0.02;
-/// Relative change of another parameter in one step above which initial guesses by power laws are also tried.
+/// Relative change of another parameter in one step above which initial guesses that follow power laws are also tried.
 const POWER_LAW_MOVE_RATIO: f64 = 0.3;
 /// Maximum magnitude of the exponent of a power law for initial guesses.
 const MAX_POWER_LAW_EXPONENT: f64 = 4.0;
@@ -190,7 +191,8 @@ impl<'a> ProfileLikelihood<'a> {
         [self.errors[i], self.units[i]].into_iter().all(|v| v > 0.0 && v.is_finite())
     }
 
-    /// Root of the rise of a sum of squares above that of the optimum, in standard deviations of parameter `i`.
+    /// Square root of the rise of a sum of squares above its value at the optimum, in standard deviations of parameter
+    /// `i`.
     #[must_use]
     pub fn rise(&self, i: usize, squares: f64) -> f64 {
         ((squares - 2.0 * self.cost()).max(0.0) / self.units[i]).sqrt()
@@ -213,9 +215,9 @@ impl<'a> ProfileLikelihood<'a> {
 
     /// Relative error of the Wald interval of parameter `i` with half-width `width` in standard deviations.
     ///
-    /// At each bound, the other parameters follow the linearized profile and one linear step. The rise of the cost
-    /// there is compared with the expected one. The error is infinite if a bound violates a constraint or its
-    /// simulation is not finite. It is 0 for a parameter that is not identifiable.
+    /// At each bound, the other parameters follow the linearized profile and are then adjusted by one linear step. The
+    /// rise of the cost there is compared with the rise that the Wald interval implies. The error is infinite if a
+    /// bound violates a constraint or its simulation is not finite. It is 0 for a parameter that is not identifiable.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -272,8 +274,8 @@ impl<'a> ProfileLikelihood<'a> {
     /// Return initial guesses with parameter `i` fixed at `value`, most promising first.
     ///
     /// The other parameters follow the tangent of the profile, or they are unchanged. If the tangent changes them
-    /// strongly, power laws are also tried, for all parameters or for the orders only. The reason is that unbounded
-    /// valleys often have the form d·μ = const and d + a = const, for parameters d, μ and a.
+    /// strongly, they also follow power laws of parameter `i`, either all of them or only the orders. The reason is
+    /// that unbounded valleys often have the form d·μ = const and d + a = const, for parameters d, μ and a.
     fn refit_starts(&self, i: usize, value: f64, near: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
         let (values, tangent) = (near.values(), tangent(near, i)?);
         let (orders, by) = (self.free.orders.len(), value - values[i]);
@@ -343,7 +345,8 @@ pub struct CostSurface<'a> {
 impl<'a> CostSurface<'a> {
     /// Return the cost surface of the two parameters `pair` around the optimum of the finest grid.
     ///
-    /// If `refit` is true, all other parameters follow by one linear step at each point. Otherwise they are fixed.
+    /// If `refit` is true, all other parameters are adjusted by one linear least-squares step at each point. Otherwise
+    /// they are fixed.
     ///
     /// # Errors
     /// The error of the simulation of the fit if it fails. [`Error::Interrupted`] after a stop request.

@@ -24,19 +24,20 @@ use bound_search::MAX_REFITS_PER_BOUND;
 ///
 /// The error is estimated with one linear step of all other parameters.
 const MAX_QUADRATIC_ERROR: f64 = 0.1;
-/// Minimum number of remaining simulations per bound with which the search continues.
+/// Minimum number of simulations that must remain per bound for the search to continue.
 const MIN_BUDGET_PER_BOUND: usize = 10;
 /// Minimum decrease of the sum of squares at which a lower optimum is reported.
 ///
 /// It is relative to the rise of the sum of squares at one standard error.
 const MIN_COST_REDUCTION: f64 = 0.1;
-/// Maximum number of searches. A lower optimum ends a search, and the next one starts around it.
+/// Maximum number of searches. A search ends if it finds a lower optimum, and the next search starts around that
+/// optimum.
 const MAX_LOWER_OPTIMA: usize = 5;
 
 /// Settings of profile-likelihood intervals: parameters, confidence level and resources.
 #[derive(Debug, Clone)]
 pub struct ProfileSettings {
-    /// Indices of the parameters; None for those whose Wald interval is inaccurate.
+    /// Indices of the parameters to be profiled. None selects those whose Wald interval is inaccurate.
     pub parameters: Option<Vec<usize>>,
     /// Half-width of the interval, in standard deviations.
     pub width: f64,
@@ -53,7 +54,7 @@ pub struct ProfileResult {
     pub intervals: Vec<(usize, Interval)>,
     /// Parameter values of an optimum with a significantly lower cost than the fit; None if no such optimum was found.
     pub lower_optimum: Option<Vec<f64>>,
-    /// True if that optimum also has a lower cost than the fit on the next finer grid.
+    /// True if the lower optimum also has a lower cost than the fit on the next finer grid.
     pub lower_on_finer_grid: bool,
     /// Indices of the parameters whose profile needed more simulations than allowed.
     pub incomplete: Vec<usize>,
