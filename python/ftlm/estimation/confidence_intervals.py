@@ -7,6 +7,7 @@ doi:10.1093/bioinformatics/btp358).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -143,7 +144,7 @@ def profile_intervals(
     """Return profile-likelihood intervals of some parameters of a fit.
 
     Results do not depend on the number of threads. The interval of a parameter that is not identifiable is unbounded on
-    both sides.
+    both sides, or ends at a lower bound of 0.
 
     Parameters
     ----------
@@ -178,9 +179,11 @@ def profile_intervals(
         progress=progress,
         stop=stop_flag(),
     )
+    # A lower bound of 0 is a limit of the quantity itself, such as of a delay, and ends the interval.
+    least = [0.0 if low == 0.0 else -math.inf for low, _ in problem.all_bounds]
     return ProfileResult(
         {
-            problem.names[i]: ProfileInterval(low, high, level, tuple(points), took)
+            problem.names[i]: ProfileInterval(max(low, least[i]), high, level, tuple(points), took)
             for i, low, high, points, took in answer["intervals"]
         },
         answer["lower_optimum"],

@@ -248,8 +248,7 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
         for n, p in joint.profiles.items()
         if n not in unidentifiable
     }
-    # An order cannot be below 0, so an order of 0 has no lower bound.
-    open_ended = {n: s for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)}
+    open_ended = {n: s for n, s in sides.items() if s}
     if not open_ended:
         return []
     words = [f"{n} {' or '.join(s)}" for n, s in open_ended.items()]

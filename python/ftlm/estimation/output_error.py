@@ -61,8 +61,9 @@ class ProfileInterval:
     Parameters
     ----------
     low, high
-        Bounds of the interval, in the unit of the parameter. A bound is infinite if the cost does not reach the
-        threshold within the bounds of the parameter or within the range of finite simulations.
+        Ends of the interval, in the unit of the parameter. An end is infinite if the cost does not reach the threshold
+        within the bounds of the parameter or within the range of finite simulations. Below a parameter with a lower
+        bound of 0, such as a delay, it is 0 instead.
     level
         Confidence level.
     points
