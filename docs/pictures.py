@@ -15,11 +15,13 @@ import numpy as np
 
 import ftlm
 from ftlm import control
-from ftlm.reproduction import demo_run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+#: Folder of the tutorials.
+TUTORIALS = Path(__file__).parent / "tutorials"
 
 
 def example(name: str, kind: str, seed: int) -> ftlm.Run:
@@ -253,30 +255,23 @@ def next_experiment(folder: Path) -> Figure:
 
 
 def unseen() -> Figure:
-    """Return simulations of a deflection on validation data, by the published algorithm and by the default."""
+    """Return the simulation of the model of the README on its validation run, a chirp."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
-    square, sine = (demo_run(kind, duration=6.0).select(["I1", "theta11", "theta12"]) for kind in ("square", "sine"))
-    link = ftlm.flexible_link(stage=1, form="published", coupling="measured", laws=())
-    published = ftlm.identify(
-        square, link, method=ftlm.MultiInnovation(order_grid=ftlm.order_grid(increment=0.2, alpha=(1.4, 2.0)))
-    ).validate(sine)
-    ours = ftlm.identify(square, ftlm.flexible_link(stage=1, coupling="simulated")).validate(sine)
-    thin = slice(None, None, 4)
+    shown = run_first_block(Path(__file__).parents[1] / "README.md")
+    run = shown["measure"](shown["chirp"], 2)
+    found = shown["result"].validate(run)
     figure = Figure(figsize=(7, 2.8), layout="constrained")
-    figure.suptitle("Tip deflection of a simulated arm on a run that neither model was fitted to", fontsize="small")
-    plot = figure.add_subplot(xlabel="time [s]", ylabel="deflection [rad]")
-    plot.plot(sine.time[thin], sine["theta12"][thin], color="0.7", linewidth=3, label="measured, noise of 1e-4 rad")
-    for name, fit, style in (("published algorithm", published, "C1"), ("ftlm identify", ours, "C0")):
-        words = f"{name}: {max(fit.fit['theta12'], 0.0):.1f} %"
-        plot.plot(sine.time[thin], fit.simulated["theta12"][0][thin], style, linewidth=1, label=words)
-    figure.legend(fontsize="small", loc="outside lower center", ncols=3)
+    figure.suptitle("Example: a chirp that was not used for the identification", fontsize="small")
+    plot = figure.add_subplot(xlabel="time [s]", ylabel="y")
+    plot.plot(run.time, run["y"], color="0.7", linewidth=2, label="measured")
+    plot.plot(run.time, found.simulated["y"][0], "C0", linewidth=1, label=f"model, fit {found.fit['y']:.1f} %")
+    figure.legend(fontsize="small", loc="outside lower center", ncols=2)
     return figure
 
 
-def run_tutorial(name: str) -> dict[str, Any]:
-    """Run the first Python block of a tutorial in an empty folder, and return its variables by name."""
-    page = Path(__file__).parent / "tutorials" / f"{name}.md"
+def run_first_block(page: Path) -> dict[str, Any]:
+    """Run the first Python block of a page in an empty folder, and return its variables by name."""
     blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     variables: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
@@ -300,7 +295,7 @@ def tutorials() -> dict[str, Figure]:
         ("flexible_arm", "nod", "tip", "tip [rad]"),
         ("matlab", "test", "y", "y"),
     ):
-        found = run_tutorial(name)
+        found = run_first_block(TUTORIALS / f"{name}.md")
         run = found[run_name]
         models = {"free order": found["free"], "first order": found["first"]} if name == "heat" else {}
         models = models or {"simulated": found["found"]}
@@ -312,7 +307,7 @@ def tutorials() -> dict[str, Figure]:
             text = f"{words}: {check.fit[output]:.1f} %"
             plot.plot(run.time[thin], check.simulated[output][0][thin], style, linewidth=1, label=text)
         drawn[f"tutorial-{name}"].legend(fontsize="small", loc="outside lower center", ncols=3)
-    found = run_tutorial("battery")
+    found = run_first_block(TUTORIALS / "battery.md")
     second, model = found["second"], found["found"].model
     plot = axes("battery", "real part [mΩ]", "negative imaginary part [mΩ]")
     measured, fitted = 1e3 * second.response, 1e3 * model.frequency_response(second.frequency)[0, 0]

@@ -89,7 +89,8 @@ class Stability:
         if self.origin_order > 0:
             why.append(f"it integrates its input with order {self.origin_order:g}")
         verdict = "stable" if self.stable else f"not stable: {', '.join(why)}"
-        how = f"poles in s^{self.base:g}" if self.method == "poles" and self.base else self.method
+        plane = "s" if self.base == 1.0 else f"s^{self.base:g}"
+        how = f"poles in {plane}" if self.method == "poles" and self.base else self.method
         return f"{verdict} ({how})"
 
 

@@ -224,7 +224,8 @@ def identify(
         result.model.save(out, force=force)
     if report is not None:
         progress.say("writing the report")
-        result.report(report, validation=others or None, force=force)
+        chosen = selection if selection is not None and selection.best is result else None
+        (chosen or result).report(report, validation=others or None, force=force)
     checked = result.validate(others) if others else None
     if as_json:
         verdict_entry = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}

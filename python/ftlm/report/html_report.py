@@ -439,7 +439,9 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
     structure = model.structure
     if structure.has_nonlinear_terms:
         return []
-    words = "Exact response of all equations together at the fractional orders, without approximation."
+    orders = [order.constant for e in model.equations for order in (e.order, *(t.order for t in e.terms))]
+    fractional = ", without an approximation of fractional orders" if any(order % 1.0 for order in orders) else ""
+    words = f"Exact response of all equations together{fractional}."
     effects = ["friction"] if structure.has_friction else []
     effects += list(dict.fromkeys(INPUT_EFFECT_LABELS[limit.law] for limit in structure.limits))
     if effects:

@@ -684,8 +684,8 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
             title, ("output", *_METRIC_LABELS), shown_rows, groups=single, headings=headings, note=" ".join(reasons)
         )
     note = (
-        "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
-        "close to one another; only the simulation shows how well the model predicts."
+        "The equation error uses the measured output on the right-hand side; only the simulation shows how well the "
+        "model predicts. The equation error is small for any model whose orders are close to one another."
     )
     groups = (("", 1), ("equation error", 4), ("output error (simulation)", 4))
     return Table(
