@@ -5,8 +5,7 @@ use std::collections::BTreeMap;
 use super::initial_guesses::OrderGrids;
 use super::multistart::{
     leading_part, run_friction_multistart, run_multistart, run_nonlinear_multistart, select_survivors,
-    split_by_prospect, split_unfinished, InitialGuessSource, MultistartContext, FIRST_BUDGET_EVALUATIONS,
-    SELECTION_INTERVALS,
+    split_unfinished, InitialGuessSource, MultistartContext, FIRST_BUDGET_EVALUATIONS, SELECTION_INTERVALS,
 };
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -447,23 +446,17 @@ fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near:
         let place = &candidate.result.iterate;
         near.minimize_in(&free.problem_at(place, false, &[]), place, evaluations)
     };
-    let short_fit = |candidate: &Candidate| -> Result<Candidate> {
-        let start = candidate.with_result(fit(candidate, 0)?);
-        Ok(start.with_result(fit(&start, FIRST_BUDGET_EVALUATIONS)?))
-    };
     let mut short = Vec::new();
     let mut last = None;
     for candidate in survivors {
-        match short_fit(candidate) {
-            Ok(candidate) => short.push(candidate),
+        match fit(candidate, FIRST_BUDGET_EVALUATIONS) {
+            Ok(attempt) => short.push(candidate.with_result(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // This survivor has no finite simulation on this grid. Other survivors may have one.
             Err(error) => last = Some(error),
         }
     }
-    let (reachable, mut ends) = split_by_prospect(short, MAX_FINAL_EVALUATIONS);
-    let (unfinished, ended) = split_unfinished(reachable, problem.noise_floor());
-    ends.extend(ended);
+    let (unfinished, mut ends) = split_unfinished(short, problem.noise_floor());
     for candidate in unfinished {
         match fit(&candidate, MAX_FINAL_EVALUATIONS) {
             Ok(attempt) => ends.push(candidate.with_result(attempt)),

@@ -18,7 +18,7 @@ mod sliding_body;
 pub use coarse_grid::{coarse_sampling, leading_part, MAX_COARSE_SAMPLES};
 pub use friction::run_friction_multistart;
 pub use halving::{competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors};
-pub(super) use halving::{sort_by_cost, split_by_prospect, split_unfinished, FIRST_BUDGET_EVALUATIONS};
+pub(super) use halving::{sort_by_cost, split_unfinished, FIRST_BUDGET_EVALUATIONS};
 pub use nested_models::{
     fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, IntegerOrderProblem,
     ReducedProblem,
