@@ -323,3 +323,16 @@ def test_friction_is_found_beside_a_delay_that_further_poles_replace():
     assert item.order.constant == 1.0
     assert any("tanh" in str(term) for term in item.terms)
     assert best.delays["u"] == pytest.approx(0.037, abs=5e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_in_which_the_output_rests_are_fitted_too(seed):
+    """Most blocks of a single step hold noise alone, of which no model explains a part."""
+    g = np.random.default_rng(seed)
+    u = np.where(np.arange(300) < 30, 0.0, 1.0)
+    y = lfilter([0.0, 0.04], [1.0, -0.98], u)
+    e = lfilter([1.0], [1.0, -0.8], g.standard_normal(300))
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y + 0.03 * y.std() / e.std() * e})
+    found = ftlm.select(run, "auto")
+    assert {"no_candidate_fits", "worse_than_mean"}.isdisjoint(f.code for f in found.findings)
+    assert found.winner.validation_fit > 80

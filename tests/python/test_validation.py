@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import ftlm
 import oracles
@@ -342,3 +343,25 @@ def test_a_validation_on_fitted_rows_is_with_care():
     said = " ".join(found.summary(clean).split())
     assert f"estimated on them (their number): {clean.per_run[0][0]} ({terms})" in said
     assert "initial terms estimated on each run (their number)" in str(found.model.compare(run.window(10, 20)))
+
+
+def two_lags(u, noise, seed, name):
+    """Samples of 2 / ((0.8 s + 1) (0.48 s + 1)) u at 50 Hz with white noise, by SciPy's exact discretization."""
+    b, a, _ = signal.cont2discrete(([2.0], np.polymul([0.8, 1.0], [0.48, 1.0])), 0.02)
+    y = signal.lfilter(b.ravel(), a, u)
+    y = y + noise * y.std() * np.random.default_rng(seed).standard_normal(u.size)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y}, name=name)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_validation_run_shows_dynamics_that_a_step_hides(seed):
+    step = np.where(np.arange(600) < 60, 0.0, 1.0)
+    binary = np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], 50), 12)
+    estimation, validation = two_lags(step, 0.1, seed, "step"), two_lags(binary, 0.1, 100 + seed, "binary")
+    # In 10 % noise, a lag and a delay describe the step response, but not the response to the binary signal.
+    poor = ftlm.identify(estimation, ftlm.equation("D y = -a y + b u(t - 0:1)")).validate(validation)
+    assert "validation_follows_input" in {f.code for f in poor.findings}
+    assert poor.verdict.level == "with care"
+    # With uncertain parameters, the residuals of the right structure depend on the input as well.
+    right = ftlm.identify(estimation, ftlm.equation("D^2 y = -a1 D y - a y + b u")).validate(validation)
+    assert "validation_follows_input" not in {f.code for f in right.findings}

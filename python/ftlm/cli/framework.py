@@ -174,7 +174,7 @@ class Command(TyperCommand):
 
     def _check_repetition(self, ctx: Any, args: Sequence[str]) -> None:
         """Fail if an option with a single value is given twice; the parser would ignore all values but the last."""
-        *_, order = self.make_parser(ctx).parse_args(list(args))
+        order: list[Any] = self.make_parser(ctx).parse_args(list(args))[2]
         single = [p for p in order if p.param_type_name == "option" and not (p.multiple or p.is_flag or p.count)]
         for option in single:
             if single.count(option) > 1:

@@ -592,11 +592,15 @@ def _result(
         model = _model(problem, records, values_by_name, values, covariance, standard, findings)
     reported = [name for name, _ in absent]
     for bound in active_bounds:
-        name = bound.parameter
-        if isinstance(problem, CircuitProblem) and name in problem.orders and values_by_name[name] == MAX_EXPONENT:
-            element, capacitor = name.removesuffix("_alpha"), problem.capacitor_of(name)
-            findings.append(make_finding("cpe_is_capacitor", parameter=name, element=element, capacitor=capacitor))
-        elif name not in reported:
+        limited = bound.parameter or ""
+        if (
+            isinstance(problem, CircuitProblem)
+            and limited in problem.orders
+            and values_by_name[limited] == MAX_EXPONENT
+        ):
+            words = {"element": limited.removesuffix("_alpha"), "capacitor": problem.capacitor_of(limited)}
+            findings.append(make_finding("cpe_is_capacitor", parameter=limited, **words))
+        elif limited not in reported:
             findings.append(make_finding("response_on_bound", bound=bound.text))
     findings += _identifiability_findings(problem, {n: values_by_name[n] for n in names if n not in reported}, standard)
     return FrequencyIdentification(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -18,8 +17,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import OUTLIER_DEVIATIONS, JointFit
-from ftlm.estimation.result import Identification
-from ftlm.findings import Finding, make_finding, unique
+from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import (
@@ -34,7 +32,7 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
 from ftlm.utils.statistics import chi_squared, is_white, quantization_step, robust_deviation
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, compare, validation_findings
+from ftlm.validation.comparison import Comparison
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
 #: Maximum absolute correlation of two separately identifiable parameters, unless one of them is well determined.
@@ -648,14 +646,3 @@ def enumerate_names(names: Sequence[str]) -> str:
     """Return a list of names as text: up to three names, then the number of the others."""
     items = names if len(names) <= 3 else [*names[:3], f"{len(names) - 3} more"]
     return " and ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else items[0]
-
-
-def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
-    """Return a comparison of the model with validation runs; see :meth:`ftlm.Identification.validate`."""
-    comparison = compare(result.model, runs)
-    findings = [
-        *comparison.findings,
-        *validation_findings(result.comparison, comparison),
-        *discretization_findings(result.model, comparison),
-    ]
-    return replace(comparison, findings=unique(findings))

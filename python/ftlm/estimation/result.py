@@ -428,14 +428,15 @@ class Identification:
         -------
         Validation
             :class:`ftlm.Comparison` with simulation error, equation error and a ``.verdict``. Findings report a fit
-            that is lower than on the estimation runs, and validation runs that were also used for estimation.
+            that is lower than on the estimation runs, residuals that depend on an input, and validation runs that were
+            also used for estimation.
 
         Raises
         ------
         DataError
             If a run lacks a signal of the model or has other units.
         """
-        from ftlm.estimation.model_checks import validate
+        from ftlm.estimation.model_validation import validate
         from ftlm.estimation.verdict import validation_with_verdict
 
         return validation_with_verdict(self, validate(self, runs))

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
+from ftlm.analysis.frequency_response import covariance_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
@@ -18,14 +18,11 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, compare
+from ftlm.validation.comparison import Comparison, simulation_sensitivities
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
 #: (lower, upper) edge of a band over time.
 Band: TypeAlias = tuple[Floats, Floats]
-#: Step of the numerical derivatives, in standard errors of the parameter. It is small enough for the curvature of the
-#: output, and large enough for the tolerance of the simulation.
-DERIVATIVE_STEP_IN_ERRORS = 0.1
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
@@ -349,26 +346,15 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         simulation with a changed parameter fails.
     """
     covariance = covariance_of(model)
-    if covariance is None:
+    if covariance is None or not np.all(np.isfinite(covariance)):
         return {}
-    errors, values = np.sqrt(np.diag(covariance)), parameter_vector(model)
-    if not np.all(np.isfinite(covariance)):
+    try:
+        sensitivities = simulation_sensitivities(model, run, comparison)
+    except FtlmError:
         return {}
-    rows = np.flatnonzero(errors)
-    derivatives: dict[str, list[Floats]] = {name: [] for name in comparison.simulated}
-    for k in rows:
-        step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
-        shifted = values.copy()
-        shifted[k] += step
-        try:
-            perturbed = compare(with_parameter_vector(model, shifted), run)
-        except FtlmError:
-            return {}
-        for name, centre in comparison.simulated.items():
-            derivatives[name].append((perturbed.simulated[name][0] - centre[0]) / step)
-    bands = {}
-    for name, columns in derivatives.items():
-        matrix, middle = np.array(columns), comparison.simulated[name][0]
+    rows, bands = np.flatnonzero(np.diag(covariance)), {}
+    for name, (matrix,) in sensitivities.items():
+        middle = comparison.simulated[name][0]
         variance = np.einsum("kt,kl,lt->t", matrix, covariance[np.ix_(rows, rows)], matrix)
         half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         if np.all(np.isfinite(half)):

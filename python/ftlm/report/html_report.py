@@ -20,7 +20,7 @@ from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
-from ftlm.estimation.model_checks import validate
+from ftlm.estimation.model_validation import validate
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html

@@ -86,8 +86,18 @@ class Fold:
             return self.runs
         return Runs(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
+    def norm(self, output: str) -> float:
+        """Return the norm of the validation samples of an output about its mean, at the variance of the whole run.
+
+        At the variance of the block itself, no model would fit a block in which the output rests.
+        """
+        values = self.validation_run[output]
+        first, last = self.rows or (0, values.size)
+        count = np.count_nonzero(np.isfinite(values[first:last]))
+        return max(math.sqrt(count) * float(np.nanstd(values)), 1e-300)
+
     def fit(self, model: Model) -> dict[str, float]:
-        """Return the fit of a simulation to the validation data in percent, by output.
+        """Return the fit of a simulation to the validation data in percent, by output; see :meth:`norm`.
 
         Initial terms are fitted to a validation run; its residual is divided by the square root of 1 - k/N for k terms
         and N samples. For a block of a run, the initial terms are fitted to the rest of the run. For the first block of
@@ -110,10 +120,7 @@ class Fold:
         out = {}
         for name in outputs:
             output, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, answer))
-            is_finite = np.isfinite(output)
-            missed, size = output[is_finite] - free[is_finite], output[is_finite] - np.mean(output[is_finite])
-            share = vector_norm(missed) / max(vector_norm(size), 1e-300)
-            out[name] = 100.0 * (1.0 - share)
+            out[name] = 100.0 * (1.0 - vector_norm(drop_missing(output - free)) / self.norm(name))
         return out
 
 
@@ -469,9 +476,8 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
         for output, residuals in joint.residuals[place].items():
             if residuals.size != fold.validation_run.length - 2:
                 return -math.inf
-            residual, output_values = residuals[max(first - 1, 0) : last - 1], fold.validation_run[output][first:last]
-            size = vector_norm(output_values - np.nanmean(output_values))
-            share = scale[output] * vector_norm(drop_missing(residual)) / max(size, 1e-300)
+            residual = residuals[max(first - 1, 0) : last - 1]
+            share = scale[output] * vector_norm(drop_missing(residual)) / fold.norm(output)
             scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
     return float(np.mean(scores))
 

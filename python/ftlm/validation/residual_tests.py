@@ -161,10 +161,10 @@ class OutputResiduals:
         return tuple(name for name, test in self.feedback_tests.items() if test.has_feedback)
 
     @property
-    def has_colored_correlation(self) -> bool:
-        """Whether the residuals are finite, not white, and correlated with an input or the direction of motion."""
+    def is_correlated(self) -> bool:
+        """Whether the residuals are finite, and correlated with an input or the direction of motion."""
         tests = [*self.inputs.values(), *([self.direction] if self.direction else [])]
-        return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in tests)
+        return math.isfinite(self.rms) and any(t.failed for t in tests)
 
     @property
     def is_noise(self) -> bool:
@@ -365,7 +365,7 @@ def run_residual_tests(
 
     The first and last sample of each run are omitted. ``sensitivities`` is a function that returns, by output, the
     sensitivities to the fitted parameters, one array per run with shape (parameters, samples). It is called only if
-    colored residuals are correlated with an input or with the direction of motion. Raise DataError if a run is too
+    residuals are correlated with an input or with the direction of motion. Raise DataError if a run is too
     short for these lags.
     """
     check_run_lengths(runs, lags)
@@ -397,7 +397,7 @@ def run_residual_tests(
             signs = _signs_of_motion(motion)
             slope = math.inf if item.order.constant > 1.0 else sign_tanh_slope(motion)
             outputs[name] = _test_direction(outputs[name], signs, lags, slope)
-        if sensitivities is not None and outputs[name].has_colored_correlation:
+        if sensitivities is not None and outputs[name].is_correlated:
             own = sensitivities().get(name, [])
             outputs[name] = _test_beyond_parameters(outputs[name], own, signals, signs, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
@@ -474,9 +474,9 @@ def _test_beyond_parameters(
 ) -> OutputResiduals:
     """Return the residuals of an output, with failed tests replaced by passed ones if parameter errors explain them.
 
-    ``signs`` are the signs of the velocity. Least squares ignores the color of the noise, so errors of the parameters
-    alone can correlate residuals with an input, or with the direction of motion. One generalized least-squares step
-    removes that part of the residuals.
+    ``signs`` are the signs of the velocity. Errors of the parameters can correlate residuals with an input, or with the
+    direction of motion: on validation data, and on estimation data because least squares ignores the color of the
+    noise. One generalized least-squares step removes that part of the residuals.
     """
 
     def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
