@@ -118,8 +118,8 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             if len(names) != count:
                 raise ValueError(f"{what} has {count} columns; give those of the structure: {', '.join(names)}")
         by_name = not isinstance(self.structure, str) or self.structure != "auto"
-        self._inputs = _in_order("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
-        self._outputs = _in_order("y", structure.outputs, columns if by_name else None)
+        self._inputs = _signals_by_column("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
+        self._outputs = _signals_by_column("y", structure.outputs, columns if by_name else None)
         self._index = _check_index(index)
         run = self._run(X, table, "fit")
         self.identification_ = identify(run, structure, method=self.method, threads=self.threads, offset=self.offset)
@@ -182,7 +182,7 @@ def _columns(table: Any) -> list[str] | None:
     return names if names and all(isinstance(name, str) for name in names) else None
 
 
-def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
+def _signals_by_column(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
     """Return the name of the signal in each column. Several named columns are matched by name, all others by position.
 
     Raise ValueError if the column names are not the signal names; `what` ("X" or "y") is named in the message.

@@ -329,22 +329,22 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
 
 
 def _filter_output(
-    a: Floats, b: Floats, c: Floats, d: Floats, output: int, top: Floats, bottom: Floats
+    a: Floats, b: Floats, c: Floats, d: Floats, output: int, numerator: Floats, denominator: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return state-space matrices in which the filter top / bottom is applied to one output, in observer form.
+    """Return state-space matrices in which a filter is applied to one output, in observer form.
 
-    `output` is the index of the output. `top` and `bottom` are coefficients in descending powers and have the same
-    length.
+    `output` is the index of the output. `numerator` and `denominator` are the coefficients of the filter in descending
+    powers, and have the same length.
     """
-    count, own = bottom.size - 1, a.shape[0]
-    top, bottom = top / bottom[0], bottom / bottom[0]
+    count, own = denominator.size - 1, a.shape[0]
+    numerator, denominator = numerator / denominator[0], denominator / denominator[0]
     shift = np.eye(count, k=1)
-    shift[:, :1] -= bottom[1:, None]
-    fed = (top[1:] - bottom[1:] * top[0])[:, None]
+    shift[:, :1] -= denominator[1:, None]
+    fed = (numerator[1:] - denominator[1:] * numerator[0])[:, None]
     a = np.block([[a, np.zeros((own, count))], [fed @ c[output : output + 1], shift]])
     b = np.vstack([b, fed @ d[output : output + 1]])
     c = np.hstack([c, np.zeros((c.shape[0], count))])
-    c[output], d[output] = top[0] * c[output], top[0] * d[output]
+    c[output], d[output] = numerator[0] * c[output], numerator[0] * d[output]
     c[output, own : own + 1] += 1.0
     return a, b, c, d
 
@@ -375,12 +375,12 @@ def _sample_system(
     first = count
     for j, length in enumerate(lengths):
         column, late = b[:, j : j + 1], length > whole[j]
-        places = [size + j, *range(first, first + length)]
-        motion[:count, [places[whole[j]]]] += hold(column, step - parts[j] if late else step)[1]
-        read[:, places[-1]] += d[:, j]
+        column_indices = [size + j, *range(first, first + length)]
+        motion[:count, [column_indices[whole[j]]]] += hold(column, step - parts[j] if late else step)[1]
+        read[:, column_indices[-1]] += d[:, j]
         if late:
-            motion[:count, [places[-1]]] += hold(column, step - parts[j])[0] @ hold(column, parts[j])[1]
-        motion[places[1:], places[:-1]] = 1.0
+            motion[:count, [column_indices[-1]]] += hold(column, step - parts[j])[0] @ hold(column, parts[j])[1]
+        motion[column_indices[1:], column_indices[:-1]] = 1.0
         first += length
     return motion[:, :size], motion[:, size:], read[:, :size], read[:, size:]
 
@@ -485,12 +485,12 @@ def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]
             if not any(d.size == denominator.size and np.array_equal(d, denominator) for denominator in distinct):
                 distinct.append(d)
         common = _product(distinct)
-        over = []
+        numerators = []
         for n, d in zip(top, own, strict=True):
             rest = [denominator for denominator in distinct if not np.array_equal(denominator, d / d[0])]
             values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
-            over.append(_product([values, *rest]) if values.size else np.zeros(1))
-        fractions.append((common, over))
+            numerators.append(_product([values, *rest]) if values.size else np.zeros(1))
+        fractions.append((common, numerators))
     return fractions
 
 

@@ -217,7 +217,7 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
     `what` is "poles" or "zeros" in messages. Raise ModelError if roots overflow or some were not found.
     """
     upper = zeros_of(polynomial, math.pi)
-    if not _whole_orders(polynomial):
+    if not _has_integer_spacing(polynomial):
         upper = [w for w in upper if w.imag < math.pi - DISTINCT_ZERO_TOLERANCE]
     if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
         decades = int(MAX_LOG_FREQUENCY / math.log(10))
@@ -236,7 +236,7 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
     return poles
 
 
-def _whole_orders(polynomial: Polynomial) -> bool:
+def _has_integer_spacing(polynomial: Polynomial) -> bool:
     """Whether all powers of s differ by integers, so that there is a single Riemann sheet."""
     lowest = min(polynomial)
     return all(abs(p - lowest - round(p - lowest)) < POWER_TOLERANCE for p in polynomial)

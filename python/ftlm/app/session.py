@@ -291,8 +291,8 @@ class Session:
             ),
         )
         for structure in parse_structures(fit_request):
-            for reading in filter(None, (fit_request.estimation, fit_request.validation)):
-                _check_signals(structure, reading)
+            for source in filter(None, (fit_request.estimation, fit_request.validation)):
+                _check_signals(structure, source)
         return fit_request
 
     def _run(self, key: str) -> RunSource:
@@ -428,13 +428,13 @@ class Session:
             shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _check_signals(structure: Structure, reading: RunSource) -> None:
+def _check_signals(structure: Structure, source: RunSource) -> None:
     """Raise ModelError if the run lacks a signal of the structure, before a worker process is started."""
-    names = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
+    names = [name for role in ("outputs", "inputs") for name in source.options.get(role, {})]
     for name in structure.signals:
         if name not in names:
             raise ModelError(
-                f"{reading.file!r} has no signal {name!r}{nearest(name, names)}; its signals are {', '.join(names)}, "
+                f"{source.file!r} has no signal {name!r}{nearest(name, names)}; its signals are {', '.join(names)}, "
                 "as the columns above name them"
             )
 

@@ -174,9 +174,9 @@ class DiscretePid:
             )
         count = check_integer("order", order, 1, MAX_APPROXIMATION_ORDER)
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
-        reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
-        self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
-        self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
+        pole_band = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
+        self._integral = _bank(pid.ki, *_integral(pid.lam, pole_band, count), 1.0 / value)
+        self._derivative = _bank(pid.kd, *_power(pid.mu, pole_band, count), 1.0 / value)
         #: Maximum gain error [dB] and phase error [degrees] over the band, relative to the exact controller.
         self.gain_error, self.phase_error = self._errors()
         if not math.isfinite(self.gain_error + self.phase_error):
@@ -267,28 +267,28 @@ class DiscretePid:
         )
 
 
-def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
+def _power(power: float, pole_band: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
     """Return (poles, residues, direct gain) of Oustaloup's filter for s^power, 0 < power <= 1.
 
-    `reach` is the frequency range of the poles [rad/s], and `order` the order of the filter. The steady-state gain is
-    zero. The filter is the direct gain plus the sum of residue/(s + pole). For power 1 it is a filtered derivative.
+    `pole_band` is the frequency range of the poles [rad/s], and `order` the order of the filter. The steady-state gain
+    is zero. The filter is the direct gain plus the sum of residue/(s + pole). For power 1 it is a filtered derivative.
     """
     if power < 1.0:
-        poles, residues, _ = oustaloup(power, reach, order)
+        poles, residues, _ = oustaloup(power, pole_band, order)
         # This direct gain makes the steady-state gain zero. Oustaloup's own gives the gain at the band's lower end.
         return poles, residues, -float(np.sum(residues / poles))
-    high = reach[1]
+    high = pole_band[1]
     return np.array([high]), np.array([-high * high]), high
 
 
-def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
+def _integral(power: float, pole_band: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
     """Return (poles, residues, direct gain) of an approximation of s^-power, 0 < power <= 1, with a pole at s = 0.
 
     It is an integrator in series with Oustaloup's filter for s^(1 - power), so a loop has no steady-state error.
     """
     if power >= 1.0:
         return np.zeros(1), np.ones(1), 0.0
-    poles, residues, gain = oustaloup(1.0 - power, reach, order)
+    poles, residues, gain = oustaloup(1.0 - power, pole_band, order)
     whole = gain + float(np.sum(residues / poles))
     return np.append(0.0, poles), np.append(whole, -residues / poles), 0.0
 
@@ -469,8 +469,8 @@ def fractional_pid(
     near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
     slope = float(np.diff(np.unwrap(np.angle(plant.response(near))))[0] / (near[1] - near[0]))
     w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARISON_FREQUENCIES)
-    curves = np.array([one.response(w) for one in [plant, *samples_drawn[:50]]])
-    best = _best(target, slope, wc, w, curves)
+    plant_responses = np.array([one.response(w) for one in [plant, *samples_drawn[:50]]])
+    best = _best_controller(target, slope, wc, w, plant_responses)
     if best is None:
         raise ModelError(
             f"no fractional PID with gains from 0 and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
@@ -487,7 +487,7 @@ def fractional_pid(
         """Whether the loop gain is below 1 at all frequencies above the requested crossover."""
         return bool(np.all(np.abs(pid.response(fine[above]) * high) < 1.0))
 
-    choice = best if is_last(best) else _best(target, slope, wc, w, curves, is_last)
+    choice = best if is_last(best) else _best_controller(target, slope, wc, w, plant_responses, is_last)
     acting = (choice or best).response(fine)
     lam = (choice or best).lam if (choice or best).ki > 0 else 0.0
 
@@ -553,19 +553,19 @@ def plant_of(
     return Plant(model, names[0], names[1], checked_rate(rate), coupling, sensor)
 
 
-def _best(
+def _best_controller(
     target: complex,
     slope: float,
     wc: float,
     w: Floats,
-    curves: Complex,
+    plant_responses: Complex,
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
     """Return the controller with the largest low-frequency gain among those that meet all conditions; None without one.
 
     At the frequency `wc` [rad/s], the controller has the response `target`, and its phase slope is minus the phase
-    slope `slope` of the plant. `curves` are the plant responses at the frequencies `w`, one row per parameter sample.
-    They determine the maximum sensitivity of the loop.
+    slope `slope` of the plant. `plant_responses` are the responses of the plant at the frequencies `w`, one row per
+    parameter sample. They determine the maximum sensitivity of the loop.
     """
     candidates: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
@@ -576,7 +576,7 @@ def _best(
                 pid = _solve_gains(target, slope, wc, lam, mu)
                 if pid is None or not is_allowed(pid):
                     continue
-                worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * curves)))
+                worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * plant_responses)))
                 candidates.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
         if not candidates:
             return None

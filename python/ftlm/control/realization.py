@@ -131,18 +131,21 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     library = python_control()
     w = np.geomspace(low, high, FIT_FREQUENCIES)
     with catch_numerical_errors(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
-        exact = np.array([p.exact(w) for p in plants])
+        responses = np.array([p.exact(w) for p in plants])
     own = [
         m.pole
         for m in modes(plants[0].model, coupling=plants[0].coupling)
         if m.oscillatory and low < m.frequency < high
     ]
-    integrates = [p.integral_order() > 0.5 for p in plants]
+    has_integrator = [p.integral_order() > 0.5 for p in plants]
     best: Realization | None = None
     for count in counts:
         with catch_numerical_errors(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
             poles_and_residues = _fit(
-                np.asarray(1j * w, dtype=np.complex128), exact, integrates, _initial_poles(own, low, high, count)
+                np.asarray(1j * w, dtype=np.complex128),
+                responses,
+                has_integrator,
+                _initial_poles(own, low, high, count),
             )
             realization = _discretize(library, plants, (low, high), *poles_and_residues)
         if best is None or _scaled_error(realization) < _scaled_error(best):
@@ -233,31 +236,33 @@ def _system(poles: Complex) -> tuple[Floats, Floats]:
     return a, b
 
 
-def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
-    """Fit a system with common poles to the responses `exact`, shape (outputs, points), at the points s.
+def _fit(
+    s: Complex, responses: Complex, has_integrator: Sequence[bool], poles: Complex
+) -> tuple[Complex, Floats, bool]:
+    """Fit a system with common poles to `responses`, shape (outputs, points), at the points s.
 
-    `integrates` states for each output whether it has an integrator, and `poles` are the initial poles. Return (poles,
-    residues, whether there is an integrator). Residues have one row per output. Their first column contains the
+    `has_integrator` states for each output whether it has an integrator, and `poles` are the initial poles. Return
+    (poles, residues, whether there is an integrator). Residues have one row per output. Their first column contains the
     residues of the integrator, 0 for an output without one.
     """
-    weight = 1.0 / np.abs(exact)
+    weight = 1.0 / np.abs(responses)
     for _ in range(MAX_POLE_ITERATIONS):
         basis = _basis(s, poles)
         blocks, right = [], []
         width = basis.shape[1]
         each = width + 1
-        for i, (line, w) in enumerate(zip(exact, weight, strict=True)):
-            block = np.zeros((s.size, each * len(exact) + width), dtype=complex)
-            block[:, i * each] = 1.0 / s if integrates[i] else 0.0
+        for i, (line, w) in enumerate(zip(responses, weight, strict=True)):
+            block = np.zeros((s.size, each * len(responses) + width), dtype=complex)
+            block[:, i * each] = 1.0 / s if has_integrator[i] else 0.0
             block[:, i * each + 1 : (i + 1) * each] = basis
-            block[:, each * len(exact) :] = -line[:, None] * basis
+            block[:, each * len(responses) :] = -line[:, None] * basis
             blocks.append(block * w[:, None])
             right.append(line * w)
         matrix, vector = np.concatenate(blocks), np.concatenate(right)
         scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-        solved = _least(matrix / scale, vector) / scale
+        solved = _least_squares(matrix / scale, vector) / scale
         a, b = _system(poles)
-        stable_poles = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
+        stable_poles = np.linalg.eigvals(a - b @ solved[None, each * len(responses) :])
         # The model is stable. A pole that errors of the fit put into the right half-plane is mirrored.
         stable_poles = -np.abs(stable_poles.real) + 1j * stable_poles.imag
         poles_before, poles = (
@@ -266,11 +271,11 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         )
         if len(poles_before) == len(poles) and np.max(np.abs(poles_before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break
-    residues = _residues(s, exact, integrates, poles)
+    residues = _residues(s, responses, has_integrator, poles)
     # Superfluous poles have negligible residues, so their states would not be observable. A second integrator would not
     # be observable either.
     at, is_significant = 1, []
-    slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(integrates) else 0.0
+    slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(has_integrator) else 0.0
     for p in poles:
         wide = 1 if p.imag == 0 else 2
         part = residues[:, at : at + wide] @ _basis(s, np.array([p])).T
@@ -278,30 +283,30 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         at += wide
     if not all(is_significant) and any(is_significant):
         poles = poles[is_significant]
-        residues = _residues(s, exact, integrates, poles)
-    return poles, residues, any(integrates)
+        residues = _residues(s, responses, has_integrator, poles)
+    return poles, residues, any(has_integrator)
 
 
-def _least(matrix: Complex, vector: Complex) -> Floats:
+def _least_squares(matrix: Complex, vector: Complex) -> Floats:
     """Return the real least-squares solution x of complex equations matrix x = vector, by QR factorization."""
     both = np.column_stack([matrix, vector])
     triangle = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"), dtype=np.float64)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1])[0])
 
 
-def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> Floats:
+def _residues(s: Complex, responses: Complex, has_integrator: Sequence[bool], poles: Complex) -> Floats:
     """Return the residues for given poles, shape (outputs, 1 + number of poles with their conjugates).
 
     The first column is the residue of the integrator, 0 for an output without one. The others are coefficients of the
     columns of :func:`_basis`.
     """
     basis = _basis(s, poles)
-    residues = np.zeros((len(exact), basis.shape[1] + 1))
-    for i, line in enumerate(exact):
-        matrix = (np.column_stack([1.0 / s, basis]) if integrates[i] else basis) / np.abs(line)[:, None]
+    residues = np.zeros((len(responses), basis.shape[1] + 1))
+    for i, line in enumerate(responses):
+        matrix = (np.column_stack([1.0 / s, basis]) if has_integrator[i] else basis) / np.abs(line)[:, None]
         scale = np.linalg.norm(matrix, axis=0)
         ones = line / np.abs(line)
-        solution = _least(matrix / scale, ones) / scale
+        solution = _least_squares(matrix / scale, ones) / scale
         residues[i, -len(solution) :] = solution
     return residues
 

@@ -72,9 +72,9 @@ def fit_with_instruments(
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
-    data_objective, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+    data_objective, noise_free_objective = (Objective(problem, each, weights, every=every) for each in (runs, answers))
     values, converged = joint.values, False
-    moments = _evaluate_moments(data_objective, clean, values)
+    moments = _evaluate_moments(data_objective, noise_free_objective, values)
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         attempt, slopes, instruments = moments
         residuals = np.asarray(attempt.outcome["residuals"])
@@ -88,7 +88,7 @@ def fit_with_instruments(
         for halving in range(MAX_STEP_HALVINGS):
             trial = problem.feasible_point(values, values + 0.5**halving * step)
             try:
-                trial_moments = _evaluate_moments(data_objective, clean, trial)
+                trial_moments = _evaluate_moments(data_objective, noise_free_objective, trial)
             except FtlmError:
                 # The simulation diverges after a step of this length.
                 continue
@@ -125,8 +125,10 @@ def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], an
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
     try:
-        data_objective, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
-        attempt, slopes, instruments = _evaluate_moments(data_objective, clean, joint.values)
+        data_objective, noise_free_objective = (
+            Objective(problem, each, weights, every=every) for each in (runs, answers)
+        )
+        attempt, slopes, instruments = _evaluate_moments(data_objective, noise_free_objective, joint.values)
     except FtlmError:
         return math.inf
     step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(attempt.outcome["residuals"]))
@@ -135,7 +137,9 @@ def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], an
     return float(np.max(np.abs(step[is_finite]) / errors[is_finite], initial=0.0))
 
 
-def _evaluate_moments(data_objective: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
+def _evaluate_moments(
+    data_objective: Objective, noise_free_objective: Objective, values: Floats
+) -> tuple[Iterate, Floats, Floats]:
     """Return the evaluated residuals, their Jacobian on measured inputs, and the Jacobian on noise-free inputs.
 
     Both Jacobians have shape (parameters, residuals).
@@ -143,7 +147,7 @@ def _evaluate_moments(data_objective: Objective, clean: Objective, values: Float
     orders, coefficients, inputs = data_objective.problem.split(values.tolist())
     start = Iterate(orders, coefficients, "instruments", {}, inputs)
     at = data_objective.minimize(start, 1, plain=True)
-    instruments = clean.minimize(start, 1, plain=True)
+    instruments = noise_free_objective.minimize(start, 1, plain=True)
     return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
 
 
@@ -154,13 +158,13 @@ def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
     return vector_norm(projections(basis, np.asarray(attempt.outcome["residuals"])))
 
 
-def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
+def _covariance(objective: Objective, attempt: Iterate, influence: Floats) -> Floats:
     """Return the parameter covariance, consistent under heteroskedasticity and autocorrelation of residuals.
 
     The estimator is that of Newey and West (doi:10.2307/1913610). ``influence`` is the derivative of each parameter
     with respect to each residual, of shape (parameters, residuals).
     """
-    series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
+    series = [residuals for part in objective.residuals(attempt) for residuals in part.values()]
     return _core.long_run_covariance(influence, series)
 
 

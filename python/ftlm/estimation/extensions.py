@@ -536,7 +536,9 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
         for _ in range(MAX_LOAD_SEARCHES):
             # The load is excluded here, so that the residuals alone determine its size.
             values = {n: values[n] for n in starts[0].names}
-            row = _load_row(*_residuals_at(values, structure, run), _load_response(item, structure, values, run))
+            row = _load_start_index(
+                *_residuals_at(values, structure, run), _load_response(item, structure, values, run)
+            )
             if row is None or row == best[1]:
                 break
             fit = fit_output_error([with_load(row)], wider, start={name: 0.0, **values}, refine=False)
@@ -581,7 +583,7 @@ def _load_response(item: Equation, structure: Structure, values: Mapping[str, fl
     return simulate(model, rest)[item.output][1:]
 
 
-def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
+def _load_start_index(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
     """Return the sample index from which a constant load explains most of the residuals.
 
     Return None if the response overflows or no load explains a part of the residuals. The first element of every array
@@ -715,13 +717,17 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
             if far and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
                 ratio = squares_ratio(other)
                 numbers = {"gain": own_gain, "error": own_error, "other_gain": gain, "other_error": error}
-                words = {"taken": _name_start(*own_setting), "other": _name_start(initial, offset), "ratio": ratio}
+                words = {
+                    "taken": _initial_condition_text(*own_setting),
+                    "other": _initial_condition_text(initial, offset),
+                    "ratio": ratio,
+                }
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
                 worst = distance, make_finding("gain_depends_on_initial_conditions", **about, **numbers, **words)
     return [worst[1]] if worst else []
 
 
-def _name_start(initial: Initial, offset: Offset) -> str:
+def _initial_condition_text(initial: Initial, offset: Offset) -> str:
     """Return initial conditions as text, such as "nonzero initial conditions and an output level"."""
     zero = "zero" if initial == "rest" else "nonzero"
     return f"{zero} initial conditions" + (" and an output level" if offset == "level" else "")

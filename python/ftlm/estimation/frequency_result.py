@@ -55,7 +55,7 @@ def curve_frequencies(record: FrequencyData) -> Floats:
     return np.unique(np.concatenate([frequencies, between, smooth]))
 
 
-def _place_of(model: Model, record: FrequencyData) -> tuple[int, int]:
+def _response_indices(model: Model, record: FrequencyData) -> tuple[int, int]:
     """Return the indices of a record's output and input in the frequency response of the model."""
     return model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
 
@@ -64,7 +64,7 @@ def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats)
     """Return the complex response of a model at `omega` [rad/s], from the input to the output of a record."""
     if isinstance(model, Circuit):
         return model.impedance(omega)
-    response: Complex = frequency_response(model, omega)[_place_of(model, record)]
+    response: Complex = frequency_response(model, omega)[_response_indices(model, record)]
     return response
 
 
@@ -78,7 +78,7 @@ def model_curve(
     response = model_response(model, record, omega)
     if isinstance(model, Circuit) or covariance_of(model) is None:
         return response, None, None
-    gain, phase = (part[_place_of(model, record)] for part in response_deviation(model, omega))
+    gain, phase = (part[_response_indices(model, record)] for part in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
@@ -387,7 +387,7 @@ class FrequencyIdentification:
 
     def _validation_findings(self, others: Sequence[ResponseError]) -> tuple[Finding, ...]:
         """Return a finding on each response with a large error, and one on an error far above the estimation errors."""
-        findings = _missed_responses(others)
+        findings = _large_error_findings(others)
         most = max(e.rms for e in self.errors)
         failures = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
         if failures:
@@ -429,7 +429,7 @@ class FrequencyIdentification:
         return self._assess(None)
 
     def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
-        findings = [*_missed_responses(self.errors), *_missed_responses(others or ()), *self._unstable_poles()]
+        findings = [*_large_error_findings(self.errors), *_large_error_findings(others or ()), *self._unstable_poles()]
         findings += [group.first_finding for group in group_findings(self.findings)]
         findings += [f for f in self._validation_findings(others or ()) if f not in findings]
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
@@ -645,7 +645,7 @@ def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     )
 
 
-def _missed_responses(errors: Sequence[ResponseError]) -> list[Finding]:
+def _large_error_findings(errors: Sequence[ResponseError]) -> list[Finding]:
     """Return a finding on each response on which the relative error of the model exceeds `MAX_RELATIVE_ERROR`."""
     return [
         make_finding("response_missed", run=e.name, output=e.output, input=e.input, rms=e.rms)

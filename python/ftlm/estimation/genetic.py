@@ -79,7 +79,7 @@ class GeneticRun:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _CandidateMap:
     """Linear map from genes to candidates of one equation: ``genes @ weights + constants``.
 
     A candidate is a row with alpha (the order of the equation), the orders and the coefficients of the terms. ``own``
@@ -131,11 +131,11 @@ class GeneticProblem:
             if name not in self.names:
                 raise ModelError(f"bounds of {name!r}: not a free parameter; free are {', '.join(self.names)}")
             self.bounds[name] = (float(pair[0]), float(pair[1]))
-        self.rows = [self._rows(e, records, settings.norm) for e in structure.equations]
+        self.rows = [self._candidate_map(e, records, settings.norm) for e in structure.equations]
         self.threads = threads
         self.size = self._candidates(structure, records, values)
 
-    def _rows(self, item: Equation, records: list[Record], norm: str) -> _Rows:
+    def _candidate_map(self, item: Equation, records: list[Record], norm: str) -> _CandidateMap:
         signals, inputs = records[0].signals, list(records[0].inputs)
         n = len(item.terms)
         weights, constants = np.zeros((len(self.names), 1 + 2 * n)), np.zeros(1 + 2 * n)
@@ -163,7 +163,7 @@ class GeneticProblem:
         count = sum(r.m for r in records)
         spread = math.sqrt(sum(float(np.var(r.of(item.output)) * r.m) for r in records) / count)
         scale = 1.0 if not self.law else spread * count if norm == "l1" else spread
-        return _Rows(points, weights, constants, own, scale)
+        return _CandidateMap(points, weights, constants, own, scale)
 
     def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
         """Return the number of candidates of the order grid; under an order law an upper bound of this number."""

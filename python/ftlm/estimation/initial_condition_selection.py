@@ -139,7 +139,7 @@ def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -
     constant = _fit_with_constant(fit, structure, fits)
     if constant is not None:
         return constant
-    restart = _fit_in_motion(fit, structure, fits)
+    restart = _fit_if_rest_rejected(fit, structure, fits)
     if restart is not None:
         return restart
     # The test of an offset assumes a linear model. In a non-linear model a constant also moves the equilibrium.
@@ -182,12 +182,12 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
     if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
         return None
-    whole = _fit_in_motion(candidate, request, fits) or fits.with_intervals(request, candidate)
+    whole = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
     return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **context)])
 
 
-def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
+def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
     """Return a fit with nonzero initial conditions or a level if residuals contradict a start from rest, else None.
 
     A few quiet samples do not distinguish slow motion from rest. With white residuals, rest is kept. If the

@@ -187,22 +187,22 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
     optima = [(values, 0.0) for values in far]
     # A second optimum on all samples is also one on the first part, on which the search is cheaper.
     for some in [parts, runs] if any(part is not run for part, run in zip(parts, runs, strict=True)) else [runs]:
-        grid = Objective(problem, some, weights, every=joint.refinement)
-        optima = _other_optima(grid, joint.values, [values for values, _ in optima]) if optima else []
+        objective = Objective(problem, some, weights, every=joint.refinement)
+        optima = _other_optima(objective, joint.values, [values for values, _ in optima]) if optima else []
     own = joint.standard_errors
     return second_optimum_findings(joint.names, joint.values, own, [(values, fall, own) for values, fall in optima])
 
 
-def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
+def _other_optima(objective: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
     """Return other optima that are almost as likely as the best one but have other simulated outputs.
 
     Each is returned as (values, decrease of the log likelihood). The result is [] if a fit from one of `starts` fails.
     """
 
     def fit(values: Floats) -> tuple[Floats, float, Floats]:
-        orders, coefficients, inputs = grid.problem.split(values.tolist())
+        orders, coefficients, inputs = objective.problem.split(values.tolist())
         start = Iterate(orders, coefficients, "second optimum", {}, inputs)
-        end = grid.minimize(start, MAX_SECOND_EVALUATIONS, plain=True)
+        end = objective.minimize(start, MAX_SECOND_EVALUATIONS, plain=True)
         return end.values, float(end.outcome["cost"]), np.asarray(end.outcome["residuals"])
 
     optima = []

@@ -35,7 +35,7 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputS
         return []
     values = [_signal_values(model, run, samples) for run, samples in zip(runs, free, strict=True)]
     findings = [f for item in model.equations for f in _term_findings(item, runs, values)]
-    return [*findings, *_forgetting_findings(model, runs, free)]
+    return [*findings, *_sensitivity_growth_findings(model, runs, free)]
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
@@ -101,7 +101,7 @@ def _rms(parts: Sequence[Floats]) -> float:
         return math.sqrt(float(np.mean(np.concatenate(parts) ** 2)))
 
 
-def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+def _sensitivity_growth_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
     """Return a finding if the sensitivity of a simulated output to a parameter grows exponentially.
 
     The output itself must not grow. As in chaotic motion, the end of the run then depends too strongly on the

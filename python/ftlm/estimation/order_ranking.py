@@ -166,7 +166,7 @@ def with_verdict(
     except FtlmError as error:
         failed = make_finding("rank_not_validated", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
-    alike = [] if result.residuals is None else _alike_findings(search, result.residuals)
+    alike = [] if result.residuals is None else _tied_rank_findings(search, result.residuals)
     findings = unique([*alike, *result.findings])
     return replace(search, verdict=result.verdict, model_findings=findings, best=result)
 
@@ -184,7 +184,7 @@ def identification_of_searches(
     return assess_fit(fit_at_best_orders(Task(tuple(runs), structure, order_grid), settings, m, searches))
 
 
-def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:
+def _tied_rank_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:
     """Return a finding on table rows whose score is not significantly larger than the score of rank 1.
 
     Consider N independent residuals and k free orders. The sum of squares at the true orders exceeds that at the best

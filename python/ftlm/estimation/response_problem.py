@@ -322,7 +322,7 @@ MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120
 
 def initial_guesses(problem: ResponseProblem) -> list[Floats]:
     """Return feasible initial guesses, most promising first."""
-    points = _points(problem)
+    points = _order_delay_grid(problem)
     guesses = _linear_coefficients(problem, points) if problem.coefficients else list(points)
     candidates = []
     for values in guesses:
@@ -345,7 +345,7 @@ def initial_guesses(problem: ResponseProblem) -> list[Floats]:
     return distinct_guesses
 
 
-def _points(problem: ResponseProblem) -> Floats:
+def _order_delay_grid(problem: ResponseProblem) -> Floats:
     """Return feasible grid points of orders and delays, of shape (points, parameters); coefficients are 0."""
     axes = list(problem.search_ranges().values())
     has_values = [n in problem.structure.order_values for n in problem.orders]
@@ -368,8 +368,8 @@ def _points(problem: ResponseProblem) -> Floats:
         orders = np.stack(columns, axis=1)
     else:
         sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, has_values, strict=True)]
-        orders = _product(sides)
-    late = _product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
+        orders = _cartesian_product(sides)
+    late = _cartesian_product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
     table = np.zeros((len(orders) * len(late), len(problem.names)))
     table[:, :count] = np.repeat(orders, len(late), axis=0)
     table[:, len(problem.names) - len(delays) :] = np.tile(late, (len(orders), 1))
@@ -379,7 +379,7 @@ def _points(problem: ResponseProblem) -> Floats:
     return points
 
 
-def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
+def _cartesian_product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
     """Return the Cartesian product of grid axes, of shape (points, axes)."""
     rows = list(itertools.product(*sides))
     return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
@@ -415,7 +415,9 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
         records = [r for r in problem.records if r.output == i]
         if not records:
             continue
-        answers, cost = _equation(problem, i, names, [_subsample_record(r) for r in records], points, corners)
+        answers, cost = _equation_coefficients(
+            problem, i, names, [_subsample_record(r) for r in records], points, corners
+        )
         for k, name in enumerate(names):
             table[:, problem.names.index(name)] = answers[:, k]
         total += np.where(np.isfinite(cost), cost, np.inf)
@@ -448,7 +450,7 @@ def _subsample_record(record: ResponseRecord) -> ResponseRecord:
     )
 
 
-def _equation(
+def _equation_coefficients(
     problem: ResponseProblem,
     place: int,
     names: Sequence[str],
@@ -490,7 +492,7 @@ def _equation(
     goal, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
     matrix = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
     denominator_parts = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
-    slowest = _slowest(problem, item, points)
+    slowest = _slowest_output_term(problem, item, points)
     bottom = 1.0 + np.abs(powers) + 0j
     answers = np.zeros((len(points), len(names)))
     cost = np.full(len(points), np.inf)
@@ -515,7 +517,7 @@ def _equation(
     return answers, cost
 
 
-def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
+def _slowest_output_term(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
     """Return the coefficient of the output term that dominates at low frequencies, and its order difference.
 
     The difference is alpha minus the order of the term at each point. Only terms with a free coefficient are

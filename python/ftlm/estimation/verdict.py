@@ -237,7 +237,7 @@ def result_findings(result: Identification) -> Iterator[Finding]:
 
 def _against_result(result: Identification) -> Iterator[Finding]:
     codes = {f.code for f in result.findings}
-    yield from _free_runs(result)
+    yield from _simulation_findings(result)
     errors, joint = result.standard_errors, result.joint
     yield from (f for f in result.findings if f.code == "simulation_chaotic")
     unidentifiable = [n for n, e in errors.items() if not math.isfinite(e)]
@@ -247,7 +247,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
         )
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.kind.names_missing_part)
-    yield from _residuals(result)
+    yield from _residual_findings(result)
     if joint is not None and not joint.converged and "not_converged" not in codes:
         yield make_finding("not_converged")
     uncertain = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
@@ -271,7 +271,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
         yield make_finding("no_standard_errors")
 
 
-def _free_runs(result: Identification) -> Iterator[Finding]:
+def _simulation_findings(result: Identification) -> Iterator[Finding]:
     """Yield findings about the simulation: overflow, instability, poor fit, unstable plant."""
     plant = [f for f in result.findings if f.code in UNSTABLE_PLANT_CODES]
     yield from plant
@@ -367,7 +367,7 @@ def _poor_fits(where: str, comparison: Comparison, reported: Sequence[str] = ())
     If no output exceeds the limit over all runs, each run is tested by itself, because runs with large signals dominate
     the total. NR is the normalized residual. `reported` are outputs that are not tested.
     """
-    for run, errors in _each(comparison):
+    for run, errors in _errors_by_run(comparison):
         poor_outputs = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in reported]
         if poor_outputs:
             text = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in poor_outputs)
@@ -375,7 +375,7 @@ def _poor_fits(where: str, comparison: Comparison, reported: Sequence[str] = ())
             return
 
 
-def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
+def _errors_by_run(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
     """Yield ("", output error over all runs), then (name, output error) of each run if there are several."""
     yield "", comparison.output_error
     if len(comparison.per_run) > 1:
@@ -390,7 +390,7 @@ def _on(run: str) -> str:
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
     """Yield one finding for each output whose fit on validation runs is far below its fit on estimation runs."""
     found: set[str] = set()
-    for run, errors in _each(validation):
+    for run, errors in _errors_by_run(validation):
         for output, figures in errors.items():
             if output not in estimation_fits or output in found:
                 continue
@@ -404,7 +404,7 @@ def _validation_losses(estimation_fits: Mapping[str, float], validation: Compari
                 found.add(output)
 
 
-def _residuals(result: Identification) -> Iterator[Finding]:
+def _residual_findings(result: Identification) -> Iterator[Finding]:
     """Yield findings on failed residual tests: correlation with an input, feedback, color."""
     if result.residuals is None:
         if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):

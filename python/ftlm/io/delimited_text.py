@@ -201,11 +201,11 @@ def parse_text(
     blocks = _line_blocks(path, stream, encoding)
     # Sheets have no comment lines.
     mark = "#" if sheet is None else "\0"
-    head, sample, remark = _sample(blocks, layout, mark)
+    head, sample, remark = _first_lines(blocks, layout, mark)
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that contains a record")
     dialect = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
-    dialect = _with_gaps(dialect, head, sample, layout, sheet=sheet is not None)
+    dialect = _dialect_with_empty_rows(dialect, head, sample, layout, sheet=sheet is not None)
     rows = _Rows(dialect, sheet is not None)
     for first, lines in itertools.chain(head, blocks):
         _read_block(rows, first, lines, mark, source)
@@ -225,7 +225,7 @@ def parse_text(
     return FileTable(path, columns, True, header, layout=what.under(dialect.layout), assumed=assumed, kind=kind)
 
 
-def _with_gaps(
+def _dialect_with_empty_rows(
     dialect: TableDialect,
     head: list[tuple[int, list[str]]],
     sample: list[tuple[int, str]],
@@ -264,7 +264,7 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
     return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)!r})")
 
 
-def _sample(
+def _first_lines(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
     """Return the first blocks, the lines from which the layout is detected, and the last comment above these lines.

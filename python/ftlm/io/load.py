@@ -216,7 +216,7 @@ def run_from_tables(
 
     given_inputs = gather(selection.inputs, blank=policy == "hold")
     given_outputs = gather(selection.outputs, blank=policy != "refuse")
-    clock = _clock(selection, pool, used_columns, options, policy)
+    clock = _time_column(selection, pool, used_columns, options, policy)
     name = options.name
     if name is None:
         stem = base_name(tables[0].path)
@@ -259,7 +259,7 @@ class _TimeColumn:
     notes: tuple[str, ...] = ()
 
 
-def _clock(
+def _time_column(
     selection: ColumnSelection, pool: ColumnTable, columns: list[Column], options: LoadOptions, policy: MissingPolicy
 ) -> _TimeColumn:
     unit_option = options.time_unit

@@ -547,28 +547,28 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
             while at < block.last:
                 piece = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
                 began = time.monotonic()
-                outcomes = self.search.evaluate_spans(self._cut(piece), self.threads, None)
+                outcomes = self.search.evaluate_spans(self._candidate_spans(piece), self.threads, None)
                 self.throughput.update(time.monotonic() - began, piece.last - piece.first)
                 yield piece, outcomes
                 at = piece.last
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function that evaluates a block of candidates in a worker process, followed by its arguments."""
-        return evaluate_candidates, self.key, self.payload(block), self._cut(block), self.threads
+        return evaluate_candidates, self.key, self.payload(block), self._candidate_spans(block), self.threads
 
-    def _cut(self, block: CandidateBlock) -> list[Span]:
+    def _candidate_spans(self, block: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans (equation, first index, exclusive end, limit of the score).
 
         Indices in a span count the candidates of its equation. Indices of a block count the candidates of all spans of
         all batches consecutively.
         """
-        cut, at = [], self._first
+        spans, at = [], self._first
         for equation, start, end, limit in self._spans:
             low, high = max(block.first - at, 0), min(block.last - at, end - start)
             if low < high:
-                cut.append((equation, start + low, start + high, limit))
+                spans.append((equation, start + low, start + high, limit))
             at += end - start
-        return cut
+        return spans
 
     def frame(self, number: int, block: CandidateBlock, piece: Outcomes) -> Verdicts:
         """Return the checkpoint record with the outcomes of a block of candidates."""

@@ -349,7 +349,7 @@ class Store:
         self.notes: list[str] = []
         self._last = time.monotonic()
         #: Records that are not written yet, and the failures written last, by (search, first round of the block).
-        self._waiting: dict[tuple[int, int], PartialRounds] = {}
+        self._queued_checkpoints: dict[tuple[int, int], PartialRounds] = {}
         self._failures: dict[tuple[int, int], Failures | None] = {}
         self._file = CheckpointFile(path, "search", "resume" if requests is None else "create")
         try:
@@ -407,11 +407,11 @@ class Store:
         """
         if checkpoint is not None:
             (*place, order), restarted, (rows, counts, failures) = checkpoint
-            rounds_before = self._waiting.get((search, first))
+            rounds_before = self._queued_checkpoints.get((search, first))
             rows = (*(rounds_before.rows if rounds_before else ()), *rows)
             restarted = restarted or (rounds_before is not None and rounds_before.restarted)
             checkpoint_place = cast("Place", tuple(place))
-            self._waiting[search, first] = PartialRounds(
+            self._queued_checkpoints[search, first] = PartialRounds(
                 search, first, last, checkpoint_place, rows, counts, failures, order, restarted
             )
         if time.monotonic() - self._last >= FLUSH_INTERVAL_S:
@@ -420,17 +420,17 @@ class Store:
     def flush(self) -> None:
         """Write all queued records to the file."""
         due = []
-        for key, frame in self._waiting.items():
+        for key, frame in self._queued_checkpoints.items():
             same = not frame.restarted and self._failures.get(key) == frame.failures
             due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
             self._failures[key] = frame.failures
-        self._waiting.clear()
+        self._queued_checkpoints.clear()
         if due:
             self._append(due)
 
     def append_block(self, frame: Rounds | Verdicts) -> None:
         """Write the record of a complete block to the file, and remove its queued partial results."""
-        self._waiting.pop((frame.search, frame.first), None)
+        self._queued_checkpoints.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
         self._append([frame])
 
@@ -452,5 +452,5 @@ class Store:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and issubclass(kind, DataError):
             # After a failed write, pending writes would fail too and hide the cause.
-            self._waiting.clear()
+            self._queued_checkpoints.clear()
         self.close()

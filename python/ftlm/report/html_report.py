@@ -468,7 +468,7 @@ def _search_sections(result: Identification) -> list[Section]:
     A section that does not apply to the method of the result is omitted.
     """
     sections = []
-    traces = _traces(result)
+    traces = _recursion_error_charts(result)
     if traces:
         words = (
             "Error (45) of the simulation after every step of the recursion, at the orders found. p weighs the data "
@@ -492,11 +492,11 @@ def _order_search_sections(result: Identification) -> list[Section]:
     if not result.searches:
         return []
     tops = [search_top(name, search) for name, search in result.searches.items()]
-    maps = [] if result.task is None else _maps(result.task, result.searches)
+    maps = [] if result.task is None else _score_charts(result.task, result.searches)
     return [Section("Order search", tables=[*tops, search_summary(result.searches)], figures=maps, small=True)]
 
 
-def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
+def _score_charts(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     """Return charts of the score over each order, and over two orders for searches that vary two or more."""
     maps: list[Figure] = []
     for name, search in searches.items():
@@ -508,7 +508,7 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     return maps
 
 
-def _traces(result: Identification) -> list[LineChart]:
+def _recursion_error_charts(result: Identification) -> list[LineChart]:
     """Return charts of the error of the multi-innovation recursion at the identified orders, one per equation.
 
     The lines are for the innovation lengths p of the paper and of the result. The list is empty for other methods,

@@ -35,7 +35,7 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
     lines = [*wrap_text(str(judgement)), ""]
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
-    lines += [*fit_lines(result, validation), *_residuals(result), *_starts(result)]
+    lines += [*fit_lines(result, validation), *_residuals(result), *_initial_condition_lines(result)]
     if validation is not None and (terms := describe_initial_terms(validation)):
         lines += wrap_text(f"initial terms and levels of validation runs, estimated on them (their number): {terms}")
     lines += finding_lines(result.findings)
@@ -181,7 +181,7 @@ def _residuals(result: Identification) -> list[str]:
     return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
 
 
-def _starts(result: Identification) -> list[str]:
+def _initial_condition_lines(result: Identification) -> list[str]:
     """Return text lines on offsets without an estimate, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     hidden = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)

@@ -125,7 +125,7 @@ def _number_math(value: float | Exact) -> Markup:
     return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
 
 
-def _short(value: float) -> Exact:
+def _rounded_number(value: float) -> Exact:
     """Return a delay or limit rounded to six significant digits, as a number that is displayed with all its digits."""
     return Exact(f"{value:.6g}")
 
@@ -141,11 +141,11 @@ def _symbol_math(name: str) -> Markup:
 def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[InputNonlinearity] = ()) -> Markup:
     text = _symbol_math(signal)
     if delay:
-        text += _DELAYED_TIME.format("−" if delay > 0 else "+", _number_math(_short(abs(delay))), THIN_SPACE)
+        text += _DELAYED_TIME.format("−" if delay > 0 else "+", _number_math(_rounded_number(abs(delay))), THIN_SPACE)
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
             text = _LIMITED_INPUT.format(
-                INPUT_EFFECT_ABBREVIATIONS[limit.law], text, _number_math(_short(float(limit.value)))
+                INPUT_EFFECT_ABBREVIATIONS[limit.law], text, _number_math(_rounded_number(float(limit.value)))
             )
     operator = _operator_math(order)
     return Markup("{}{}{}").format(operator, THIN_SPACE, text) if operator else text
@@ -174,7 +174,7 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
     match item.operation:
         case "constant":
             sign = Markup("<mo>−</mo>") if item.value < 0 else Markup("")
-            return sign + _number_math(_short(abs(item.value)))
+            return sign + _number_math(_rounded_number(abs(item.value)))
         case "channel":
             return _derivative_math(Order(item.value), item.signal, delay.get(item.signal, 0.0), limits)
     parts = [_expression_math(argument, delay, limits) for argument in item.arguments]

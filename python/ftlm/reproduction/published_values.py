@@ -316,7 +316,7 @@ class AsPrinted:
         return {"closest settings": str(self.reading)} | attributes(self, (*fit, "rank", "among", "best"))
 
 
-class _Angle:
+class _AngleRegression:
     """Regressors of one angle at any orders, and coefficients by the closed form of eq. (44) of the paper.
 
     `angles` has the block-pulse means of both angles of the joint, and `current` has the block-pulse means of the motor
@@ -426,12 +426,15 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
         behind = behind * float(np.std(plain_angles[deflection])) / float(np.std(behind))
         angles_by_filter = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
         current = own.of(f"I{stage}")
-        angles = {filtered: _Angle(series, current, output, own.step) for filtered, series in angles_by_filter.items()}
-        readings[output] = _nearest(output, angles, scales[output])
+        angles = {
+            filtered: _AngleRegression(series, current, output, own.step)
+            for filtered, series in angles_by_filter.items()
+        }
+        readings[output] = _closest_recomputation(output, angles, scales[output])
     return readings
 
 
-def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
+def _closest_recomputation(output: str, angles: Mapping[bool, _AngleRegression], scale: float) -> AsPrinted:
     """Return the recomputed table of an angle that is closest to the printed one, over all interpretations.
 
     `angles` has the regressors without and with the sensor filter. The filter is tried for deflections only.
@@ -473,7 +476,7 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
 
 
 def _rank_orders(
-    angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
+    angle: _AngleRegression, reading: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
     """Rank the printed orders beta, gamma and mu among all orders of a grid, by the sum of absolute equation errors.
 

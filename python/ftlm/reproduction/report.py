@@ -201,7 +201,7 @@ def _fits_chart(
     return [fit_chart(present, output, title, caption, simulated=simulated)]
 
 
-def _beside_integer(stage: Stage) -> dict[str, Candidate]:
+def _comparison_models(stage: Stage) -> dict[str, Candidate]:
     """Return the models in the paper's Figures 6, 9 and 10, by label.
 
     They are the integer-order model of the manufacturer's manual, multi-innovation with innovation length 7, and output
@@ -226,7 +226,7 @@ def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
         number = f"{first + 2}({letter})"
-        figures += _fits_chart(_beside_integer(stage), output, number, sine=False, simulated=simulated)
+        figures += _fits_chart(_comparison_models(stage), output, number, sine=False, simulated=simulated)
     return figures
 
 
@@ -240,7 +240,7 @@ def sine_figures(reproduction: Reproduction) -> list[Figure]:
         figure
         for stage, output in reproduction.angles
         for figure in _fits_chart(
-            _beside_integer(stage), output, _place(10, output), sine=True, simulated=reproduction.simulated
+            _comparison_models(stage), output, _place(10, output), sine=True, simulated=reproduction.simulated
         )
     ]
 

@@ -289,7 +289,7 @@ class ArmParameters:
         return _core.VirtualArm(links, sensors, step, MAX_SUBSTEP_S, horizon)
 
 
-def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
+def _optional_toml_keys(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
     """Return the fields of a dataclass, except `name`, as (name, type, default) of optional keys of a TOML file.
 
     `replaced` are the types of additional keys, and of keys whose type in the file differs from that of the field.
@@ -298,9 +298,11 @@ def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
 
 
-_StageFile = msgspec.defstruct("StageFile", _optional(StageParameters), forbid_unknown_fields=True)
+_StageFile = msgspec.defstruct("StageFile", _optional_toml_keys(StageParameters), forbid_unknown_fields=True)
 _ArmFile = msgspec.defstruct(
-    "ArmFile", _optional(ArmParameters, stage1=_StageFile, stage2=_StageFile, base=str), forbid_unknown_fields=True
+    "ArmFile",
+    _optional_toml_keys(ArmParameters, stage1=_StageFile, stage2=_StageFile, base=str),
+    forbid_unknown_fields=True,
 )
 
 

@@ -125,7 +125,7 @@ def control(
         )
     controller = _of_both_joints(controller)
     rate = _rate_of(controller, rate)
-    path = _numbers(reference)
+    path = _reference_array(reference)
     if duration is None:
         if path.ndim == 1:
             raise ModelError(
@@ -139,7 +139,7 @@ def control(
     def loop(board: Board) -> ControllerSource:
         own = getattr(board, "parameters", None)
         travel = own.travel if isinstance(own, ArmParameters) else DEFAULT_TRAVEL_RAD
-        rows = _rows(path, round(duration * rate) + 1, rate, travel)
+        rows = _reference_per_sample(path, round(duration * rate) + 1, rate, travel)
         reset = getattr(controller, "reset", None)
         if callable(reset):
             reset()
@@ -291,7 +291,7 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
     return np.array([values]), ""
 
 
-def _numbers(reference: ArrayLike) -> Floats:
+def _reference_array(reference: ArrayLike) -> Floats:
     """Return the reference as an array of shape (rows, 2) or (2,); raise DataError for any other shape or type."""
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
@@ -302,7 +302,7 @@ def _numbers(reference: ArrayLike) -> Floats:
     return np.array(raw, dtype=np.float64)
 
 
-def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
+def _reference_per_sample(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
     """Return the reference [rad] with one row per sample, shape (rows, 2); a pair of angles is repeated.
 
     Raise DataError for another number of rows or a value that is not finite. Raise ModelError if an angle exceeds the

@@ -159,7 +159,7 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
         # A constant output gives no evidence, for example in a run that is only an input for a simulation.
         return None
-    moves = [_rows_of_change(run[n]) for n in inputs]
+    moves = [_change_indices(run[n]) for n in inputs]
     quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
     if quiet >= START_SETTINGS.quiet_rows:
         levels = {}
@@ -171,15 +171,14 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
             rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
             if rows.size < START_SETTINGS.quiet_rows or not _is_at_rest(rows, noise):
                 return None
-            if has_held_input and noise * run.length / _slope_weight(rows.size) > START_SETTINGS.drift_share * float(
-                np.nanstd(run[name])
-            ):
+            drift_error = noise * run.length / _noise_to_slope_error_ratio(rows.size)
+            if has_held_input and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
                 return None
             levels[name] = float(np.mean(rows))
             size = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
             visible |= abs(levels[name]) > size
         return RestEvidence(quiet, levels, {n: float(run[n][0]) for n in inputs}, visible)
-    constant = all(_rows_of_change(run[n][1:]).size == 0 for n in inputs)
+    constant = all(_change_indices(run[n][1:]).size == 0 for n in inputs)
     if not constant or not any(np.any(run[n][1:]) for n in inputs):
         return None
     first = {n: float(drop_missing(run[n])[0]) for n in outputs}
@@ -221,7 +220,7 @@ def noise_at_start(samples: Floats) -> float:
     return max(noise, START_SETTINGS.least_noise * float(np.nanstd(samples)))
 
 
-def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
+def _change_indices(samples: Floats) -> NDArray[np.intp]:
     """Return the indices of samples that differ from the first one."""
     return np.flatnonzero(np.abs(samples - samples[0]) > START_SETTINGS.rounding * float(np.max(np.abs(samples))))
 
@@ -230,7 +229,7 @@ def _is_at_rest(rows: Floats, noise: float) -> bool:
     """Whether slope and standard deviation of samples are consistent with white noise of standard deviation `noise`."""
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
-    limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
+    limits = noise / _noise_to_slope_error_ratio(rows.size), noise / math.sqrt(2.0 * rows.size)
     return abs(slope) <= START_SETTINGS.sigmas * limits[0] and scatter <= noise + START_SETTINGS.sigmas * limits[1]
 
 
@@ -241,7 +240,7 @@ def _without_outliers(rows: Floats, noise: float) -> Floats:
     return rows[near] if np.count_nonzero(~near) <= few else rows
 
 
-def _slope_weight(rows: int) -> float:
+def _noise_to_slope_error_ratio(rows: int) -> float:
     """Return the ratio of the noise standard deviation to the standard error of a least-squares slope per sample.
 
     The line is fitted to `rows` samples.

@@ -200,7 +200,7 @@ class EquationParser(TokenReader):
 
     def _item(self, sign: float) -> list[ParsedTerm]:
         """Parse a product, or a number times a sum in parentheses, and return its terms."""
-        factor = self._numbers(sign)
+        factor = self._numeric_factor(sign)
         name: str | None = None
         if self._next_is("(") and not self._is_expression_group():
             self._take()
@@ -242,7 +242,7 @@ class EquationParser(TokenReader):
             "term"
         )
 
-    def _numbers(self, factor: float) -> float:
+    def _numeric_factor(self, factor: float) -> float:
         """Parse numbers at the start of a product, and return `factor` times these numbers."""
         while self._peek()[0] == "number":
             factor *= float(self._take()[1])
@@ -673,13 +673,13 @@ class EquationParser(TokenReader):
 
     def _transfer(self) -> None:
         """Parse transfer functions, multiply the equation by all denominators, and store the terms of both sides."""
-        output = self._transform()
-        common = self._transform() if self._accept("/") else None
+        output = self._laplace_signal()
+        common = self._laplace_signal() if self._accept("/") else None
         self._expect("=")
         paths: list[tuple[SymbolicPolynomial, SymbolicPolynomial, str]] = []
         for sign in self._signs():
             top, bottom, delay, inner = self._ratio(common)
-            signal = common or inner or self._transform()
+            signal = common or inner or self._laplace_signal()
             self.delays[signal] = delay
             if any(signal == other for _, _, other in paths):
                 raise self._error(f"{signal} occurs twice; combine its terms into one transfer function")
@@ -700,7 +700,7 @@ class EquationParser(TokenReader):
                 scaled = scaled if bottom == own else self._times(scaled, bottom)
             self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
-    def _transform(self) -> str:
+    def _laplace_signal(self) -> str:
         """Parse a signal, with or without ``(s)`` after it, and return its name."""
         kind, value, _ = self._peek()
         if kind != "name":
@@ -725,7 +725,7 @@ class EquationParser(TokenReader):
             if value in ("e", "exp") and symbols[0] in ("^", "("):
                 delay = self._exponential()
             elif not (common or signal or divides) and value != "sqrt" and symbols == ["(", "s", ")"]:
-                signal = self._transform()
+                signal = self._laplace_signal()
             elif not divides and self._ends_ratio(kind, value, symbols, is_named=common is None and signal is None):
                 return top, bottom, delay, signal
             elif not divides and (kind == "end" or value in "+-"):

@@ -372,10 +372,10 @@ class Structure:
                 continue
             if len(together) == len(self.equations):
                 return {"stage": self}
-            out[", ".join(e.output for e in together)] = self._of(tuple(together), self.coupling)
+            out[", ".join(e.output for e in together)] = self._substructure(tuple(together), self.coupling)
         return out
 
-    def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
+    def _substructure(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
         """Return a structure of only the given equations, with the given coupling and without coefficient laws."""
         name = f"{self.name}, {', '.join(e.output for e in equations)}"
         return restrict_structure(self, equations, coupling=coupling, coefficient_law=(), name=name)
@@ -405,7 +405,7 @@ class Structure:
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
         single = replace(own, terms=tuple(free_order(k, t) for k, t in enumerate(own.terms)))
-        return self._of((single,), "measured")
+        return self._substructure((single,), "measured")
 
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Return the structure with some free orders fixed or with new grid values; see :func:`parse_values`.

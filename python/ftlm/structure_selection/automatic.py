@@ -243,7 +243,7 @@ class AutomaticSelection:
             return self._fit([IntegerOrderForm(n, 0, offset=o) for n in range(1, MAX_ORDER + 1) for o in FREE_OFFSETS])
         probe = IntegerOrderForm(2, 1)
         probes = self._fit([probe, replace(probe, offset="level")])
-        offset = "level" if _gain(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
+        offset = "level" if _bic_decrease(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
         forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
         fits = self._fit_delayed(self._fit_zeros(forms, probes), offset)
         self.feedback = self._inputs_in_loop(fits)
@@ -385,7 +385,8 @@ class AutomaticSelection:
         fitted with a delay.
         """
         form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
-        y, end, frequency = self.problem.output, self.problem.suffix, _frequency(fits, form.offset, self.problem.suffix)
+        y, end = self.problem.output, self.problem.suffix
+        frequency = _natural_frequency(fits, form.offset, end)
         drivers = self.problem.numbered_drivers
         highest, own = f"D^alpha{end} {y}", f"a0{end} {y}"
         damping = f"a1{end} D^mu{end} {y}"
@@ -464,14 +465,14 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     return [f for f in dict.fromkeys(forms) if f.zeros >= 0 and f.order > 0]
 
 
-def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
+def _bic_decrease(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
     """Return by how much a property lowers the lowest BIC of all forms; 0 if no form has the property."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
-def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
+def _natural_frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
     """Return the natural frequency [rad/s] of an underdamped form of order 2.
 
     Without such a form, return the pole frequency of a form of order 1, or else 1.

@@ -203,16 +203,16 @@ class NestedStructures:
     def _owns(self, term: Term) -> bool:
         return any(term in e.terms and term.column == e.output for e in self.structure.equations)
 
-    def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
+    def _with_own_terms(self, highest_order_values: Mapping[str, float]) -> Variant | None:
         """Return the variant with all output terms at distinct integer orders and all mandatory terms; None if invalid.
 
-        `top` are the integer values of the highest orders by name.
+        `highest_order_values` are the integer values of the highest orders by name.
         """
         droppable = self.droppable
-        whole: dict[str, float] = dict(top)
+        whole: dict[str, float] = dict(highest_order_values)
         names_used: list[str] = []
         for item in self.structure.equations:
-            highest = top.get(item.order.names[0]) if item.order.is_single else item.order.constant
+            highest = highest_order_values.get(item.order.names[0]) if item.order.is_single else item.order.constant
             values_used = {t.order.constant for t in item.terms if t.column == item.output and not t.order.names}
             for term in item.terms:
                 if term.order.is_single and term.order.names[0] in whole:

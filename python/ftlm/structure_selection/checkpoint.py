@@ -171,12 +171,12 @@ class Store:
                 payloads = [RECORD_ENCODER.encode(request)]
                 self._file.append(payloads)
             for number, payload in enumerate(payloads, 1):
-                self._take(number, payload, request)
+                self._load_record(number, payload, request)
         except BaseException:
             self._file.close()
             raise
 
-    def _take(self, number: int, payload: bytes, request: Request) -> None:
+    def _load_record(self, number: int, payload: bytes, request: Request) -> None:
         """Compare the first record with the request, or store the result in any other record for later use.
 
         `number` is the number of the record and `payload` its content.
@@ -214,7 +214,7 @@ class Store:
         if difference is not None:
             raise DataError(f"store {path} contains a selection {difference}; choose another file")
 
-    def _expect(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
+    def _check_result_type(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
         """Return a stored result if its type is `kind`, otherwise raise DataError.
 
         `description` is the name of the expected result in the message.
@@ -269,7 +269,11 @@ class Store:
             return StoredFit.of(result) if isinstance(result, JointFit) else FitError.of(result)
 
         def read(answer: Answer) -> JointFit | FtlmError:
-            return answer.error() if isinstance(answer, FitError) else self._expect(answer, StoredFit, "a fit").fit()
+            return (
+                answer.error()
+                if isinstance(answer, FitError)
+                else self._check_result_type(answer, StoredFit, "a fit").fit()
+            )
 
         return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
 
@@ -279,7 +283,7 @@ class Store:
         """Return the stored or computed trial of a fitted candidate on validation data."""
 
         def read(answer: Answer) -> Trial:
-            trial = self._expect(answer, StoredTrial, "a validation").trial
+            trial = self._check_result_type(answer, StoredTrial, "a validation").trial
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
@@ -293,7 +297,7 @@ class Store:
         """Return the stored or computed result of the best-subset search."""
 
         def read(answer: Answer) -> list[ScreenedSubset]:
-            return self._expect(answer, StoredSubsets, "subsets").subsets
+            return self._check_result_type(answer, StoredSubsets, "subsets").subsets
 
         return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, read)
 

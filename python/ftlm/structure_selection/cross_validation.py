@@ -193,7 +193,7 @@ class Folds:
             others = as_runs(validation)
             as_runs([*every, *others])
             for run in others:
-                if any(_same(run, estimation_run) for estimation_run in every):
+                if any(_have_equal_samples(run, estimation_run) for estimation_run in every):
                     raise ModelError(
                         f"validation run {run.name} is also an estimation run, so it does not validate the model; "
                         f"leave it out of one of the two, or use {parameter('validation', 'runs')}"
@@ -231,7 +231,7 @@ class Folds:
         return replace(folds, description=words, split=(runs, duration))
 
 
-def _same(one: Run, other: Run) -> bool:
+def _have_equal_samples(one: Run, other: Run) -> bool:
     """Whether two runs have equal samples."""
     names = one.signals
     return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)

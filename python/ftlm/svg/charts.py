@@ -299,7 +299,7 @@ class PlaneChart(Figure):
         plot = PlotArea(left, top, w, h, frame)
         box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
         view = " ".join(f"{v:.1f}" for v in box.values())
-        x, y = _places(plot, [0])[0]
+        x, y = _pixel_coordinates(plot, [0])[0]
         through = faint_path(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
         curves = self._crosses(plot) if self.line is None else self._locus(plot, self.line)
         texts = plot.labels((x_ticks, y_ticks), (self.x_label, self.y_label), width)
@@ -321,18 +321,18 @@ class PlaneChart(Figure):
 
     def _crosses(self, plot: PlotArea) -> list[Markup]:
         outline = self.sector_outline((plot.frame[1] + plot.frame[3]) / 2)
-        sector = path_data(_places(plot, outline)) + "Z"
+        sector = path_data(_pixel_coordinates(plot, outline)) + "Z"
         curves = [element("path", class_="shade1", fill=LINE_STYLES[1][0], fill_opacity="0.16", d=sector)]
-        curves.append(stroke_path(1, _places(plot, [outline[1], 0, outline[-1]]), 1.2, dashes="5 3"))
+        curves.append(stroke_path(1, _pixel_coordinates(plot, [outline[1], 0, outline[-1]]), 1.2, dashes="5 3"))
         c = CROSS_HALF_SIZE_PX
         strokes = f"l{2 * c} {2 * c}m0 {-2 * c}l{-2 * c} {2 * c}"
-        crosses = (f"M{x - c:.1f} {y - c:.1f}{strokes}" for x, y in _places(plot, self.values))
+        crosses = (f"M{x - c:.1f} {y - c:.1f}{strokes}" for x, y in _pixel_coordinates(plot, self.values))
         stroke = {"class_": "line2", "fill": "none", "stroke": LINE_STYLES[2][0], "stroke_width": "2.2"}
         return curves + [element("path", **stroke, d=data) for data in crosses]
 
     def _locus(self, plot: PlotArea, line: Complex) -> list[Markup]:
-        curves = [stroke_path(1, _places(plot, line))] if line.size else []
-        return curves + [_dot(x, y) for x, y in _places(plot, self.values)]
+        curves = [stroke_path(1, _pixel_coordinates(plot, line))] if line.size else []
+        return curves + [_dot(x, y) for x, y in _pixel_coordinates(plot, self.values)]
 
 
 def _dot(x: float, y: float) -> Markup:
@@ -341,7 +341,7 @@ def _dot(x: float, y: float) -> Markup:
     return element("circle", **stroke, cx=x, cy=y, r=DOT_RADIUS_PX)
 
 
-def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
+def _pixel_coordinates(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
     """Return the (x, y) pixel coordinates of complex values, limited to [-10000, 10000]."""
     points = np.asarray(values, dtype=np.complex128)
     xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(points.real), plot.y_pixels(points.imag)))
@@ -440,7 +440,7 @@ class Landscape(Figure):
         w, h = width - left - max(14.0, LETTER_WIDTH_PX * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
         cell_w, cell_h, bottom = w / columns, h / rows, top + h
         out = []
-        for i, row in enumerate(_classes(self.scores, *score_range).tolist()):
+        for i, row in enumerate(_color_indices(self.scores, *score_range).tolist()):
             j = 0
             # Adjacent cells of a row with equal color are drawn as one rectangle.
             for step, alike in groupby(row):
@@ -469,7 +469,7 @@ class Landscape(Figure):
         return svg(width, round(bottom + below), self.title, described, out, narrow=narrow)
 
 
-def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
+def _color_indices(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
     """Return the index into HEAT_COLORS of each score, on a logarithmic scale; -1 for pairs without a score."""
     first, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -101,11 +101,13 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     file = check_new(path, force=force)
     try:
         # The file is in the same folder, because a rename cannot cross file systems. File names have a maximum length.
-        beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
+        temporary_file = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
         status = _link_status(file)
         # O_EXCL does not follow a link that another program created. The permissions are the default of a new file, or
         # those of the file that is overwritten, from the first byte on.
-        descriptor = os.open(beside, _NEW_FILE_FLAGS, 0o666 if status is None else stat.S_IMODE(status.st_mode) & 0o777)
+        descriptor = os.open(
+            temporary_file, _NEW_FILE_FLAGS, 0o666 if status is None else stat.S_IMODE(status.st_mode) & 0o777
+        )
         try:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(content)
@@ -114,18 +116,18 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
                     os.fchmod(stream.fileno(), stat.S_IMODE(status.st_mode) & 0o777)
                 os.fsync(stream.fileno())
             if force:
-                os.replace(beside, file)
+                os.replace(temporary_file, file)
             else:
-                _move_exclusively(beside, file)
+                _move_exclusively(temporary_file, file)
         except FileExistsError:
             with contextlib.suppress(OSError):
-                beside.unlink()
+                temporary_file.unlink()
             # Another program created the file after the check.
             check_new(file, force=False)
             raise
         except BaseException:
             with contextlib.suppress(OSError):
-                beside.unlink()
+                temporary_file.unlink()
             raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
@@ -147,17 +149,17 @@ def check_ending(path: str | os.PathLike[str], ending: str) -> None:
         raise ModelError(f"{path} does not end in {ending}; use this extension")
 
 
-def _move_exclusively(beside: Path, file: Path) -> None:
-    """Rename the file `beside` to `file`, which must not exist; raise FileExistsError if it exists."""
+def _move_exclusively(temporary_file: Path, file: Path) -> None:
+    """Rename the file `temporary_file` to `file`, which must not exist; raise FileExistsError if it exists."""
     try:
-        os.link(beside, file, follow_symlinks=False)
+        os.link(temporary_file, file, follow_symlinks=False)
     except FileExistsError:
         raise
     except (OSError, NotImplementedError):
         # On file systems without hard links, an empty file reserves the name.
         os.close(os.open(file, _NEW_FILE_FLAGS, 0o666))
         try:
-            os.replace(beside, file)
+            os.replace(temporary_file, file)
         except BaseException:
             with contextlib.suppress(OSError):
                 file.unlink()
@@ -165,7 +167,7 @@ def _move_exclusively(beside: Path, file: Path) -> None:
     else:
         # The file is complete even if its temporary name cannot be deleted.
         with contextlib.suppress(OSError):
-            beside.unlink()
+            temporary_file.unlink()
 
 
 #: Maximum length of a name in a message, and maximum size of a model, controller or settings file (usually kilobytes).

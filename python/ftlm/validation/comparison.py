@@ -338,7 +338,7 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
     for run, sampled, rec in zip(runs, free, full, strict=True):
         outputs = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
-        parts.append(_run_errors(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
+        parts.append(_run_signals(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
     result = _pooled_comparison(model, runs, parts, m, times, sampled=True)
     findings = list(result.findings)
@@ -366,7 +366,7 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
     parts = []
     for free, full in pairs:
         responses, initial = simulate_record(model, free)
-        parts.append(_run_errors(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
+        parts.append(_run_signals(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
     middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
     return _pooled_comparison(model, several, parts, m, middles, sampled=False)
 
@@ -446,7 +446,7 @@ def describe_initial_terms(comparison: Comparison) -> str:
 
 
 @dataclass(frozen=True)
-class _RunErrors:
+class _RunSignals:
     """Signals of one run from which its error metrics are computed, by output.
 
     Output error: ``simulated`` and ``measured``. Equation error: residuals ``equation_errors`` of the equations, and
@@ -462,7 +462,7 @@ class _RunErrors:
     equation_errors: dict[str, Floats]
 
 
-def _run_errors(
+def _run_signals(
     model: Model,
     full: Record,
     simulated: dict[str, Floats],
@@ -470,7 +470,7 @@ def _run_errors(
     initial: dict[str, dict[float, float]],
     *,
     gaps: Container[str] = (),
-) -> _RunErrors:
+) -> _RunSignals:
     """Return the signals of one run from which its error metrics are computed.
 
     `full` is the block-pulse record for the equation error. In it, the sensor filter is applied to signals that were
@@ -486,13 +486,13 @@ def _run_errors(
         # at rest. An output with gaps or with an undefined non-linear term has none either.
         if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
-    return _RunErrors(
+    return _RunSignals(
         full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, equation_residuals
     )
 
 
 def _pooled_comparison(
-    model: Model, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
+    model: Model, runs: Sequence[Run], parts: Sequence[_RunSignals], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
     """Return a comparison with the errors of each run, and with the errors pooled over all runs."""
     equation_error, output_error = _pooled_errors(parts)
@@ -524,7 +524,7 @@ def _pooled_comparison(
     )
 
 
-def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
+def _pooled_errors(parts: Sequence[_RunSignals]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
     """Return (equation error, output error), each as metrics by output, pooled over runs."""
     outputs = parts[0].measured
     equation = {

@@ -145,10 +145,10 @@ def feedback_test(
         return FeedbackTest("undecided", "the input is constant")
     changes = [np.flatnonzero(np.diff(u)) + 1 for u in inputs]
     levels = np.unique(np.concatenate(inputs)).size
-    if all(_repeats(u) for u in inputs):
+    if all(_is_periodic(u) for u in inputs):
         return FeedbackTest("command", "it repeats itself exactly", rows=longest)
     if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE * longest):
-        if _has_clock(changes):
+        if _has_common_change_interval(changes):
             return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
         return FeedbackTest("undecided", f"{levels} levels: a relay and a command are indistinguishable", rows=longest)
     count = sum(c.size for c in changes)
@@ -165,21 +165,21 @@ def feedback_test(
             [inputs[k] for k in rows_by_run],
             [changes[k] for k in rows_by_run],
         )
-        missed = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
-        moves = [u[c] for u, c in zip(inputs, changes, strict=True)]
+        aligned_residuals = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
+        input_values = [u[c] for u, c in zip(inputs, changes, strict=True)]
         beside = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in others]
     else:
-        missed, moves = [_fill_missing(residuals[k]) for k in runs], inputs
+        aligned_residuals, input_values = [_fill_missing(residuals[k]) for k in runs], inputs
         beside = [[other[k] for k in runs] for other in others]
     room = MAX_FEEDBACK_ROWS
     sizes = []
-    for u in moves:
+    for u in input_values:
         sizes.append(min(u.size, room))
         room -= sizes[-1]
     rows_used = [k for k, rows in enumerate(sizes) if rows >= (MIN_FEEDBACK_ROWS if dense else MIN_CHANGES // 2)]
     test = _Innovations(
-        [missed[k][: sizes[k]] for k in rows_used],
-        [moves[k][: sizes[k]] for k in rows_used],
+        [aligned_residuals[k][: sizes[k]] for k in rows_used],
+        [input_values[k][: sizes[k]] for k in rows_used],
         [[other[k][: sizes[k]] for k in rows_used] for other in beside],
         shift=int(dense),
     ).test()
@@ -208,7 +208,7 @@ def _fill_missing(residuals: Floats) -> Floats:
     )
 
 
-def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
+def _has_common_change_interval(changes: Sequence[NDArray[np.intp]]) -> bool:
     """Whether a signal changes only at multiples of a common interval of at least two samples, as a generated one does.
 
     `changes` are the sample indices of the changes in each run.
@@ -217,7 +217,7 @@ def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
     return bool(gaps.size >= MAX_COMMAND_LEVELS and np.gcd.reduce(gaps) > 1)
 
 
-def _repeats(u: Floats) -> bool:
+def _is_periodic(u: Floats) -> bool:
     """Whether an input is exactly periodic, with a period of at most half the run."""
     x = u - u.mean()
     count = x.size
@@ -300,7 +300,7 @@ def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Fl
     return ratios[best], sets[best]
 
 
-def _local_color(w: Floats) -> float:
+def _local_autocorrelation(w: Floats) -> float:
     """Return the mean squared autocorrelation over short blocks, divided by the upper limit for white noise."""
     count = w.size // LOCAL_ROWS
     if count < 4:
@@ -312,7 +312,7 @@ def _local_color(w: Floats) -> float:
     return float(np.mean(LOCAL_ROWS * r * r)) / (1 + max(0.5, 4 * math.sqrt(2 / (LOCAL_LAGS * count))))
 
 
-def _local_past(w: Floats, past: Floats) -> float:
+def _local_explained_fraction(w: Floats, past: Floats) -> float:
     """Return the share of an innovation that `past` explains in short blocks, over its limit for independent series."""
     count = w.size // LOCAL_ROWS
     if count < 1:
@@ -331,17 +331,19 @@ def _local_past(w: Floats, past: Floats) -> float:
 class _Innovations:
     """Innovations of an input and of an output over several runs, with the feedback test on them."""
 
-    def __init__(self, missed: list[Floats], moves: list[Floats], others: list[list[Floats]], *, shift: int) -> None:
-        shortest = min(u.size for u in moves)
+    def __init__(
+        self, residuals: list[Floats], input_values: list[Floats], others: list[list[Floats]], *, shift: int
+    ) -> None:
+        shortest = min(u.size for u in input_values)
         self.shift = shift
         self.input_lags = min(MAX_INPUT_LAGS, shortest // 10)
         output_lags = min(MAX_OUTPUT_LAGS, shortest // 14)
         self.start = max(self.input_lags, output_lags)
-        deviation = math.sqrt(float(np.mean(np.concatenate([(u - u.mean()) ** 2 for u in moves]))))
+        deviation = math.sqrt(float(np.mean(np.concatenate([(u - u.mean()) ** 2 for u in input_values]))))
         self.deviation = deviation
-        inputs = [(u - u.mean()) / deviation for u in moves]
-        outputs = self._clip_outliers(missed)
-        sizes = [u.size - self.start for u in moves]
+        inputs = [(u - u.mean()) / deviation for u in input_values]
+        outputs = self._clip_outliers(residuals)
+        sizes = [u.size - self.start for u in input_values]
         ends = np.cumsum(sizes).tolist()
         #: (start, stop) of each run in the stacked rows.
         self.places = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
@@ -374,16 +376,16 @@ class _Innovations:
         memory = SLOW_FORGETTING * (1 - SLOW_FORGETTING) ** np.arange(SLOW_MEMORY_ROWS)
         self.slow = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
 
-    def _clip_outliers(self, missed: list[Floats]) -> list[Floats]:
-        """Return the residuals `missed`, centered and divided by their standard deviation, with far outliers clipped.
+    def _clip_outliers(self, residuals: list[Floats]) -> list[Floats]:
+        """Return residuals, centered and divided by their standard deviation, with far outliers clipped.
 
         Outliers only reduce the power of the test.
         """
-        every = np.concatenate([e - e.mean() for e in missed])
+        every = np.concatenate([e - e.mean() for e in residuals])
         size = float(np.std(every)) or 1.0
         middle = float(np.median(every)) / size
         reach = RESIDUAL_CLIP * max(robust_deviation(every / size - middle), 1e-12)
-        return [np.clip((e - e.mean()) / size, middle - reach, middle + reach) for e in missed]
+        return [np.clip((e - e.mean()) / size, middle - reach, middle + reach) for e in residuals]
 
     def _stack_rows(self, series: Sequence[Floats]) -> Floats:
         return np.concatenate([x[self.start :] for x in series])
@@ -428,7 +430,7 @@ class _Innovations:
         clipped = clipped - clipped.mean()
         if robust_deviation(self.present) < QUIET_SHARE:
             return FeedbackTest("none", "the output has no noise that could come back", rows=count)
-        signed = self._present_ratio(clipped)
+        signed = self._same_sample_ratio(clipped)
         now = abs(signed)
         at_once = f"it is correlated with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
         if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
@@ -448,9 +450,9 @@ class _Innovations:
         if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
             return result("found")
         objection = ""
-        if _local_color(clipped) > 1:
+        if _local_autocorrelation(clipped) > 1:
             objection = "its innovations are not white"
-        elif _local_past(clipped, self.past[:, :2]) > 1:
+        elif _local_explained_fraction(clipped, self.past[:, :2]) > 1:
             objection = "its innovations depend on its past in parts of the run, as those of a sweep"
         if objection and ratio <= PLACEBO_RATIO_IN_DOUBT:
             return result("undecided", objection)
@@ -472,7 +474,7 @@ class _Innovations:
             return result("undecided", objection or f"outputs far in the past explain as much (ratio {placebo:.2g})")
         return result("found")
 
-    def _present_ratio(self, clipped: Floats) -> float:
+    def _same_sample_ratio(self, clipped: Floats) -> float:
         """Return the signed score statistic of the output innovation in the same sample, divided by its critical value.
 
         This statistic detects integral control. There the past input already contains the past outputs, so they do not
