@@ -59,7 +59,7 @@ const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
 /// Number of most recent requests for long plans. The plans of these requests are not evicted, even if the total
 /// exceeds the limit. One evaluation of a large problem may need more points than the limit.
-const IN_USE: u64 = 16;
+const RECENT_REQUEST_COUNT: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
 struct Plans {
@@ -120,7 +120,7 @@ impl Plans {
         let mut stored_points: usize = long.iter().map(|&(_, len)| len).sum();
         let mut evicted = Vec::new();
         for (last, len) in long {
-            if stored_points <= points || self.uses - last <= IN_USE {
+            if stored_points <= points || self.uses - last <= RECENT_REQUEST_COUNT {
                 break;
             }
             stored_points -= len;
@@ -281,7 +281,7 @@ mod tests {
         for len in [short, long, next] {
             assert_eq!(insert(&mut plans, len), 0, "in use");
         }
-        for _ in 0..=IN_USE {
+        for _ in 0..=RECENT_REQUEST_COUNT {
             assert!(plans.find(short).is_some() && plans.find(next).is_some());
         }
         assert_eq!(insert(&mut plans, next + 2), 1);

@@ -237,10 +237,10 @@ impl<'a> System<'a> {
             return Ok(None);
         }
         let kernels = inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
-        let behind = (0..inverse.len()).map(|_| None).collect();
+        let filtered_kernels = (0..inverse.len()).map(|_| None).collect();
         // Without a filter only the spectra are needed.
         let inverse = if self.record.is_filtered() { inverse } else { Vec::new() };
-        Ok(Some(InverseKernels { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
+        Ok(Some(InverseKernels { system: self, inverse, kernels, filtered_kernels, buffers: Buffers::default() }))
     }
 
     /// Return the responses of all outputs to each initial term (equation, exponent) by one solution per term.
@@ -281,7 +281,7 @@ struct InverseKernels<'s, 'a> {
     /// Spectra of the inverse matrix, by output, then by equation.
     kernels: Vec<Vec<Kernel>>,
     /// Spectra of the filtered inverse matrix, by equation, then by output. Computed when first needed.
-    behind: Vec<Option<Vec<Kernel>>>,
+    filtered_kernels: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }
 
@@ -317,10 +317,10 @@ impl InverseKernels<'_, '_> {
             return self.kernels.iter().map(|row| through(&row[i], &term)).collect();
         };
         let inverse = &self.inverse;
-        let behind = self.behind[i].get_or_insert_with(|| {
+        let filtered_kernels = self.filtered_kernels[i].get_or_insert_with(|| {
             inverse.iter().map(|row| Kernel::new(&system.record.apply_filter(row[i].clone()))).collect()
         });
-        behind.iter().map(|kernel| through(kernel, &term)).collect()
+        filtered_kernels.iter().map(|kernel| through(kernel, &term)).collect()
     }
 }
 

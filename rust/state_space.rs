@@ -280,15 +280,21 @@ impl Realization {
             return Ok(None);
         }
         // Columns are contiguous, so that the states of a step are independent sums.
-        let growth = (0..n * n).map(|k| interval.growth[k % n * n + k / n]).collect();
-        Ok(Some(Recursion { states: n, outputs: self.outputs, growth, read: self.read.clone(), channels }))
+        let transition_increment = (0..n * n).map(|k| interval.transition_increment[k % n * n + k / n]).collect();
+        Ok(Some(Recursion {
+            states: n,
+            outputs: self.outputs,
+            transition_increment,
+            read: self.read.clone(),
+            channels,
+        }))
     }
 }
 
-/// Matrix functions e^M − I (`growth`), φ₁(M) (`first`) and φ₂(M) (`second`) of an n × n matrix M, row-major. φ₁ and φ₂
-/// are defined in the module documentation.
+/// Matrix functions e^M − I (`transition_increment`), φ₁(M) (`first`) and φ₂(M) (`second`) of an n × n matrix M,
+/// row-major. φ₁ and φ₂ are defined in the module documentation.
 pub(crate) struct Transition {
-    pub(crate) growth: Vec<f64>,
+    pub(crate) transition_increment: Vec<f64>,
     first: Vec<f64>,
     second: Vec<f64>,
 }
@@ -316,25 +322,25 @@ impl Transition {
             coefficient *= f64::from(k + 2);
         }
         let mut first = with_diagonal(product(&scaled, &second), 1.0);
-        let mut growth = product(&scaled, &first);
+        let mut transition_increment = product(&scaled, &first);
         for _ in 0..halvings {
             let squared = product(&first, &first);
             second.iter_mut().zip(&squared).for_each(|(v, s)| *v = 0.25 * (s + 2.0 * *v));
-            let increment = product(&growth, &first);
+            let increment = product(&transition_increment, &first);
             first.iter_mut().zip(&increment).for_each(|(v, r)| *v += 0.5 * r);
-            let squared = product(&growth, &growth);
-            growth.iter_mut().zip(&squared).for_each(|(v, s)| *v = 2.0 * *v + s);
+            let squared = product(&transition_increment, &transition_increment);
+            transition_increment.iter_mut().zip(&squared).for_each(|(v, s)| *v = 2.0 * *v + s);
         }
-        let finite = growth.iter().chain(&first).chain(&second).all(|v| v.is_finite());
-        finite.then_some(Self { growth, first, second })
+        let finite = transition_increment.iter().chain(&first).chain(&second).all(|v| v.is_finite());
+        finite.then_some(Self { transition_increment, first, second })
     }
 }
 
 /// Return the matrix exponential e^M of a row-major n × n matrix M; None if it overflows.
 pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
-    let mut growth = Transition::new(matrix, n, 1.0)?.growth;
-    growth.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
-    Some(growth)
+    let mut transition = Transition::new(matrix, n, 1.0)?.transition_increment;
+    transition.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
+    Some(transition)
 }
 
 /// Gains of an input on the states after one interval. `now` multiplies the value of the input at the start of the
@@ -392,7 +398,7 @@ struct Recursion<'a> {
     states: usize,
     outputs: usize,
     /// Transition matrix e^{hA} minus I, column-major.
-    growth: Vec<f64>,
+    transition_increment: Vec<f64>,
     read: Vec<f64>,
     channels: Vec<Channel<'a>>,
 }
@@ -431,7 +437,7 @@ impl Recursion<'_> {
                     samples.iter_mut().zip(&values).for_each(|(y, value)| *y += gain * value);
                 }
             }
-            advance(n, &self.growth, &mut state, &mut history);
+            advance(n, &self.transition_increment, &mut state, &mut history);
             for (samples, gains) in out.chunks_exact_mut(rows).zip(self.read.chunks_exact(n.max(1))) {
                 add_outputs(n, gains, &history, &mut samples[begin..begin + count]);
             }
@@ -480,8 +486,8 @@ fn add_outputs(n: usize, gains: &[f64], history: &[f64], samples: &mut [f64]) {
 /// Advance the state by one block of rows. `history` contains the forcing of each row, which is replaced by the state
 /// at that row.
 #[inline(always)]
-fn advance(n: usize, growth: &[f64], state: &mut [f64], history: &mut [f64]) {
-    let (growth, state) = (&growth[..n * n], &mut state[..n]);
+fn advance(n: usize, transition_increment: &[f64], state: &mut [f64], history: &mut [f64]) {
+    let (transition_increment, state) = (&transition_increment[..n * n], &mut state[..n]);
     for row in history.chunks_exact_mut(n.max(1)) {
         for i in 0..n {
             let past = state[i];
@@ -490,7 +496,7 @@ fn advance(n: usize, growth: &[f64], state: &mut [f64], history: &mut [f64]) {
         }
         for j in 0..n {
             for i in 0..n {
-                state[i] += growth[j * n + i] * row[j];
+                state[i] += transition_increment[j * n + i] * row[j];
             }
         }
     }
@@ -517,7 +523,8 @@ mod tests {
             for slow in [1.0, 1e-3, 1e-6] {
                 let root = f64::sqrt(fast * slow);
                 let matrix = [-(fast + slow), root, -root, 0.0];
-                let entries = Transition::new(&matrix, 2, 1.0).map(|t| [t.growth[3], t.first[3], t.second[3]]);
+                let entries =
+                    Transition::new(&matrix, 2, 1.0).map(|t| [t.transition_increment[3], t.first[3], t.second[3]]);
                 let exact = two_poles(fast, slow);
                 let worst = entries
                     .map_or(f64::NAN, |f| f.iter().zip(exact).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max));
@@ -531,7 +538,7 @@ mod tests {
     fn a_nilpotent_chain_has_powers_over_factorials() {
         let mut chain = vec![0.0; 16];
         (0..3).for_each(|i| chain[5 * i + 1] = 1.0);
-        let entries = Transition::new(&chain, 4, 0.5).map(|t| [t.growth[3], t.first[3], t.second[3]]);
+        let entries = Transition::new(&chain, 4, 0.5).map(|t| [t.transition_increment[3], t.first[3], t.second[3]]);
         let exact = [6.0, 24.0, 120.0].map(|factorial| 0.125 / factorial);
         assert!(entries.is_some_and(|f| f.iter().zip(exact).all(|(a, b)| (a / b - 1.0).abs() < 1e-14)), "{entries:?}");
     }

@@ -120,7 +120,7 @@ fn fit_point(
     let mut buffers = Buffers::default();
     let mut target: Vec<f64> = Vec::new();
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); fixed.iter().filter(|f| f.is_none()).count()];
-    let mut starts = Vec::with_capacity(parts.len());
+    let mut initial_responses = Vec::with_capacity(parts.len());
     for part in parts {
         let m = part.target.len();
         let mut divisor = vec![0.0; m];
@@ -148,13 +148,14 @@ fn fit_point(
             }
         }
         target.extend(residual);
-        starts.push(part.initial.iter().map(&mut through).collect::<Vec<_>>());
+        initial_responses.push(part.initial.iter().map(&mut through).collect::<Vec<_>>());
     }
     let finite = |v: &[f64]| v.iter().all(|x| x.is_finite());
-    if !finite(&target) || !columns.iter().all(|c| finite(c)) || !starts.iter().flatten().all(|c| finite(c)) {
+    if !finite(&target) || !columns.iter().all(|c| finite(c)) || !initial_responses.iter().flatten().all(|c| finite(c))
+    {
         return Ok(None);
     }
-    let Some((values, missed)) = solve_with_initial_terms(columns, target, starts) else { return Ok(None) };
+    let Some((values, missed)) = solve_with_initial_terms(columns, target, initial_responses) else { return Ok(None) };
     let mut values = values.into_iter();
     let coefficients = fixed.iter().map(|f| f.or_else(|| values.next()).unwrap_or(f64::NAN)).collect();
     Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
@@ -166,13 +167,13 @@ fn fit_point(
 fn solve_with_initial_terms(
     columns: Vec<Vec<f64>>,
     target: Vec<f64>,
-    starts: Vec<Vec<Vec<f64>>>,
+    initial_responses: Vec<Vec<Vec<f64>>>,
 ) -> Option<(Vec<f64>, f64)> {
-    let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
+    let lengths: Vec<usize> = initial_responses.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
     let (mut less, mut residual) = (columns.clone(), target.clone());
     let mut from = 0;
-    for (own, &m) in starts.iter().zip(&lengths) {
+    for (own, &m) in initial_responses.iter().zip(&lengths) {
         let mut basis = Vec::new();
         own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
         for series in less.iter_mut().chain(std::iter::once(&mut residual)) {
@@ -184,8 +185,11 @@ fn solve_with_initial_terms(
     }
     let is_determined =
         less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
-    let (columns, target) =
-        if is_determined { (less, residual) } else { (append_initial_terms(columns, &starts, &lengths), target) };
+    let (columns, target) = if is_determined {
+        (less, residual)
+    } else {
+        (append_initial_terms(columns, &initial_responses, &lengths), target)
+    };
     let (x, _) = solve(&columns, &target, free).ok()?;
     let mut missed = target;
     for (column, c) in columns.iter().zip(&x) {
@@ -195,10 +199,14 @@ fn solve_with_initial_terms(
 }
 
 /// Append the columns of the initial terms. Each of them is zero outside its record.
-fn append_initial_terms(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
+fn append_initial_terms(
+    mut columns: Vec<Vec<f64>>,
+    initial_responses: &[Vec<Vec<f64>>],
+    lengths: &[usize],
+) -> Vec<Vec<f64>> {
     let rows = lengths.iter().sum();
     let mut from = 0;
-    for (own, &m) in starts.iter().zip(lengths) {
+    for (own, &m) in initial_responses.iter().zip(lengths) {
         for series in own {
             let mut column = vec![0.0; rows];
             column[from..from + m].copy_from_slice(series);

@@ -169,7 +169,7 @@ impl StreamingOptions {
 pub struct Streaming {
     inputs: Vec<bool>,
     decay_factors: Vec<f64>,
-    share: Vec<f64>,
+    pulse_weights: Vec<f64>,
     histories: Vec<SignalHistory>,
     fits: Vec<EquationRecursion>,
     /// Last sample of every signal; empty before the first one.
@@ -251,7 +251,7 @@ impl Streaming {
         Ok(Self {
             inputs: inputs.to_vec(),
             decay_factors: decays.iter().map(|d| d.0).collect(),
-            share: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
+            pulse_weights: decays.iter().map(|d| step * (d.1 + d.2)).collect(),
             histories: vec![SignalHistory { states: vec![0.0; count], last: 0.0 }; inputs.len()],
             fits,
             sample: Vec::new(),
@@ -288,8 +288,8 @@ impl Streaming {
             *mean = if self.inputs[s] { self.sample[s] } else { 0.5 * (self.sample[s] + sample[s]) };
         }
         self.sample.copy_from_slice(sample);
-        let Self { fits, histories, means, decay_factors, share, .. } = self;
-        simd::dispatch_simd(Integration { fits, histories, means, decay_factors, share });
+        let Self { fits, histories, means, decay_factors, pulse_weights, .. } = self;
+        simd::dispatch_simd(Integration { fits, histories, means, decay_factors, pulse_weights });
         for fit in &mut self.fits {
             fit.step(&self.options, self.pulses)?;
         }
@@ -345,7 +345,7 @@ struct Integration<'a> {
     histories: &'a mut [SignalHistory],
     means: &'a [f64],
     decay_factors: &'a [f64],
-    share: &'a [f64],
+    pulse_weights: &'a [f64],
 }
 
 impl simd::SimdKernel for Integration<'_> {
@@ -353,7 +353,7 @@ impl simd::SimdKernel for Integration<'_> {
 
     #[inline(always)]
     fn run(self) {
-        let Self { fits, histories, means, decay_factors, share } = self;
+        let Self { fits, histories, means, decay_factors, pulse_weights } = self;
         for fit in fits {
             fit.values[0] = fit.target.next(means[fit.output], &histories[fit.output]);
             for (value, integral) in fit.values[1..].iter_mut().zip(&mut fit.integrals) {
@@ -361,8 +361,8 @@ impl simd::SimdKernel for Integration<'_> {
             }
         }
         for (past, mean) in histories.iter_mut().zip(means) {
-            for ((z, decay_factors), share) in past.states.iter_mut().zip(decay_factors).zip(share) {
-                *z = *z * decay_factors + share * past.last;
+            for ((z, decay_factor), pulse_weight) in past.states.iter_mut().zip(decay_factors).zip(pulse_weights) {
+                *z = *z * decay_factor + pulse_weight * past.last;
             }
             past.last = *mean;
         }

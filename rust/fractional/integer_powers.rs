@@ -82,7 +82,7 @@ struct Table<T: 'static> {
     /// Table that all threads share.
     shared: &'static ForkSafeLock<Values<T>>,
     /// Table of this thread.
-    own: &'static LocalKey<RefCell<Values<T>>>,
+    thread_values: &'static LocalKey<RefCell<Values<T>>>,
     /// Function that computes a table with a given number of values.
     make: fn(usize) -> Vec<T>,
 }
@@ -93,8 +93,8 @@ impl<T> Table<T> {
     /// Return a table with at least m values.
     fn of(&self, m: usize) -> Arc<Vec<T>> {
         let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
-        let own = || self.own.with_borrow(enough);
-        if let Some(values) = own().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
+        let thread_values = || self.thread_values.with_borrow(enough);
+        if let Some(values) = thread_values().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
             return values;
         }
         let table = Arc::new((self.make)(m.next_power_of_two()));
@@ -104,7 +104,7 @@ impl<T> Table<T> {
             longer.then(|| values.replace(Arc::clone(&table)))
         });
         if cached.is_none() {
-            self.own.set(Some(Arc::clone(&table)));
+            self.thread_values.set(Some(Arc::clone(&table)));
         }
         table
     }
@@ -130,7 +130,7 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
         }
         divisors
     };
-    Table { shared: &SHARED, own: &OWN, make }.of(m)
+    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
 }
 
 /// Return the logarithms ln n in double-double precision for n < m, with 0 for n = 0. The table may be longer.
@@ -167,7 +167,7 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
         }
         logarithms
     };
-    Table { shared: &SHARED, own: &OWN, make }.of(m)
+    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
 }
 
 /// Return the logarithms ln n for n < m, with 0 for n = 0. The table may be longer.
@@ -176,7 +176,7 @@ pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
     static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);
     thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
     let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
-    Table { shared: &SHARED, own: &OWN, make }.of(m)
+    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
 }
 
 #[cfg(test)]
@@ -187,7 +187,7 @@ mod tests {
     fn a_lock_that_is_never_given_back_stops_no_table() {
         static SHARED: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
         thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
-        let table = Table { shared: &SHARED, own: &OWN, make: |len| (0..len).collect() };
+        let table = Table { shared: &SHARED, thread_values: &OWN, make: |len| (0..len).collect() };
         let (first, second) = SHARED.hold_during(|| (table.of(5), table.of(8)));
         assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
         assert!(Arc::ptr_eq(&first, &second), "made once");

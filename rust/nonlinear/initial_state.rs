@@ -196,7 +196,7 @@ pub(super) enum InitialTerm {
         /// Indices of the equation and of the term in it.
         at: (usize, usize),
         /// Order of the derivative of the input whose initial value enters: 0 for the input itself.
-        more: u32,
+        derivative_order: u32,
     },
     /// Constant (0) or ramp (1) on the right-hand side of the equation with the first index.
     Offset(usize, u32),
@@ -228,11 +228,11 @@ impl InitialTerm {
                         all.push(Self::Rate(i));
                     }
                     for (term, driver) in structure.terms.iter().enumerate().filter(|(_, t)| !followed(t.signal)) {
-                        for more in (0_u32..).take_while(|&k| f64::from(k) < driver.order - ORDER_GRAIN) {
-                            let exponent = structure.order - driver.order + f64::from(more);
+                        for derivative_order in (0_u32..).take_while(|&k| f64::from(k) < driver.order - ORDER_GRAIN) {
+                            let exponent = structure.order - driver.order + f64::from(derivative_order);
                             let known = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
                             if free(i, term) || !known {
-                                all.push(Self::Jump { at: (i, term), more });
+                                all.push(Self::Jump { at: (i, term), derivative_order });
                             }
                         }
                     }
@@ -270,11 +270,11 @@ impl InitialTerm {
         match self {
             Self::Level(i) => powers_of_value(i, 0.0),
             Self::Rate(i) => powers_of_value(i, 1.0),
-            Self::Jump { at: (i, term), more } => {
+            Self::Jump { at: (i, term), derivative_order } => {
                 let structure = &equations[i].structure;
-                vec![(i, structure.order - structure.terms[term].order + f64::from(more), 1.0)]
+                vec![(i, structure.order - structure.terms[term].order + f64::from(derivative_order), 1.0)]
             }
-            Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
+            Self::Offset(i, degree) => vec![(i, equations[i].structure.order + f64::from(degree), 1.0)],
             Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
         }
     }

@@ -206,13 +206,13 @@ pub(crate) struct Budget {
     /// Total number of regressor columns of all equations.
     columns: usize,
     /// Part of the memory for the join of coupled equations \[bytes\].
-    layout: u128,
+    join_bytes: u128,
 }
 
 impl Budget {
     /// Add the memory of the rows of the join of coupled equations \[bytes\].
     pub(crate) fn add_layout(&mut self, bytes: u128) {
-        self.layout += bytes;
+        self.join_bytes += bytes;
         self.bytes += bytes;
     }
 
@@ -267,7 +267,7 @@ impl Budget {
         if self.bytes <= limit {
             return Ok(());
         }
-        let layout = if self.layout > 0 { " and the layout of the order law" } else { "" };
+        let layout = if self.join_bytes > 0 { " and the layout of the order law" } else { "" };
         let what = format!("{} regressors of all runs, their products and test vectors{layout}", self.columns);
         Err(Error::Memory { what, bytes: self.bytes, limit })
     }

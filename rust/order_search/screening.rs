@@ -124,7 +124,7 @@ pub(crate) struct Screen<const L: usize> {
     /// Cache of the most recent lookup of test vectors that are linearized in the orders.
     lookup: VectorLookup,
     /// Path of the unstable-zero test that excluded the most recent candidate.
-    path: usize,
+    unstable_zero_path: usize,
 }
 
 impl<const L: usize> Screen<L> {
@@ -141,7 +141,7 @@ impl<const L: usize> Screen<L> {
             norm_cache: NormCache::for_adjacent_candidates(),
             open_positions: Vec::new(),
             lookup: VectorLookup::default(),
-            path: 0,
+            unstable_zero_path: 0,
         }
     }
 
@@ -227,7 +227,16 @@ impl<const L: usize> Screen<L> {
         (open, singular): &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self {
-            solve, positions, initial, columns, coefficients, weights, norm_cache: memory, lookup, path, ..
+            solve,
+            positions,
+            initial,
+            columns,
+            coefficients,
+            weights,
+            norm_cache: memory,
+            lookup,
+            unstable_zero_path,
+            ..
         } = self;
         let failed = candidate_index.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
@@ -274,7 +283,7 @@ impl<const L: usize> Screen<L> {
                 continue;
             }
             if let (Some(unstable_zeros), true) = (&candidate_index.problem.unstable_zeros, limit < f64::INFINITY)
-                && unstable_zeros.excludes_candidate(columns, coefficients, limit, path)
+                && unstable_zeros.excludes_candidate(columns, coefficients, limit, unstable_zero_path)
             {
                 continue;
             }

@@ -18,7 +18,7 @@ pub(super) const FIRST_REFINEMENT: usize = 2;
 /// Ratio of the end times of successive time ranges into which responses are divided. The shortest range has at least
 /// [`MIN_RANGE_INTERVALS`] sampling intervals. With this ratio, halving the step on a range costs as much as the whole
 /// response on the coarser grid.
-const PIECE_RATIO: usize = 8;
+const RANGE_END_RATIO: usize = 8;
 const MIN_RANGE_INTERVALS: usize = 128;
 /// Pulses per sampling interval of the grids that cover whole responses. The coarsest of these grids is not used for
 /// the first time range, in which responses have jumps.
@@ -322,7 +322,7 @@ fn refine_long_record(
     };
     let grids = FULL_GRID_REFINEMENTS.iter().map(|&every| responses.compute(every, intervals));
     let grids = grids.collect::<Result<Vec<_>>>()?;
-    if !grids[1..].iter().all(decays) {
+    if !grids[1..].iter().all(has_small_growth) {
         return Ok(None);
     }
     let estimate = responses.samples(&grids[grids.len() - 1], initial)?;
@@ -385,7 +385,7 @@ fn refine_long_record(
 
 /// Divide responses over `intervals` sampling intervals into time ranges. Return (first sample, end) of each range.
 fn time_ranges(intervals: usize) -> Vec<(usize, usize)> {
-    let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / PIECE_RATIO));
+    let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / RANGE_END_RATIO));
     let mut ends: Vec<usize> =
         ends.enumerate().take_while(|(k, end)| *k == 0 || *end >= MIN_RANGE_INTERVALS).map(|(_, end)| end).collect();
     ends.reverse();
@@ -394,7 +394,7 @@ fn time_ranges(intervals: usize) -> Vec<(usize, usize)> {
 }
 
 /// True if the responses are finite and grow so little over the record that their superposition does not lose digits.
-fn decays(rows: &Rows) -> bool {
+fn has_small_growth(rows: &Rows) -> bool {
     rows.iter().all(|row| {
         let (first, second) = row.split_at(row.len() / 2);
         row.iter().all(|v| v.is_finite()) && peak(second) <= MAX_GROWTH_RATIO * peak(first)

@@ -48,7 +48,7 @@ pub struct Parameters {
 struct Operator {
     signal: usize,
     order: f64,
-    into: [f64; 4],
+    force: [f64; 4],
     /// Contributions to the momenta on the left-hand side of the integrated equations.
     momentum: [f64; 4],
     /// Weights of the history states; empty for orders 0 and 1.
@@ -119,7 +119,7 @@ impl Arm {
         }
         let (mut implicit, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
         for operator in &operators {
-            for (row, c) in implicit.iter_mut().zip(operator.into) {
+            for (row, c) in implicit.iter_mut().zip(operator.force) {
                 row[operator.signal] += c * operator.now;
             }
             for (row, c) in momenta.iter_mut().zip(operator.momentum) {
@@ -205,7 +205,7 @@ impl Arm {
                 value += self.angle[s];
             }
             value += operator.weights.iter().zip(&self.past[s]).map(|(w, z)| w * z).sum::<f64>();
-            for (sum, c) in history.iter_mut().zip(operator.into) {
+            for (sum, c) in history.iter_mut().zip(operator.force) {
                 *sum += c * value;
             }
             for (sum, c) in gained.iter_mut().zip(operator.momentum) {
@@ -388,7 +388,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
             if momentum {
                 operators[at].momentum[row] -= c;
             } else {
-                operators[at].into[row] += c;
+                operators[at].force[row] += c;
             }
         }
     }

@@ -200,14 +200,14 @@ pub struct Guard {
     rest: usize,
     sums: [f64; 2],
     bias: [f64; 2],
-    zero: [i32; 2],
+    encoder_zero: [i32; 2],
     previous: Option<[i32; 2]>,
     unchanged_time: [f64; 2],
     gauges: [Gauge; 2],
     last_current: [f64; 2],
     mean_square_current: [f64; 2],
     missed: u32,
-    missed_in_all: u64,
+    missed_deadline_count: u64,
     filters: Option<[Filter; 2]>,
 }
 
@@ -253,14 +253,14 @@ impl Guard {
             rest: 0,
             sums: [0.0; 2],
             bias: [0.0; 2],
-            zero: [0; 2],
+            encoder_zero: [0; 2],
             previous: None,
             unchanged_time: [0.0; 2],
             gauges: [Gauge::default(); 2],
             last_current: [0.0; 2],
             mean_square_current: [0.0; 2],
             missed: 0,
-            missed_in_all: 0,
+            missed_deadline_count: 0,
             filters,
         })
     }
@@ -291,7 +291,7 @@ impl Guard {
     /// Total number of missed deadlines.
     #[must_use]
     pub fn missed_deadlines(&self) -> u64 {
-        self.missed_in_all
+        self.missed_deadline_count
     }
 
     /// Process a reading before the motors are enabled. The gauge bias is the mean voltage of these readings, and the
@@ -305,7 +305,7 @@ impl Guard {
             self.sums[j] += reading.analog[j];
             self.bias[j] = self.sums[j] / count;
         }
-        self.zero = reading.counts;
+        self.encoder_zero = reading.counts;
         self.previous = Some(reading.counts);
     }
 
@@ -318,7 +318,7 @@ impl Guard {
         let mut bends = [0.0; 2];
         for j in 0..2 {
             let s = &self.settings;
-            hubs[j] = f64::from(reading.counts[j].wrapping_sub(self.zero[j])) * s.encoder_scale[j];
+            hubs[j] = f64::from(reading.counts[j].wrapping_sub(self.encoder_zero[j])) * s.encoder_scale[j];
             bends[j] = -(reading.analog[j] - self.bias[j]) * s.strain_scale[j];
             if bends[j].abs() > s.deflection_limit[j] {
                 let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
@@ -417,8 +417,8 @@ impl Guard {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
         if gauge.volts != volts {
-            *gauge = Gauge { volts, last_current: self.last_current[j], unchanged_time: 0.0 };
-        } else if (self.last_current[j] - gauge.last_current).abs() >= s.moving_current {
+            *gauge = Gauge { volts, current_at_change: self.last_current[j], unchanged_time: 0.0 };
+        } else if (self.last_current[j] - gauge.current_at_change).abs() >= s.moving_current {
             gauge.unchanged_time += s.step;
             if gauge.unchanged_time > s.standstill {
                 let (seconds, current) = (gauge.unchanged_time, s.moving_current);
@@ -431,7 +431,7 @@ impl Guard {
         let s = &self.settings;
         if late > s.step {
             self.missed += 1;
-            self.missed_in_all += 1;
+            self.missed_deadline_count += 1;
         } else {
             self.missed = 0;
         }
@@ -448,7 +448,7 @@ impl Guard {
 #[derive(Debug, Clone, Copy, Default)]
 struct Gauge {
     volts: f64,
-    last_current: f64,
+    current_at_change: f64,
     unchanged_time: f64,
 }
 

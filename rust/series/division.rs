@@ -126,9 +126,9 @@ struct Level {
     blocks: Vec<Tile>,
     /// Spectra of segments of the matrix series, ordered by tile (group of frequency bins), equation, descending
     /// segment and unknown.
-    pieces: Vec<Tile>,
+    segment_spectra: Vec<Tile>,
     /// Number of segments of each matrix series whose spectra have been computed.
-    known_pieces: usize,
+    known_segments: usize,
     /// Spectrum of the contribution of solved blocks to one later block.
     sum: Vec<Tile>,
 }
@@ -166,8 +166,8 @@ impl Level {
             len,
             capacity,
             blocks: zeros(size),
-            pieces: zeros(size * n),
-            known_pieces: 0,
+            segment_spectra: zeros(size * n),
+            known_segments: 0,
             sum: zeros(tiles),
         }
     }
@@ -238,14 +238,14 @@ impl simd::SimdKernel for Contributions<'_> {
 
     #[inline(always)]
     fn run(self) {
-        let Self { n, i, count, level: Level { capacity, blocks, pieces, .. }, sum } = self;
+        let Self { n, i, count, level: Level { capacity, blocks, segment_spectra, .. }, sum } = self;
         let terms = count * n;
         for t in 0..sum.len() {
             let blocks = &blocks[t * capacity * n..][..terms];
-            let pieces = &pieces[((t * n + i + 1) * capacity - count) * n..][..terms];
+            let segment_spectra = &segment_spectra[((t * n + i + 1) * capacity - count) * n..][..terms];
             let [mut re, mut im] = [[0.0; LANE_COUNT]; 2];
             for k in 0..terms {
-                let ([x_re, x_im], [k_re, k_im]) = (&blocks[k], &pieces[k]);
+                let ([x_re, x_im], [k_re, k_im]) = (&blocks[k], &segment_spectra[k]);
                 for l in 0..LANE_COUNT {
                     re[l] += x_re[l] * k_re[l] - x_im[l] * k_im[l];
                     im[l] += x_re[l] * k_im[l] + x_im[l] * k_re[l];
@@ -282,7 +282,7 @@ impl Division {
 
     /// Reset the division for another divisor. Memory stays allocated.
     pub fn reset(&mut self) {
-        self.levels.iter_mut().for_each(|level| level.known_pieces = 0);
+        self.levels.iter_mut().for_each(|level| level.known_segments = 0);
         self.restart();
     }
 
@@ -388,16 +388,16 @@ impl Division {
         let Self { rest, levels, buffers, m, .. } = self;
         let level = &mut levels[level];
         let stride = level.capacity * n;
-        for piece in level.known_pieces..place {
+        for segment in level.known_segments..place {
             for k in 0..n * n {
                 let (i, j) = (k / n, k % n);
-                let terms = ((piece + 2) * len).min(*m);
-                let at = (i * level.capacity + level.capacity - 1 - piece) * n + j;
-                let values = &series(i, j, terms)[piece * len..];
-                buffers.transform(&level.transform, values, &mut level.pieces[at..], n * stride);
+                let terms = ((segment + 2) * len).min(*m);
+                let at = (i * level.capacity + level.capacity - 1 - segment) * n + j;
+                let values = &series(i, j, terms)[segment * len..];
+                buffers.transform(&level.transform, values, &mut level.segment_spectra[at..], n * stride);
             }
         }
-        level.known_pieces = level.known_pieces.max(place);
+        level.known_segments = level.known_segments.max(place);
         for (j, rest) in rest.iter().enumerate() {
             let at = (place - 1) * n + j;
             buffers.transform(&level.transform, &rest[hi - len..hi], &mut level.blocks[at..], stride);

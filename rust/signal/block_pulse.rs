@@ -231,7 +231,7 @@ const KINK_RANGE_PULSES: f64 = 16.0;
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct NearbyJump {
     /// Time from the jump to the sample; negative for a jump after the sample.
-    before: f64,
+    time_since_jump: f64,
     /// Index of the first pulse of the interpolation, relative to the pulse of the jump.
     first: isize,
     /// Fraction of the pulse of the jump that precedes the jump.
@@ -333,7 +333,7 @@ impl SampleInterpolation {
             {
                 let pulse = p.floor();
                 out.near.push(NearbyJump {
-                    before: place - p,
+                    time_since_jump: place - p,
                     first: first as isize - pulse as isize,
                     share: p - pulse,
                     size,
@@ -357,10 +357,10 @@ impl SampleInterpolation {
         let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
         let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
         let lacking = |near: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
-            let sample = match near.before {
-                before if before < 0.0 => 0.0,
-                before if eta == 0.0 && before == 0.0 => corner,
-                before => corner * libm::pow(before, eta),
+            let sample = match near.time_since_jump {
+                time if time < 0.0 => 0.0,
+                time if eta == 0.0 && time == 0.0 => corner,
+                time => corner * libm::pow(time, eta),
             };
             let sampled_share: f64 = (near.first..)
                 .zip(weights)

@@ -229,10 +229,10 @@ pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
 }
 
 /// Minimum number of samples in the shortest run per coefficient of an autoregression.
-const SAMPLES_A_COEFFICIENT: usize = 10;
+const MIN_SAMPLES_PER_COEFFICIENT: usize = 10;
 /// Minimum length of the transform for autocovariances of an autoregression. Over this length, a correlation of 0.99
 /// per sample has decayed.
-const LEAST_CIRCLE: usize = 4096;
+const MIN_TRANSFORM_LENGTH: usize = 4096;
 
 /// Return the whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance.
 ///
@@ -251,7 +251,7 @@ const LEAST_CIRCLE: usize = 4096;
 #[allow(clippy::cast_precision_loss)]
 pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
-    let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
+    let most = most.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
     let (mut covariance, pairs) = autocovariances(series, most);
     let (count, all) = (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
     for (lag, (value, &of)) in covariance.iter_mut().zip(&pairs).enumerate() {
@@ -341,7 +341,7 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
 }
 
 /// Minimum number of samples in all runs together, per lag of each input of an ARX model.
-const SAMPLES_AN_INPUT_LAG: usize = 40;
+const MIN_SAMPLES_PER_INPUT_LAG: usize = 40;
 /// Minimum ratio of the residual sum of squares to the total sum of squares when a column is regressed on the previous
 /// columns. A column with a smaller ratio is omitted.
 const COLUMN_TOLERANCE: f64 = 1e-8;
@@ -385,8 +385,8 @@ pub struct ArxModel {
 #[allow(clippy::cast_precision_loss)]
 pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxModel {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
-    let most = most.min(counts.iter().min().copied().unwrap_or(0) / SAMPLES_A_COEFFICIENT);
-    let lags = most.min(counts.iter().sum::<usize>() / (SAMPLES_AN_INPUT_LAG * inputs.len().max(1)));
+    let most = most.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
+    let lags = most.min(counts.iter().sum::<usize>() / (MIN_SAMPLES_PER_INPUT_LAG * inputs.len().max(1)));
     let start = most.max(lags);
     let fixed = 1 + inputs.len() * lags;
     let size = fixed + most + 1;
@@ -531,7 +531,7 @@ impl Regression {
 #[must_use]
 pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
     // The transform is so long that wrapped-around covariances have decayed.
-    let size = power_above(2 * count + 8 * filter.len()).max(LEAST_CIRCLE);
+    let size = power_above(2 * count + 8 * filter.len()).max(MIN_TRANSFORM_LENGTH);
     let plan = plan(size);
     let mut time = filter.to_vec();
     time.resize(size, 0.0);

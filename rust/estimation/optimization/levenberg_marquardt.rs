@@ -175,7 +175,7 @@ struct SearchState<P: LeastSquaresProblem> {
     damping: f64,
     curvature: Curvature,
     /// Last step in coordinates, and the gradient before it.
-    before: Option<(Vec<f64>, Vec<f64>)>,
+    previous_step_and_gradient: Option<(Vec<f64>, Vec<f64>)>,
 }
 
 impl<P: LeastSquaresProblem> SearchState<P> {
@@ -228,7 +228,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             is_admissible,
             damping,
             curvature,
-            before: None,
+            previous_step_and_gradient: None,
         })
     }
 
@@ -272,7 +272,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 self.fixes_kinks,
             );
             if at.curvature.is_for(at.jacobian.len()) {
-                if let Some((step, gradient)) = at.before.take() {
+                if let Some((step, gradient)) = at.previous_step_and_gradient.take() {
                     let now = linear.gradient_by_parameter();
                     let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
                     at.curvature.update(&step, &change, &linear.columns_along(&step));
@@ -361,7 +361,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                         let with = predicted - linear.curvature_change(&step, &at.curvature);
                         at.curvature.select_model(predicted, with, self.gain);
                     }
-                    at.before = Some((steps.clone(), linear.gradient_by_parameter()));
+                    at.previous_step_and_gradient = Some((steps.clone(), linear.gradient_by_parameter()));
                     if self.gain >= ACCEPTABLE_GAIN_RATIO * decrease {
                         at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);
                     }

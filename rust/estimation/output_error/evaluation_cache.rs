@@ -33,7 +33,7 @@ const MIN_LENGTH_RATIO: f64 = 0.7;
 /// It contains kernels, powers of time, and the inverse A⁻¹ of the system matrix at the last point.
 struct GridCache {
     /// Record of zeros with the length of the longest run.
-    bare: Record,
+    zero_record: Record,
     /// Sensor filter of all signals.
     filter: Option<Rc<SeriesFilter>>,
     /// Number of runs that share the cache.
@@ -43,21 +43,21 @@ struct GridCache {
     /// Initial terms t^e, by the bits of the exponent e.
     powers: HashMap<u64, Rc<InitialTerm>>,
     /// Inverse of the last system matrix, with the bits of the autoregressive terms as key.
-    solved: Option<(Vec<u64>, Rc<SystemInverse>)>,
+    system_inverse: Option<(Vec<u64>, Rc<SystemInverse>)>,
 }
 
 impl GridCache {
     /// Return true if an experiment can share the cache of a longer one.
     fn accepts(&self, experiment: &Experiment) -> bool {
         let record = &experiment.record;
-        let filters = match (self.bare.filter(), record.filter()) {
+        let filters = match (self.zero_record.filter(), record.filter()) {
             (None, None) => true,
             (Some(long), Some(short)) => long.starts_with(short),
             _ => false,
         };
-        let long = self.bare.m();
+        let long = self.zero_record.m();
         filters
-            && self.bare.step().to_bits() == record.step().to_bits()
+            && self.zero_record.step().to_bits() == record.step().to_bits()
             && record.m() <= long
             && record.m() as f64 >= MIN_LENGTH_RATIO * long as f64
     }
@@ -92,15 +92,21 @@ impl EvaluationCache {
                 Some(cached) => cached.clone(),
                 None => {
                     let record = &experiments[k].record;
-                    let bare = Record::from_rows(
+                    let zero_record = Record::from_rows(
                         record.step(),
                         vec![vec![0.0; record.m()]],
                         record.filter().map(<[f64]>::to_vec),
                     )?;
                     let filter = record.filter().map(|series| Rc::new(SeriesFilter::new(series)));
                     let (operators, powers) = (HashMap::new(), HashMap::new());
-                    let grid =
-                        Rc::new(RefCell::new(GridCache { bare, filter, runs: 0, operators, powers, solved: None }));
+                    let grid = Rc::new(RefCell::new(GridCache {
+                        zero_record,
+                        filter,
+                        runs: 0,
+                        operators,
+                        powers,
+                        system_inverse: None,
+                    }));
                     grids.push(grid.clone());
                     grid
                 }
@@ -110,7 +116,7 @@ impl EvaluationCache {
         }
         places.sort_by_key(|(k, _)| *k);
         let cache = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
-            let total = SPECTRUM_FACTORS * grid.borrow().bare.m();
+            let total = SPECTRUM_FACTORS * grid.borrow().zero_record.m();
             Self { stop: stop.clone(), grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
         };
         Ok(places.into_iter().map(cache).collect())
@@ -137,7 +143,7 @@ impl EvaluationCache {
 
     /// Number of pulses of the longest run that shares the cache.
     pub(crate) fn pulses(&self) -> usize {
-        self.grid.borrow().bare.m()
+        self.grid.borrow().zero_record.m()
     }
 
     /// Return true if several runs share the cache.
@@ -153,7 +159,7 @@ impl EvaluationCache {
         if let Some(cached) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
             return cached.clone();
         }
-        let (m, step) = (grid.bare.m(), grid.bare.step());
+        let (m, step) = (grid.zero_record.m(), grid.zero_record.step());
         // Terms of the same order share an operator.
         let same_order = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
         let new_operator = same_order.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
@@ -172,15 +178,16 @@ impl EvaluationCache {
         bits: Vec<u64>,
         compute: impl FnOnce() -> Result<SystemInverse>,
     ) -> Result<Rc<SystemInverse>> {
-        let cached = self.grid.borrow().solved.as_ref().filter(|(cached, _)| *cached == bits).map(|(_, s)| s.clone());
+        let cached =
+            self.grid.borrow().system_inverse.as_ref().filter(|(cached, _)| *cached == bits).map(|(_, s)| s.clone());
         match cached {
             Some(solved) => Ok(solved),
             None => {
                 // Free the memory of the old inverse before computing the new one.
-                self.grid.borrow_mut().solved = None;
+                self.grid.borrow_mut().system_inverse = None;
                 let solved = Rc::new(compute()?);
                 if self.is_shared() {
-                    self.grid.borrow_mut().solved = Some((bits, solved.clone()));
+                    self.grid.borrow_mut().system_inverse = Some((bits, solved.clone()));
                 }
                 Ok(solved)
             }
@@ -196,10 +203,10 @@ impl EvaluationCache {
         model: &FreeModel,
         experiment: &Experiment,
         (signal, eta): (usize, f64),
-        acted: &[(Vec<f64>, Vec<f64>)],
+        nonlinearity_outputs: &[(Vec<f64>, Vec<f64>)],
     ) -> Rc<Kernel> {
         if let Some(law) = model.law_of(signal) {
-            return self.spectrum(&acted[law].0);
+            return self.spectrum(&nonlinearity_outputs[law].0);
         }
         let series = experiment.record.term_signal(signal, eta);
         if experiment.record.m() > MAX_CACHED_PULSES {
@@ -220,14 +227,15 @@ impl EvaluationCache {
         let mut grid = self.grid.borrow_mut();
         // Exponents that change with free orders would fill the cache.
         if grid.powers.len()
-            > if grid.bare.m() > MAX_CACHED_PULSES { MAX_POWERS_LONG_RECORD } else { MAX_POWERS_SHORT_RECORD }
+            > if grid.zero_record.m() > MAX_CACHED_PULSES { MAX_POWERS_LONG_RECORD } else { MAX_POWERS_SHORT_RECORD }
         {
             grid.powers.clear();
         }
         if let Some(cached) = grid.powers.get(&exponent.to_bits()) {
             return cached.clone();
         }
-        let term = Rc::new(InitialTerm::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
+        let term =
+            Rc::new(InitialTerm::new(exponent, grid.zero_record.m(), grid.zero_record.step(), grid.filter.clone()));
         grid.powers.insert(exponent.to_bits(), term.clone());
         term
     }

@@ -295,13 +295,17 @@ impl Experiment {
 
     /// Deviation of an input with a free parameter, and its derivative, at the compared samples.
     ///
-    /// `acted` contains the pulse means of the input after its nonlinearity, and their derivative with respect to the
-    /// parameter. The deviation is half the jump of a zero-order hold, and 0 for other inputs.
-    pub(crate) fn input_point_deviation(&self, signal: usize, acted: &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
+    /// `nonlinearity_output` contains the pulse means of the input after its nonlinearity, and their derivative with
+    /// respect to the parameter. The deviation is half the jump of a zero-order hold, and 0 for other inputs.
+    pub(crate) fn input_point_deviation(
+        &self,
+        signal: usize,
+        nonlinearity_output: &(Vec<f64>, Vec<f64>),
+    ) -> (Vec<f64>, Vec<f64>) {
         let half =
             if self.point_values.get(signal).is_some_and(|instant| instant.is_zero_order_hold) { 0.5 } else { 0.0 };
         let jump = |means: &[f64]| self.sides(means).map(|(a, b)| half * (b - a)).collect();
-        (jump(&acted.0), jump(&acted.1))
+        (jump(&nonlinearity_output.0), jump(&nonlinearity_output.1))
     }
 
     /// The weighted values of the outputs at the compared samples, computed from their pulse means.

@@ -43,7 +43,7 @@ impl Feedthrough {
         experiment: &Experiment,
         structures: &[Structure],
         point: &ParameterPoint,
-        acted: &[(Vec<f64>, Vec<f64>)],
+        nonlinearity_outputs: &[(Vec<f64>, Vec<f64>)],
     ) -> Result<Option<Self>> {
         let terms: Vec<Vec<bool>> = structures
             .iter()
@@ -62,7 +62,7 @@ impl Feedthrough {
                     between[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
                 } else if lacking[term.signal].is_none() {
                     lacking[term.signal] = Some(match model.law_of(term.signal) {
-                        Some(d) => experiment.input_point_deviation(term.signal, &acted[d]),
+                        Some(d) => experiment.input_point_deviation(term.signal, &nonlinearity_outputs[d]),
                         None => (experiment.point_deviation(term.signal), Vec::new()),
                     });
                 }
@@ -175,7 +175,11 @@ const RELATIVE_DIFFERENCE_STEP: f64 = 1e-5;
 
 impl JumpCorrection {
     /// Return the jumps of zero-order-hold signals, and the kinks of linearly interpolated ones.
-    pub(crate) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
+    pub(crate) fn of(
+        model: &FreeModel,
+        experiment: &Experiment,
+        nonlinearity_outputs: &[(Vec<f64>, Vec<f64>)],
+    ) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
                 // Nonuniform samples have an exact kink correction instead.
@@ -187,7 +191,7 @@ impl JumpCorrection {
                 }
                 let unchanged = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.law_of(signal) {
-                    Some(d) => experiment.input_point_deviation(signal, &acted[d]),
+                    Some(d) => experiment.input_point_deviation(signal, &nonlinearity_outputs[d]),
                     None => (
                         experiment.input_point_deviation(signal, &(unchanged.0, vec![0.0; experiment.record.m()])).0,
                         unchanged.1,

@@ -50,7 +50,7 @@ struct Terms {
     /// Distinct integration orders η of the terms.
     etas: Vec<f64>,
     /// Index of the integration order of each term in `etas`.
-    places: Vec<usize>,
+    eta_indices: Vec<usize>,
     coefficients: Vec<f64>,
     /// Input signal of each term; None for a term of the output itself.
     inputs: Vec<Option<usize>>,
@@ -71,7 +71,8 @@ struct Column {
 impl Terms {
     fn of(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
         let structure = &model.structures(&point.orders)[i];
-        let mut terms = Self { etas: Vec::new(), places: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
+        let mut terms =
+            Self { etas: Vec::new(), eta_indices: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
         for (k, term) in structure.terms.iter().enumerate() {
             let eta = structure.order - term.order;
             let own = model.output_index(i, term.signal).is_some();
@@ -80,7 +81,7 @@ impl Terms {
                 return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
             }
             let position = terms.etas.iter().position(|e| e.to_bits() == eta.to_bits());
-            terms.places.push(position.unwrap_or(terms.etas.len()));
+            terms.eta_indices.push(position.unwrap_or(terms.etas.len()));
             if position.is_none() {
                 terms.etas.push(eta);
             }
@@ -102,8 +103,8 @@ impl Terms {
     ///
     /// `powers` contains s^−η of each distinct integration order.
     fn sum(&self, input: Option<usize>, powers: &[Bin], weight: impl Fn(usize) -> Bin) -> Bin {
-        let terms = (0..self.places.len()).filter(|&k| self.inputs[k] == input);
-        terms.map(|k| weight(k) * powers[self.places[k]]).sum()
+        let terms = (0..self.eta_indices.len()).filter(|&k| self.inputs[k] == input);
+        terms.map(|k| weight(k) * powers[self.eta_indices[k]]).sum()
     }
 
     /// Write s^−η of each distinct integration order η to `powers`, and return 1/D; `logarithm` is ln s.
@@ -116,8 +117,8 @@ impl Terms {
     /// Return half of the jump of the step response at t = 0. `weights` returns the weight of a term of the input.
     fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
         let at_once =
-            |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.places[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
-        0.5 * (0..self.places.len()).filter(at_once).map(weights).sum::<f64>()
+            |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.eta_indices[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
+        0.5 * (0..self.eta_indices.len()).filter(at_once).map(weights).sum::<f64>()
     }
 }
 
@@ -231,7 +232,7 @@ impl FractionalOrders {
                 let mut weight_sets = vec![terms.coefficients.clone()];
                 weight_sets.extend(linear.iter().map(|&j| {
                     let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
-                    (0..terms.places.len()).map(slope).collect()
+                    (0..terms.eta_indices.len()).map(slope).collect()
                 }));
                 let (sums, units) = run.responses(experiment, &terms, &weight_sets, &out.exponents[i]);
                 let targets = std::iter::once(&mut remainders).chain(&mut simulation.effects);

@@ -89,7 +89,7 @@ pub(crate) struct Companion {
     /// Pulse width in seconds.
     width: f64,
     /// Cache of discretizations, shared by all experiments with this pulse width.
-    known: RefCell<Vec<Rc<Discretization>>>,
+    discretizations: RefCell<Vec<Rc<Discretization>>>,
 }
 
 /// Key of a discretization: inter-sample behavior, fractional delay in pulses, and first system of two in series.
@@ -101,7 +101,7 @@ type DiscretizationKey = (Option<Intersample>, u64, Option<(Vec<f64>, f64)>);
 struct Discretization {
     key: DiscretizationKey,
     /// Transition matrix over one pulse minus the identity, column-major.
-    growth: Vec<f64>,
+    transition_increment: Vec<f64>,
     gains: Option<InputGains>,
 }
 
@@ -117,7 +117,7 @@ impl Companion {
         let scale = own.iter().enumerate().map(root).fold(0.0, f64::max);
         let scale = if scale > 0.0 && scale.is_finite() { scale } else { 1.0 / step };
         let own = own.iter().enumerate().map(|(i, a)| a * scale.powi(i as i32 - order as i32)).collect();
-        Self { order, scale, own, step: step * scale, width: step, known: RefCell::default() }
+        Self { order, scale, own, step: step * scale, width: step, discretizations: RefCell::default() }
     }
 
     /// Return the companion form for the pulse width `step` from the cache, to which it is added if necessary.
@@ -193,7 +193,7 @@ impl Companion {
         behind: Option<(&[f64], f64)>,
     ) -> Option<Rc<Discretization>> {
         let key = (between, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
-        if let Some(cached) = self.known.borrow().iter().find(|d| d.key == key) {
+        if let Some(cached) = self.discretizations.borrow().iter().find(|d| d.key == key) {
             return Some(cached.clone());
         }
         let n = self.order;
@@ -221,9 +221,10 @@ impl Companion {
             Some(between) => Some(InputGains::new(&interval, &system, &drive, between, fraction)?),
         };
         // Columns are contiguous, so that the states of a step are independent sums.
-        let growth = (0..total * total).map(|k| interval.growth[k % total * total + k / total]).collect();
-        let gain_matrices = Rc::new(Discretization { key, growth, gains });
-        self.known.borrow_mut().push(gain_matrices.clone());
+        let transition_increment =
+            (0..total * total).map(|k| interval.transition_increment[k % total * total + k / total]).collect();
+        let gain_matrices = Rc::new(Discretization { key, transition_increment, gains });
+        self.discretizations.borrow_mut().push(gain_matrices.clone());
         Some(gain_matrices)
     }
 }
@@ -263,7 +264,7 @@ impl Discretization {
                     *v += a * now + b * later;
                 }
             }
-            for (column, x) in self.growth.chunks_exact(n).zip(&state) {
+            for (column, x) in self.transition_increment.chunks_exact(n).zip(&state) {
                 next.iter_mut().zip(column).for_each(|(v, g)| *v += g * x);
             }
             std::mem::swap(&mut state, &mut next);

@@ -448,8 +448,8 @@ type TimePower = (f64, Vec<f64>);
 /// coefficient. The exponent is None for an unscaled coefficient.
 #[derive(Debug, Clone)]
 pub(crate) struct TimeUnit {
-    unit: f64,
-    powers: Vec<Option<TimePower>>,
+    log_unit: f64,
+    exponents: Vec<Option<TimePower>>,
 }
 
 impl TimeUnit {
@@ -465,21 +465,21 @@ impl TimeUnit {
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {
         // Inverse of the geometric mean of the lowest frequency, π/duration, and the Nyquist frequency, π/interval.
-        let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
-        Self { unit, powers: time_powers(model) }
+        let log_unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
+        Self { log_unit, exponents: time_powers(model) }
     }
 
     /// Natural logarithm of the unit of time in seconds.
     pub(crate) fn log_unit(&self) -> f64 {
-        self.unit
+        self.log_unit
     }
 
     /// Factor that converts a coefficient from seconds to the scaled unit of time, at the given orders.
     pub(crate) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
-        self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
+        self.exponents[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
             // Clipping avoids overflow with extreme units.
-            libm::exp((power * self.unit).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR))
+            libm::exp((power * self.log_unit).clamp(-MAX_LOG_FACTOR, MAX_LOG_FACTOR))
         })
     }
 
@@ -488,7 +488,7 @@ impl TimeUnit {
     /// The derivative is taken at a constant value of the coefficient in the scaled unit of time.
     pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
-        self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
+        self.exponents[coefficient].as_ref().map_or(0.0, weight) * self.log_unit
     }
 }
 

@@ -39,9 +39,9 @@ struct InitialTermResponse {
 
 /// Simulation of an experiment from zero initial conditions, before the initial terms are added.
 struct RestSimulation {
-    part: Linearization,
+    linearization: Linearization,
     residuals: Vec<f64>,
-    free: Vec<InitialTermResponse>,
+    initial_responses: Vec<InitialTermResponse>,
 }
 
 impl FreeModel {
@@ -61,21 +61,26 @@ impl FreeModel {
         }
         if !linear.is_empty() {
             let sides: Vec<LinearSide<'_>> = (responses.iter())
-                .map(|RestSimulation { part, residuals, .. }| {
-                    let effects = part.linear_effects.iter().map(|d| &d.samples[..]).collect();
-                    (&residuals[..], &part.basis[..], effects)
+                .map(|RestSimulation { linearization, residuals, .. }| {
+                    let effects = linearization.linear_effects.iter().map(|d| &d.samples[..]).collect();
+                    (&residuals[..], &linearization.basis[..], effects)
                 })
                 .collect();
             let steps = solve_linear_steps(&sides)?;
             linear.iter().zip(&steps).for_each(|(&j, by)| out.point.coefficients[j] += by);
             for (answer, experiment) in responses.iter_mut().zip(experiments) {
-                let Linearization { linear_effects: driven, response, feedthrough: direct, input_means: acted, .. } =
-                    &mut answer.part;
+                let Linearization {
+                    linear_effects: driven,
+                    response,
+                    feedthrough: direct,
+                    input_means: nonlinearity_outputs,
+                    ..
+                } = &mut answer.linearization;
                 for (column, by) in driven.iter_mut().zip(&steps) {
                     column.apply(*by, &mut answer.residuals, response);
                 }
                 if direct.is_some() {
-                    *direct = Feedthrough::of(self, experiment, &structures, &out.point, acted)?;
+                    *direct = Feedthrough::of(self, experiment, &structures, &out.point, nonlinearity_outputs)?;
                 }
             }
         }
@@ -96,22 +101,22 @@ impl FreeModel {
     ) -> Result<RestSimulation> {
         cache.stop.check()?;
         let record = &experiment.record;
-        let acted = (self.inputs.iter().zip(&point.inputs))
+        let nonlinearity_outputs = (self.inputs.iter().zip(&point.inputs))
             .map(|(&input, &value)| self.apply_input_law(record, input, value))
             .collect::<Result<Vec<_>>>()?;
         let operators = self.term_operators(experiment, cache, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let has_level = self.initial.has_level();
         let needs_terms = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
-        let (response, solved) = self.rest_response(experiment, cache, &operators, point, &acted)?;
+        let (response, solved) = self.rest_response(experiment, cache, &operators, point, &nonlinearity_outputs)?;
         cache.stop.check()?;
         let mut residuals = experiment.measured_samples();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.weighted_samples(&response);
-        let jump_correction = JumpCorrection::of(self, experiment, &acted);
+        let jump_correction = JumpCorrection::of(self, experiment, &nonlinearity_outputs);
         jump_correction.correct(self, experiment, point, &mut sampled)?;
         residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
-        let direct = Feedthrough::of(self, experiment, structures, point, &acted)?;
+        let direct = Feedthrough::of(self, experiment, structures, point, &nonlinearity_outputs)?;
         if let Some(direct) = &direct {
             residuals.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
         }
@@ -123,7 +128,7 @@ impl FreeModel {
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "simulation".into(), index });
         }
-        let mut free = Vec::new();
+        let mut initial_responses = Vec::new();
         let mut basis = Vec::new();
         if needs_terms {
             let terms: Vec<(usize, f64)> =
@@ -146,7 +151,7 @@ impl FreeModel {
                     }
                 };
                 extend_orthonormal(&mut basis, samples.clone(), RANK_TOLERANCE);
-                free.push(InitialTermResponse { equation: Some(i), samples, means });
+                initial_responses.push(InitialTermResponse { equation: Some(i), samples, means });
             }
         }
         for i in 0..if has_level { structures.len() } else { 0 } {
@@ -154,21 +159,21 @@ impl FreeModel {
                 .flat_map(|j| experiment.weights_of(j).map(move |w| if i == j { w } else { 0.0 }))
                 .collect();
             extend_orthonormal(&mut basis, samples.clone(), RANK_TOLERANCE);
-            free.push(InitialTermResponse { equation: None, samples, means: Rc::default() });
+            initial_responses.push(InitialTermResponse { equation: None, samples, means: Rc::default() });
         }
-        let mut part = Linearization {
+        let mut linearization = Linearization {
             system: solved,
             operators,
             response,
             basis,
             linear_effects: Vec::new(),
-            input_means: acted,
+            input_means: nonlinearity_outputs,
             feedthrough: direct,
             jump_correction,
             kink_correction,
         };
-        part.linear_effects = self.linear_effects(experiment, cache, &part, point, linear)?;
-        Ok(RestSimulation { part, residuals, free })
+        linearization.linear_effects = self.linear_effects(experiment, cache, &linearization, point, linear)?;
+        Ok(RestSimulation { linearization, residuals, initial_responses })
     }
 
     /// Return the integral operators of the terms, by equation.
@@ -213,7 +218,7 @@ impl FreeModel {
         cache: &mut EvaluationCache,
         operators: &[Vec<Rc<Operator>>],
         point: &ParameterPoint,
-        acted: &[(Vec<f64>, Vec<f64>)],
+        nonlinearity_outputs: &[(Vec<f64>, Vec<f64>)],
     ) -> Result<(PulseMeans, Rc<SystemInverse>)> {
         let (record, n) = (&experiment.record, operators.len());
         let m = record.m();
@@ -241,9 +246,10 @@ impl FreeModel {
                         let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
                         if self.output_index(i, signal).is_none() && c != 0.0 {
                             let eta = operators[i][k].eta();
-                            let series = || Cow::Borrowed(self.input_means(record, (signal, eta), acted));
+                            let series =
+                                || Cow::Borrowed(self.input_means(record, (signal, eta), nonlinearity_outputs));
                             rights.add(i, c, (&operators[i][k], false), series, || {
-                                cache.input_spectrum(self, experiment, (signal, eta), acted)
+                                cache.input_spectrum(self, experiment, (signal, eta), nonlinearity_outputs)
                             });
                         }
                     }
@@ -271,7 +277,7 @@ impl FreeModel {
                     sum.add(
                         c,
                         &operator.spectrum(false),
-                        &cache.input_spectrum(self, experiment, (signal, operator.eta()), acted),
+                        &cache.input_spectrum(self, experiment, (signal, operator.eta()), nonlinearity_outputs),
                     );
                 }
             }
@@ -303,9 +309,9 @@ impl FreeModel {
         &self,
         record: &'a Record,
         (signal, eta): (usize, f64),
-        acted: &'a [(Vec<f64>, Vec<f64>)],
+        nonlinearity_outputs: &'a [(Vec<f64>, Vec<f64>)],
     ) -> &'a [f64] {
-        self.law_of(signal).map_or_else(|| record.term_signal(signal, eta), |law| &acted[law].0)
+        self.law_of(signal).map_or_else(|| record.term_signal(signal, eta), |law| &nonlinearity_outputs[law].0)
     }
 
     /// Estimate the initial terms of an experiment by linear least squares, and append its residuals, initial terms and
@@ -313,10 +319,10 @@ impl FreeModel {
     ///
     /// The estimates follow from a projection of the residuals on the responses to the initial terms.
     fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation<Linearization>) -> Result<()> {
-        let RestSimulation { mut part, mut residuals, free } = answer;
+        let RestSimulation { mut linearization, mut residuals, initial_responses } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
-        if !free.is_empty() {
-            let (places, columns): (Vec<_>, Vec<_>) = free
+        if !initial_responses.is_empty() {
+            let (places, columns): (Vec<_>, Vec<_>) = initial_responses
                 .into_iter()
                 .map(|InitialTermResponse { equation, samples, means }| ((equation, means), samples))
                 .unzip();
@@ -326,14 +332,14 @@ impl FreeModel {
                     initial[*i].push(*x);
                 }
                 residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-                for (total, more) in part.response.iter_mut().zip(means.iter()) {
+                for (total, more) in linearization.response.iter_mut().zip(means.iter()) {
                     total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);
                 }
             }
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(part);
+        out.parts.push(linearization);
         Ok(())
     }
 
@@ -379,7 +385,7 @@ impl FreeModel {
         &self,
         experiment: &Experiment,
         cache: &mut EvaluationCache,
-        part: &Linearization,
+        linearization: &Linearization,
         point: &ParameterPoint,
         coefficients: &[usize],
     ) -> Result<Vec<ParameterEffect>> {
@@ -388,7 +394,7 @@ impl FreeModel {
         }
         let (record, n) = (&experiment.record, self.equations.len());
         let mut driven = Vec::with_capacity(coefficients.len());
-        part.system.inverse()?.solve_each(
+        linearization.system.inverse()?.solve_each(
             (n, record.m()),
             coefficients.len(),
             |place, rights| {
@@ -397,10 +403,11 @@ impl FreeModel {
                     for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
                         let weight = monomial.slope(&point.coefficients, coefficients[place]);
                         if weight != 0.0 {
-                            let eta = part.operators[i][k].eta();
-                            let series = || Cow::Borrowed(self.input_means(record, (*signal, eta), &part.input_means));
-                            rights.add(i, weight, (&part.operators[i][k], false), series, || {
-                                cache.input_spectrum(self, experiment, (*signal, eta), &part.input_means)
+                            let eta = linearization.operators[i][k].eta();
+                            let series =
+                                || Cow::Borrowed(self.input_means(record, (*signal, eta), &linearization.input_means));
+                            rights.add(i, weight, (&linearization.operators[i][k], false), series, || {
+                                cache.input_spectrum(self, experiment, (*signal, eta), &linearization.input_means)
                             });
                         }
                     }
@@ -410,7 +417,7 @@ impl FreeModel {
             |place, means| {
                 let parameter = point.orders.len() + coefficients[place];
                 let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
-                let effect = part.parameter_effect(parameter, means, (self, experiment, point))?;
+                let effect = linearization.parameter_effect(parameter, means, (self, experiment, point))?;
                 if let Some(index) = effect.samples.iter().position(|v| !v.is_finite()) {
                     return Err(Error::Diverged { what: "simulation".into(), index });
                 }

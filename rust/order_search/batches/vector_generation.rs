@@ -281,12 +281,12 @@ impl BatchEvaluation<'_> {
         let problem = &self.candidate_index.problem;
         let first = |solved: &SolvedCandidate| solved.0.iter().position(|p| *p == own[0]).map_or(0.0, |i| solved.1[i]);
         open.sort_by(|a, b| first(a).total_cmp(&first(b)).then_with(|| a.0.cmp(&b.0)));
-        let (mut new_vectors, mut vain) = (Vec::new(), 0);
+        let (mut new_vectors, mut failure_count) = (Vec::new(), 0);
         let mut parts = vec![open];
         #[allow(clippy::cast_precision_loss)]
         let many = |count: usize| count as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS;
         while let Some(mut part) = parts.pop() {
-            if !many(part.len()) || new_vectors.len() >= room || vain >= MAX_FAILED_VECTORS {
+            if !many(part.len()) || new_vectors.len() >= room || failure_count >= MAX_FAILED_VECTORS {
                 continue;
             }
             let middle = part.remove(part.len() / 2);
@@ -301,7 +301,7 @@ impl BatchEvaluation<'_> {
                     part = remaining;
                 }
             }
-            vain += usize::from(!gained);
+            failure_count += usize::from(!gained);
             let above = part.split_off(part.partition_point(|solved| first(solved) < at));
             parts.push(above);
             parts.push(part);

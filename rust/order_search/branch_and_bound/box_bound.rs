@@ -142,13 +142,13 @@ pub(super) struct BoxQuantities {
     /// Row of the slice of the order grid and index within the row, for each of the four corners.
     pub(super) at: [(usize, usize); 4],
     /// One eighth of the squared length of each side, with the length in grid increments.
-    pub(super) wide: [f64; 2],
+    pub(super) interpolation_factors: [f64; 2],
     /// Coefficient p of the first varying column at the four corners.
     pub(super) ps: [f64; 4],
     /// Coefficient q of the second varying column at the four corners.
     pub(super) qs: [f64; 4],
     /// Upper bounds over the box of orders of |p| and |q|, with the coefficients p and q of the two varying columns.
-    pub(super) most: [f64; 2],
+    pub(super) coefficient_bounds: [f64; 2],
     /// Largest deviations of (p + q)/2 and (p − q)/2 over the box of orders from the bilinear functions with the same
     /// corner values. Here p and q are the coefficients of the two varying columns. The deviations are 0 if candidates
     /// are ranked by equation error, whose bound does not need them.
@@ -177,8 +177,8 @@ impl BoxQuantities {
         let slopes = a.slope.abs() + b.slope.abs();
         let (sum, difference) = (a.middle + b.middle, a.middle - b.middle);
         curvature
-            + self.most[0] * a.remainder
-            + self.most[1] * b.remainder
+            + self.coefficient_bounds[0] * a.remainder
+            + self.coefficient_bounds[1] * b.remainder
             + self.bilinear_deviation[0] * (sum.abs() + slopes)
             + self.bilinear_deviation[1] * (difference.abs() + slopes)
     }
@@ -191,13 +191,13 @@ pub(super) struct Moduli {
     others: [[f64; 4]; MAX_REMAINING_COLUMNS],
     /// For each fixed-order column, an upper bound of how far its coefficient deviates from a bilinear function within
     /// the box of orders. The bound includes rounding errors.
-    rests: [f64; MAX_REMAINING_COLUMNS],
+    deviation_bounds: [f64; MAX_REMAINING_COLUMNS],
     /// Modulus, at each corner, of the sum of two coefficients that may cancel. They belong to the fixed-order output
     /// column and to the varying output column.
     sums: [f64; 4],
     /// Upper bound of how far the sum of the two coefficients of `sums` deviates from a bilinear function within the
     /// box of orders. The bound includes rounding errors.
-    sums_rest: f64,
+    sum_deviation_bound: f64,
 }
 
 /// Inner products and denominators of one group of [`LANE_COUNT`] test vectors at the corners of a box of orders, and
@@ -236,7 +236,7 @@ pub(super) struct SliceTables<'a> {
     /// Norms ‖Fᵀt − g t‖ for the fixed-order columns with kernel matrix F and the test vectors t, scaled by the inverse
     /// column norm. Here g is the projection of Fᵀt on t. The entries are sorted by group of test vectors, then by
     /// column.
-    rests: Vec<Wide>,
+    orthogonal_norms: Vec<Wide>,
 }
 
 impl<'a> SliceTables<'a> {
@@ -247,7 +247,7 @@ impl<'a> SliceTables<'a> {
         let mut base_coefficients = vec![0.0; k];
         let rhs: Vec<f64> = others.columns.iter().map(|&s| others.normal.rhs()[s]).collect();
         others.solve(&rhs, &mut base_coefficients);
-        let (mut base, mut rests) = (Vec::new(), Vec::new());
+        let (mut base, mut orthogonal_norms) = (Vec::new(), Vec::new());
         for (r, g) in vector_groups(others.test_vectors) {
             let test_vectors = &others.test_vectors[r];
             let mut slice_products =
@@ -259,7 +259,7 @@ impl<'a> SliceTables<'a> {
                         slice_products[n] -= c * products[n];
                     }
                 }
-                rests.push(rest);
+                orthogonal_norms.push(rest);
             }
             base.push(slice_products);
         }
@@ -276,7 +276,7 @@ impl<'a> SliceTables<'a> {
             base_coefficients,
             unexplained: common.size * common.size - explained,
             base,
-            rests,
+            orthogonal_norms,
         }
     }
 
@@ -377,10 +377,10 @@ impl<'a> SliceTables<'a> {
         let mixed_slopes = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
         Some(BoxQuantities {
             at,
-            wide: [wu, wv],
+            interpolation_factors: [wu, wv],
             ps,
             qs,
-            most: [p_most, q_most],
+            coefficient_bounds: [p_most, q_most],
             bilinear_deviation,
             mixed_slopes,
             explained,
@@ -469,10 +469,10 @@ impl<'a> SliceTables<'a> {
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
         let [u, v] = &self.sides;
-        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding, .. } = *cell;
+        let BoxQuantities { at, interpolation_factors: [wu, wv], ps, qs, rounding, .. } = *cell;
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
-        let (mut others, mut rests) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
+        let (mut others, mut deviation_bounds) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
         for s in 0..k {
             for (c, (i, j)) in at.into_iter().enumerate() {
                 others[s][c] = (self.base_coefficients[s]
@@ -490,9 +490,9 @@ impl<'a> SliceTables<'a> {
                 v.fixed_coefficients[v1 * k + s],
                 wv * lv.fixed_coefficients[sv.at * k + s],
             );
-            rests[s] = cell.remainder([a, b]) + rounding;
+            deviation_bounds[s] = cell.remainder([a, b]) + rounding;
         }
-        let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
+        let (mut sums, mut sum_deviation_bound) = ([0.0; 4], 0.0);
         if let Some(own_fixed_column) = self.own_fixed_column() {
             for (c, (i, j)) in at.into_iter().enumerate() {
                 sums[c] = (self.base_coefficients[own_fixed_column]
@@ -515,9 +515,9 @@ impl<'a> SliceTables<'a> {
                 v.joint_coefficients[v1],
                 wv * curvature(&v.joint_coefficients, v0, v1),
             );
-            sums_rest = cell.remainder([a, b]) + rounding * self.common.ratio;
+            sum_deviation_bound = cell.remainder([a, b]) + rounding * self.common.ratio;
         }
-        Moduli { others, rests, sums, sums_rest }
+        Moduli { others, deviation_bounds, sums, sum_deviation_bound }
     }
 
     /// Return the index of a fixed-order column of the output if a varying column also belongs to the output. `None`
@@ -543,7 +543,7 @@ impl<'a> SliceTables<'a> {
         let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
         let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
         let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
-        let rest = &self.rests[group * k + own_fixed_column];
+        let rest = &self.orthogonal_norms[group * k + own_fixed_column];
         let (mut apart, mut joint) = (0.0, 0.0);
         for n in 0..LANE_COUNT {
             apart += moduli.others[own_fixed_column][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
@@ -567,10 +567,10 @@ impl<'a> SliceTables<'a> {
         let [u, v] = &self.sides;
         let BoxQuantities {
             at,
-            wide: [wu, wv],
+            interpolation_factors: [wu, wv],
             ps,
             qs,
-            most: [p_most, q_most],
+            coefficient_bounds: [p_most, q_most],
             bilinear_deviation,
             mixed_slopes,
             modulus_sum,
@@ -617,13 +617,13 @@ impl<'a> SliceTables<'a> {
                 slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
             }
         }
-        let rest_of = &self.rests[group * k..(group + 1) * k];
+        let rest_of = &self.orthogonal_norms[group * k..(group + 1) * k];
         for (s, rest) in rest_of.iter().enumerate() {
             let joint_coefficients = joint_column == Some(s);
             let (sizes, norms) = if joint_coefficients {
-                (&moduli.sums, moduli.sums_rest)
+                (&moduli.sums, moduli.sum_deviation_bound)
             } else {
-                (&moduli.others[s], moduli.rests[s])
+                (&moduli.others[s], moduli.deviation_bounds[s])
             };
             for n in 0..LANE_COUNT {
                 remainders[1][n] += norms * rest[n];

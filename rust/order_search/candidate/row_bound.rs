@@ -36,10 +36,10 @@ pub(crate) struct CommonFactor<'a> {
 }
 
 impl<'a> CommonFactor<'a> {
-    /// Factor the terms with these columns except term number `but`. `None` if there are too many terms, or if they are
-    /// so nearly dependent that no bound holds.
+    /// Factor the terms with these columns except term number `varying_term`. `None` if there are too many terms, or if
+    /// they are so nearly dependent that no bound holds.
     #[inline(always)]
-    pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], but: usize) -> Option<Self> {
+    pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], varying_term: usize) -> Option<Self> {
         let count = columns.len().checked_sub(1).filter(|count| *count <= MAX_COMMON_TERMS)?;
         let zero = [0.0; MAX_COMMON_TERMS];
         let mut shared = Self {
@@ -55,7 +55,7 @@ impl<'a> CommonFactor<'a> {
             trace: 0.0,
         };
         for i in 0..count {
-            shared.columns[i] = columns[i + usize::from(i >= but)];
+            shared.columns[i] = columns[i + usize::from(i >= varying_term)];
             shared.extend(i);
         }
         // This form of the condition also rejects NaN.
@@ -259,12 +259,12 @@ mod tests {
                 terms,
                 1,
             );
-            let but = case as usize % terms;
+            let varying_term = case as usize % terms;
             let others: Vec<usize> = (0..terms - 1).collect();
             let changing: Vec<usize> = (terms - 1..columns.len()).collect();
             let mut named = others.clone();
-            named.insert(but, changing[0]);
-            let Some(shared) = CommonFactor::new(&squares, &named, but) else {
+            named.insert(varying_term, changing[0]);
+            let Some(shared) = CommonFactor::new(&squares, &named, varying_term) else {
                 none += 1;
                 continue;
             };

@@ -42,7 +42,7 @@ pub(super) struct CellProducts {
     /// Upper bounds of the norms of the mth derivatives of the column of term j, by m, then j.
     pub(super) sizes: [Row; EXPANSION_COLUMNS],
     /// Upper bound of the remainder of the expansion of each column within the cell (box of orders).
-    pub(super) rests: Row,
+    pub(super) remainder_bounds: Row,
     /// Half width of the cell (box of orders) for each order of integration.
     pub(super) halves: Row,
     /// Upper bound of the rounding error in the inner product of two unit-norm columns.
@@ -57,7 +57,7 @@ impl CellProducts {
             products: [[[0.0; MAX_TERMS]; MAX_TERMS]; EXPANSION_COLUMNS],
             target: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
             sizes: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
-            rests: [0.0; MAX_TERMS],
+            remainder_bounds: [0.0; MAX_TERMS],
             halves: [0.0; MAX_TERMS],
             // The rounding error of products of stored columns is an eighth of the error of a chain of transforms.
             rounding: rounding_unit(samples) / 8.0,
@@ -115,8 +115,8 @@ impl CellProducts {
         for j in 0..k {
             let half = self.halves[j];
             tau[j] = along(0, j).abs() + self.rounding * all;
-            gamma[j] =
-                taylor_sum(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j]) + size * self.rests[j];
+            gamma[j] = taylor_sum(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j])
+                + size * self.remainder_bounds[j];
             for i in 0..k {
                 let part = |m: usize| -> (f64, f64) {
                     let terms = (0..k).map(|l| inverse[i][l] * self.products[m][l][j]);
@@ -127,7 +127,7 @@ impl CellProducts {
                     let (sum, all) = part(m);
                     sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
                 });
-                let outer = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.rests[j];
+                let outer = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.remainder_bounds[j];
                 a[i][j] = within + outer;
             }
         }
@@ -283,7 +283,7 @@ pub(super) fn expand_cell(
             local.target[m][j] = target_product((j, m));
             local.sizes[m][j] = curve.sizes[m];
         }
-        local.rests[j] = curve.remainder;
+        local.remainder_bounds[j] = curve.remainder;
         local.halves[j] = half;
         span.add(half, curve.sizes, curve.remainder);
     }

@@ -65,7 +65,7 @@ pub(super) struct GramTables {
     sizes: Vec<[f64; EXPANSION_COLUMNS]>,
     /// For each node, an upper bound of the remainder of the Taylor series of a regressor column in its order. A node
     /// is an order about which columns are expanded.
-    rests: Vec<f64>,
+    remainder_bounds: Vec<f64>,
 }
 
 /// Distance from an interval, relative to its width, up to which orders belong to it. It is above the rounding error.
@@ -82,7 +82,7 @@ struct Middle {
     /// Index of the node about which inner products are expanded.
     node: usize,
     /// Powers of the distance of the midpoint from the node, divided by factorials, from power 0 on.
-    off: [f64; EXPANSION_COLUMNS],
+    taylor_powers: [f64; EXPANSION_COLUMNS],
     /// Half width of the interval of orders of integration.
     half: f64,
 }
@@ -211,7 +211,7 @@ impl GramTables {
             products,
             target: along,
             sizes: curves.iter().map(|c| c.sizes).collect(),
-            rests: curves.iter().map(|c| c.remainder).collect(),
+            remainder_bounds: curves.iter().map(|c| c.remainder).collect(),
         })
     }
 
@@ -244,7 +244,7 @@ impl GramTables {
     fn middle(&self, cell: &Cell) -> [Middle; MAX_TERMS] {
         let mut out = [Middle::default(); MAX_TERMS];
         for (term, ((stretches, fixed_node), out)) in self.terms.iter().zip(&mut out).enumerate() {
-            (out.node, out.off[0]) = (*fixed_node, 1.0);
+            (out.node, out.taylor_powers[0]) = (*fixed_node, 1.0);
             let Some(stretches) = stretches else { continue };
             let (level, at) = (cell.level[term], cell.at[term]);
             let above = level.min(self.table_level);
@@ -255,8 +255,8 @@ impl GramTables {
             let distance = f64::from(2 * at + 1) * out.half - f64::from(2 * whole + 1) * cell_width(above) / 2.0;
             for m in 1..EXPANSION_COLUMNS {
                 #[allow(clippy::cast_precision_loss)]
-                let next = out.off[m - 1] * distance / m as f64;
-                out.off[m] = next;
+                let next = out.taylor_powers[m - 1] * distance / m as f64;
+                out.taylor_powers[m] = next;
             }
         }
         out
@@ -277,7 +277,7 @@ impl GramTables {
         let mut sum = 0.0;
         for p in n..EXPANSION_COLUMNS {
             for q in m..EXPANSION_COLUMNS {
-                let weight = a.off[p - n] * b.off[q - m];
+                let weight = a.taylor_powers[p - n] * b.taylor_powers[q - m];
                 if weight != 0.0 {
                     sum += weight * self.raw((a.node, p), (b.node, q));
                 }
@@ -289,7 +289,7 @@ impl GramTables {
     /// Return the product of the measured output with the mth derivative of a column at a cell (box of orders)
     /// midpoint. Also return an upper bound of the norm of this derivative.
     fn target_product(&self, a: &Middle, m: usize) -> (f64, f64) {
-        let all = (m..EXPANSION_COLUMNS).map(|q| (a.off[q - m], q));
+        let all = (m..EXPANSION_COLUMNS).map(|q| (a.taylor_powers[q - m], q));
         all.fold((0.0, 0.0), |(sum, size), (weight, q)| {
             (sum + weight * self.target[q][a.node], size + weight.abs() * self.sizes[a.node][q])
         })
@@ -307,7 +307,7 @@ impl GramTables {
                 }
                 (local.target[m][j], local.sizes[m][j]) = self.target_product(b, m);
             }
-            local.rests[j] = self.rests[b.node];
+            local.remainder_bounds[j] = self.remainder_bounds[b.node];
             local.halves[j] = b.half;
         }
         local
@@ -319,7 +319,7 @@ impl GramTables {
         let mut span = DerivativeSubspace::new(self.samples);
         for middle in middles.iter().take(self.terms.len()) {
             let sizes = std::array::from_fn(|m| self.target_product(middle, m).1);
-            span.add(middle.half, sizes, self.rests[middle.node]);
+            span.add(middle.half, sizes, self.remainder_bounds[middle.node]);
         }
         let product = |(i, n): (usize, usize), (j, m): (usize, usize)| self.product(&middles[i], n, &middles[j], m);
         span.fill(product, |(j, m)| self.target_product(&middles[j], m).0);

@@ -116,12 +116,12 @@ struct Vector {
     /// product Fᵀt is the time reversal of F applied to the time-reversed t.
     spectra: [Kernel; 2],
     /// Product Fᵀt of the test vector t with the convolution matrix F of the current column, in reversed time.
-    here: [Vec<f64>; 2],
+    current_product: [Vec<f64>; 2],
     /// Product Fᵀt of the test vector t with the convolution matrix F of the previous column, in reversed time.
-    before: [Vec<f64>; 2],
+    previous_product: [Vec<f64>; 2],
     /// Projection of Fᵀt on t for the most recent column (real and imaginary part), and a bound of the rounding error
     /// of Fᵀt. Here t is the test vector, and F is the convolution matrix of the column.
-    last: Option<[f64; 3]>,
+    last_projection: Option<[f64; 3]>,
 }
 
 impl Vector {
@@ -129,7 +129,15 @@ impl Vector {
     fn with_samples(m: usize) -> Self {
         let none = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::zeros(m));
-        Self { halves: none(), number: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
+        Self {
+            halves: none(),
+            number: 0,
+            size: 0.0,
+            spectra,
+            current_product: none(),
+            previous_product: none(),
+            last_projection: None,
+        }
     }
 
     /// Compute the spectra of the test vector stored in `halves`. `which` is its index, and `size` its dual norm.
@@ -137,19 +145,20 @@ impl Vector {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
         }
-        (self.number, self.size, self.last) = (which, size, None);
+        (self.number, self.size, self.last_projection) = (which, size, None);
     }
 
     /// Return the entries of [`divisor_effects`] for the next output column, with the distance from the previous column
     /// in place of the path length. `length` is the sum of the moduli of the column's kernel.
     fn apply_column(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
-        std::mem::swap(&mut self.here, &mut self.before);
-        for (spectrum, product) in self.spectra.iter().zip(&mut self.here) {
+        std::mem::swap(&mut self.current_product, &mut self.previous_product);
+        for (spectrum, product) in self.spectra.iter().zip(&mut self.current_product) {
             column.times(spectrum, product, buffers);
         }
-        let before = self.last.map(|last| (&self.before, last));
-        let [g, h, rest, rounding, step] = column_effect(&self.halves, &self.here, before, norm, unit * length);
-        self.last = Some([g, h, rounding]);
+        let before = self.last_projection.map(|last| (&self.previous_product, last));
+        let [g, h, rest, rounding, step] =
+            column_effect(&self.halves, &self.current_product, before, norm, unit * length);
+        self.last_projection = Some([g, h, rounding]);
         let truncation = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
         [g * self.size, h * self.size, rest + truncation, step]
     }

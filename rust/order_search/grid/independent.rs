@@ -247,7 +247,7 @@ pub(crate) struct GroupTuples {
     /// Number of allowed combinations of all orders of the signal.
     pub(super) count: u64,
     /// Number of allowed combinations before the prefixes 0, [`PREFIX_STRIDE`], 2·[`PREFIX_STRIDE`], …
-    pub(super) before: Vec<u64>,
+    pub(super) cumulative_counts: Vec<u64>,
 }
 
 /// Set of positions in an axis (list of orders), as a bit set of 64-bit words.
@@ -391,15 +391,15 @@ impl Group {
     pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];
-        let mut before = Vec::with_capacity(prefixes / PREFIX_STRIDE + 1);
+        let mut cumulative_counts = Vec::with_capacity(prefixes / PREFIX_STRIDE + 1);
         let mut count = 0;
         for prefix in 0..prefixes {
             if prefix % PREFIX_STRIDE == 0 {
-                before.push(count);
+                cumulative_counts.push(count);
             }
             self.decode(&first, prefix, &mut digits);
             count += self.count_completions(&first, &digits);
         }
-        GroupTuples { first, prefixes, count, before }
+        GroupTuples { first, prefixes, count, cumulative_counts }
     }
 }

@@ -31,7 +31,7 @@ pub struct OrderLawGrid {
     /// Number of combinations of values of the free orders.
     product: u64,
     /// Output and term index of each term with a fixed coefficient.
-    known: Vec<(usize, usize)>,
+    fixed_coefficient_terms: Vec<(usize, usize)>,
 }
 
 impl OrderLawGrid {
@@ -83,7 +83,7 @@ impl OrderLawGrid {
                 equations: equations.to_vec(),
                 inputs: inputs.to_vec(),
                 product: count,
-                known: Vec::new(),
+                fixed_coefficient_terms: Vec::new(),
             }),
             _ => Err(Error::OrderGridTooLarge { count: product, limit: MAX_TUPLES }),
         }
@@ -99,7 +99,7 @@ impl OrderLawGrid {
             let fixed_terms = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
             fixed_terms.map(|(k, _)| (equation.output, k))
         });
-        self.known = terms.collect();
+        self.fixed_coefficient_terms = terms.collect();
         self
     }
 
@@ -177,7 +177,7 @@ impl OrderLawGrid {
                     && !input(signal)
                     && order > alpha
                     && order < alpha + MAX_EXCESS - ORDER_GRAIN
-                    && self.known.contains(&(equation.output, k))
+                    && self.fixed_coefficient_terms.contains(&(equation.output, k))
         };
         alpha_fits(alpha)
             && equation.terms.iter().zip(&orders[1..]).enumerate().all(|(k, (term, &order))| fit(k, term.0, order))

@@ -93,8 +93,8 @@ impl<'a> Cursor<'a> {
     /// Move a group (the terms of one signal) to its combination of orders with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
         let (group, slice) = (&self.grid.groups[g], &self.grid.blocks[self.block].tuples[g]);
-        let block = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
-        let mut rest = rank - slice.before[block];
+        let block = slice.cumulative_counts.partition_point(|&b| b <= rank).saturating_sub(1);
+        let mut rest = rank - slice.cumulative_counts[block];
         for prefix in block * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
             let completions = group.count_completions(&slice.first, &self.digits[g]);

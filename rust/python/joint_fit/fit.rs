@@ -24,7 +24,7 @@ use crate::recording::Recordings;
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 /// Resources of a fit: (number of threads, memory limit of one order grid \[bytes\]).
-type Means = (usize, u64);
+type FitResources = (usize, u64);
 
 /// Candidates of a multistart, best first. Later fits of the same structure to the same runs can start from these
 /// candidates.
@@ -48,7 +48,7 @@ pub fn joint_multistart(
     py: Python<'_>,
     problem: &JointProblem,
     runs: List<Py<Recording>>,
-    means: Means,
+    means: FitResources,
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<JointMultistart> {
@@ -82,7 +82,7 @@ pub fn joint_fit<'py>(
     candidates: Option<&JointMultistart>,
     huber: bool,
     refine: bool,
-    means: Means,
+    means: FitResources,
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<Option<Bound<'py, PyDict>>> {

@@ -25,7 +25,7 @@ use crate::recording::{Recordings, Sampling};
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
 /// Approximate number of sampling intervals, over all runs, to which initial guesses of problems of integer orders are
 /// fitted.
-const GUESS_INTERVALS: usize = 2000;
+const INITIAL_GUESS_INTERVALS: usize = 2000;
 /// Number of leading intervals of a long record, over all runs, to which submodels and survivors are fitted.
 pub const SELECTION_INTERVALS: usize = 6000;
 
@@ -134,7 +134,7 @@ fn guess_samplings(
     source: &Recordings,
     leading_intervals: Option<usize>,
 ) -> Result<Vec<Sampling>> {
-    let Some(first) = leading_part(free, source, GUESS_INTERVALS)? else { return Ok(Vec::new()) };
+    let Some(first) = leading_part(free, source, INITIAL_GUESS_INTERVALS)? else { return Ok(Vec::new()) };
     let intervals = source.runs().iter().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / first;
     if decimation < 2 {

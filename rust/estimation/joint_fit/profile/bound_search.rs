@@ -105,18 +105,18 @@ pub struct BoundSearch {
     /// Distance of the next refit from the optimum.
     distance: f64,
     /// Distance between the optimum and the last refit whose cost is below the threshold.
-    inside: f64,
+    inner_distance: f64,
     /// Distance between the optimum and the nearest refit whose cost is above the threshold; infinite if there is none.
-    outside: f64,
+    outer_distance: f64,
     /// Result of the last refit whose cost is below the threshold.
-    within: OptimizationResult,
+    inner_result: OptimizationResult,
     /// Result of the refit that was interrupted when the budget was exhausted; the next refit starts from it.
-    origin: Option<OptimizationResult>,
+    interrupted_result: Option<OptimizationResult>,
     refits: usize,
     /// Square root of the cost rise at the previous step.
-    reached: f64,
+    previous_rise: f64,
     /// Increase of the square root of the cost rise in the previous step.
-    gained: f64,
+    previous_rise_increment: f64,
     points: Vec<(f64, f64)>,
     evaluations: usize,
 }
@@ -139,13 +139,13 @@ impl BoundSearch {
             first,
             farthest,
             distance: first.min(farthest),
-            inside: 0.0,
-            outside: f64::INFINITY,
-            within: around.best.clone(),
-            origin: None,
+            inner_distance: 0.0,
+            outer_distance: f64::INFINITY,
+            inner_result: around.best.clone(),
+            interrupted_result: None,
             refits: 0,
-            reached: 0.0,
-            gained: f64::INFINITY,
+            previous_rise: 0.0,
+            previous_rise_increment: f64::INFINITY,
             points: Vec::new(),
             evaluations: 0,
         }
@@ -167,12 +167,14 @@ impl BoundSearch {
         allowed: usize,
         is_cancelled: &dyn Fn() -> bool,
     ) -> Result<BoundOutcome> {
-        while self.refits < MAX_REFITS_PER_BOUND && (self.origin.is_some() || self.distance > self.inside) {
+        while self.refits < MAX_REFITS_PER_BOUND
+            && (self.interrupted_result.is_some() || self.distance > self.inner_distance)
+        {
             around.stop().check()?;
             if is_cancelled() {
                 return Ok(BoundOutcome::Paused);
             }
-            let origin = self.origin.take().unwrap_or_else(|| self.within.clone());
+            let origin = self.interrupted_result.take().unwrap_or_else(|| self.inner_result.clone());
             let budget = MAX_REFIT_EVALUATIONS.min(allowed.saturating_sub(self.evaluations));
             let refit = match budget {
                 0 => Refit::Infeasible,
@@ -190,7 +192,7 @@ impl BoundSearch {
             self.evaluations += used;
             if budget < MAX_REFIT_EVALUATIONS && used >= budget {
                 // The result of an interrupted refit is not a point of the profile.
-                self.origin = Some(refit_result.unwrap_or(origin));
+                self.interrupted_result = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
             }
             self.refits += 1;
@@ -200,8 +202,8 @@ impl BoundSearch {
         }
         // The interval is bounded only if some finite cost beyond the threshold was computed.
         let is_bounded =
-            self.outside.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
-        let bound = if is_bounded { self.start + self.side * self.outside } else { self.side * f64::INFINITY };
+            self.outer_distance.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
+        let bound = if is_bounded { self.start + self.side * self.outer_distance } else { self.side * f64::INFINITY };
         Ok(BoundOutcome::Found(self.side_of(bound)))
     }
 
@@ -227,16 +229,16 @@ impl BoundSearch {
             }
             near = (rise / width - 1.0).abs() <= RISE_TOLERANCE;
             let short = (following - self.distance).abs() <= BOUND_TOLERANCE * self.distance;
-            if near && short && self.inside < following && following <= self.farthest {
+            if near && short && self.inner_distance < following && following <= self.farthest {
                 return Some(following);
             }
         }
         match refit_result {
             Some(refit_result) if rise <= width => {
-                (self.inside, self.within) = (self.distance, refit_result);
-                if self.distance >= self.outside {
+                (self.inner_distance, self.inner_result) = (self.distance, refit_result);
+                if self.distance >= self.outer_distance {
                     // The earlier refit at the outer point did not find the optimum.
-                    self.outside = f64::INFINITY;
+                    self.outer_distance = f64::INFINITY;
                 }
                 if self.distance >= self.farthest {
                     self.distance = f64::NAN;
@@ -244,16 +246,16 @@ impl BoundSearch {
                 }
             }
             _ => {
-                if self.distance >= self.outside {
+                if self.distance >= self.outer_distance {
                     // Small steps confirm that the outer point is outside: the profile jumps here, or the simulation
                     // diverges.
                     self.distance = f64::NAN;
                     return None;
                 }
-                self.outside = self.distance;
+                self.outer_distance = self.distance;
             }
         }
-        let (inside, outside) = (self.inside, self.outside);
+        let (inside, outside) = (self.inner_distance, self.outer_distance);
         let closed = outside.is_finite();
         let scale = outside.min((self.start + self.side * inside).abs()).max(BRACKET_SCALE_RATIO * outside);
         let narrow = closed && outside - inside <= BOUND_TOLERANCE * scale;
@@ -261,14 +263,15 @@ impl BoundSearch {
             // Close to the bound, Newton's step is more accurate than a step of fixed ratio.
             self.distance = following;
         } else if !closed {
-            let gain = rise - self.reached;
-            self.reached = rise;
-            let levels = gain <= LEVELING_RATIO * self.gained && rise + gain < (1.0 - LEVELING_MARGIN) * width;
+            let gain = rise - self.previous_rise;
+            self.previous_rise = rise;
+            let levels =
+                gain <= LEVELING_RATIO * self.previous_rise_increment && rise + gain < (1.0 - LEVELING_MARGIN) * width;
             if levels && self.distance > MAX_STEP_FACTOR * self.first {
                 self.distance = f64::NAN;
                 return None;
             }
-            self.gained = gain;
+            self.previous_rise_increment = gain;
             let longest = (MAX_STEP_FACTOR * self.distance).min(self.farthest);
             self.distance = following.max(MIN_STEP_FACTOR * self.distance).min(longest);
         } else if narrow {
@@ -285,11 +288,12 @@ impl BoundSearch {
     /// Distance from the optimum to the midpoint of the bracket. The midpoint is a geometric mean if the parameter has
     /// the same sign at both ends.
     fn bracket_midpoint(&self) -> f64 {
-        let (inner, outer) = (self.start + self.side * self.inside, self.start + self.side * self.outside);
+        let (inner, outer) =
+            (self.start + self.side * self.inner_distance, self.start + self.side * self.outer_distance);
         if inner * outer > 0.0 {
             self.side * ((inner * outer).sqrt().copysign(inner) - self.start)
         } else {
-            0.5 * (self.inside + self.outside)
+            0.5 * (self.inner_distance + self.outer_distance)
         }
     }
 }
