@@ -265,3 +265,18 @@ def test_colored_noise_alone_starts_no_multistart(monkeypatch):
     # A missing lag is found from an automatic start.
     codes_of(record([1.0], [0.3 / RATE**2, 1.3 / RATE, 1.0], 0, 0, [1.0]))
     assert automatic
+
+
+@pytest.mark.parametrize("rows", [40, 200])
+def test_color_under_a_constant_input_is_not_blamed_on_the_model(rows):
+    """A step from the first row on: residuals of the right structure are colored, and no test tells why."""
+    found = []
+    for seed in range(6):
+        g = np.random.default_rng(seed)
+        t = np.arange(rows) * STEP
+        e = signal.lfilter([1.0], [1.0, -0.9], g.standard_normal(rows))
+        y = 2.0 * (1.0 - np.exp(-6.0 * t / t[-1])) + 0.03 * e / e.std()
+        found.append(codes_of(ftlm.Run.from_arrays(step=STEP, inputs={"u": np.ones(rows)}, outputs={"y": y})))
+    wrong = {"residuals_not_white", "output_not_white", "noise_coloured", "dynamics_missing"}
+    assert all(wrong.isdisjoint(codes) for codes in found), found
+    assert sum("color_undecided" in codes for codes in found) >= 4, found

@@ -329,7 +329,9 @@ def assess_fit(fit: Fit) -> Identification:
         # Residuals of unstable simulations are no test of the model.
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
-    if tests is not None:
+    if tests is None:
+        findings = [_undecided_color(f) if f.code == "residuals_not_white" else f for f in findings]
+    else:
         extensions = run_extension_tests(fit, tests)
         missing = extensions.findings
         if extensions.friction_tested:
@@ -396,6 +398,11 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
     return lambda: output_sensitivities(joint, request, fit.task.runs)
 
 
+def _undecided_color(item: Finding) -> Finding:
+    """Return the finding that replaces one on colored residuals if no input tells noise from missing dynamics."""
+    return make_finding("color_undecided", output=item.output)
+
+
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
     """Return a finding, replaced by a less severe one if the residuals are noise that no input explains.
 
@@ -407,6 +414,8 @@ def _noise_finding(item: Finding, tests: Residuals) -> Finding:
         return make_finding("end_row_far_off", output=item.output, inner=inner, **item.numbers)
     if item.code == "explains_little" and is_buried(tests.outputs[item.output]):
         return make_finding("buried_in_noise", output=item.output, **item.numbers)
+    if item.code == "residuals_not_white" and tests.outputs[item.output].is_undecided:
+        return _undecided_color(item)
     colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise
     return make_finding("noise_coloured", output=item.output) if colored else item
 
@@ -472,7 +481,7 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return [f for f in residual_findings(tests) if f.code != "residuals_follow_direction"]
-    codes = ("output_not_white", "noise_coloured")
+    codes = ("output_not_white", "noise_coloured", "color_undecided")
     return [f for f in residual_findings(tests, floor=ROUNDING_RESIDUAL_RATIO) if f.code not in codes]
 
 

@@ -431,7 +431,9 @@ def _residual_findings(result: Identification) -> Iterator[Finding]:
     colored_outputs = (
         [] if has_loop_model else [o for o, r in outputs.items() if not (r.whiteness.passed or r.is_noise)]
     )
-    yield from (make_finding("residuals_not_white", output=o) for o in colored_outputs)
+    for name in colored_outputs:
+        code = "color_undecided" if outputs[name].is_undecided else "residuals_not_white"
+        yield make_finding(code, output=name)
 
 
 def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:

@@ -6,6 +6,7 @@ import importlib
 import io
 import math
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, islice
@@ -219,6 +220,10 @@ def _draw_correlations(axis: Any, chart: CorrelationMap) -> None:
     axis.figure.colorbar(drawn, ax=axis, label="correlation")
 
 
+#: Maximum number of characters in a line of the label of a color bar.
+COLORBAR_LABEL_CHARACTERS = 40
+
+
 def _draw_landscape(axis: Any, chart: Landscape) -> None:
     norm = importlib.import_module("matplotlib.colors").LogNorm()
     drawn = axis.pcolormesh(chart.x, chart.y, chart.valid_scores, norm=norm, cmap="viridis", shading="nearest")
@@ -228,7 +233,9 @@ def _draw_landscape(axis: Any, chart: Landscape) -> None:
     axis.plot(chart.x[column], chart.y[row], "o", **ring)
     xlabel, ylabel = (escape_math(f"order {symbol(name)}") for name in chart.names)
     axis.set(xlabel=xlabel, ylabel=ylabel)
-    axis.figure.colorbar(drawn, ax=axis, label=f"{chart.score} (grey: no candidate, or diverged)")
+    # A long label does not fit along the bar.
+    label = textwrap.fill(f"{chart.score} (grey: no candidate, or diverged)", COLORBAR_LABEL_CHARACTERS)
+    axis.figure.colorbar(drawn, ax=axis, label=label)
 
 
 #: Height of a residual plot, as a fraction of the height of the fit plot above it.

@@ -172,6 +172,11 @@ class OutputResiduals:
         return all(test.passed for test in self.informative_tests.values())
 
     @property
+    def is_undecided(self) -> bool:
+        """Whether no test of independence is conclusive, such as for a constant input or a short run."""
+        return not any(test.conclusive for test in self.inputs.values())
+
+    @property
     def informative_tests(self) -> dict[str, CorrelationTest]:
         """Tests of the inputs that vary, or of all inputs if none does."""
         return {n: t for n, t in self.inputs.items() if t.conclusive or not math.isnan(t.limit)} or self.inputs
@@ -617,8 +622,10 @@ def failed_tests(tests: Residuals) -> list[Finding]:
         white = output.whiteness
         if not white.passed and not output.follows_direction:
             numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
-            noise = make_finding("noise_coloured", output=name)
-            findings.append(noise if output.is_noise else make_finding("output_not_white", output=name, **numbers))
+            code = "output_not_white"
+            if output.is_undecided or output.is_noise:
+                code, numbers = "color_undecided" if output.is_undecided else "noise_coloured", {}
+            findings.append(make_finding(code, output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
