@@ -72,8 +72,8 @@ pub struct BatchPosition {
     pub size: u64,
     /// Limit of the raw score (Σ|e| or Σe²) for that chunk.
     pub limit: f64,
-    /// Digest of the evaluation sequence of the candidates of the batch that no bound excluded. It is below 2^63, and 0
-    /// if `end` is 0.
+    /// Digest of the sequence in which the batch evaluates the candidates that no bound excludes. It is below 2^63, and
+    /// 0 if `end` is 0.
     pub order: u64,
 }
 

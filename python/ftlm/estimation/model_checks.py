@@ -38,7 +38,7 @@ from ftlm.validation.data_advice import check_excitation, find_dead_channel
 #: Maximum absolute correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
 #: Minimum number of samples per period of a mode, below which its parameters depend on the assumed intersample behavior
-#: of the inputs; and damping ratio from which on a mode does not count as oscillatory.
+#: of the inputs; and minimum damping ratio of a mode that does not count as oscillatory.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
 #: Maximum relative standard error of a well-determined coefficient or delay, and maximum standard error of an order.
 #: The 95 % interval is then shorter than half the value, or than the increment 0.5 between orders of common mechanisms.

@@ -19,7 +19,7 @@ from ftlm.utils.formatting import attributes, finite, format_bound, json_value
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
 
-#: Fraction of a limit from which on the limit counts as an active constraint.
+#: Minimum fraction of a limit at which it counts as an active constraint.
 ACTIVE_LIMIT_FRACTION = 0.98
 #: Maximum number of candidate inputs that are listed in the printed text.
 MAX_PRINTED_INPUTS = 6

@@ -680,7 +680,7 @@ MAX_PROBE_FRACTION, PROBE_TIME_S = 1 / 12, 0.3
 TIME_EXPONENT_RANGE = (0.7, 1.1)
 #: Range of the ratio of the actual to the extrapolated computing time.
 TIME_FACTOR_RANGE = (0.6, 4.0)
-#: Number of candidates from which on whole boxes may be excluded, and the exponent of time over candidates above it.
+#: Minimum number of candidates with which whole boxes may be excluded, and exponent of time over candidates above it.
 #: Searches on coarse grids do not show this effect.
 BOX_EXCLUSION_CANDIDATES, BOX_TIME_EXPONENT = 1 << 25, 0.5
 

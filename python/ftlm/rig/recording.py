@@ -122,7 +122,9 @@ class PartialRecording:
             self._append(text.encode())
             self.kept += len(rows)
         except OSError as error:
-            raise RigFault(f"the recording cannot be written to disk ({error.strerror or error}); make space") from None
+            raise RigFault(
+                f"the recording cannot be written to disk ({error.strerror or error}); free disk space, or choose another folder"
+            ) from None
 
     def _append(self, content: bytes) -> None:
         if self._descriptor is None:

@@ -48,7 +48,7 @@ class OutputGate:
             self.reason = self.reason or reason
 
     def check(self) -> None:
-        """Raise RigFault with the reason if the gate is closed."""
+        """Raise RigFault with its reason if the gate is closed, so that it passes no command to the motors."""
         if self.reason is not None:
             raise RigFault(self.reason)
 

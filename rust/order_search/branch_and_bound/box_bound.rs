@@ -221,7 +221,8 @@ pub(super) struct CornerValues {
 pub(super) struct SliceTables<'a> {
     pub(super) others: &'a RemainingColumns<'a>,
     pub(super) common: &'a SearchConstants,
-    /// Tables along the two varying orders. The first order changes from row to row, the second within a row.
+    /// Tables of the values of the two varying orders. In the grid of order pairs, the first order determines the row,
+    /// the second the column.
     pub(super) sides: [AxisTable; 2],
     /// Index in `sides` of the order that belongs to terms of the output. `None` if neither order does.
     own: Option<usize>,
