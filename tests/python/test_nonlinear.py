@@ -252,7 +252,7 @@ def test_an_input_that_makes_the_output_jump_is_refused():
         (
             TEXT,
             {"y": 0.3},
-            "the operating point of u is not given, and 0.7 (y)*u depends on it; give its value with at={'u': …}",
+            "the operating point of u is not given, and 0.7 (y)*u depends on it; give its value with at=",
         ),
         (TEXT, {"y": 0.3, "u": 0, "v": 1}, "operating point 'v' does not occur in the equation"),
         (TEXT, {"y": 0.3, "u": 0, "sin(y)": 1}, "the operating point 'sin(y)' is not a signal"),

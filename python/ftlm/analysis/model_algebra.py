@@ -276,7 +276,7 @@ def linearize(model: Model, at: Mapping[str, float]) -> Model:
         if c not in point and c[1] == 0:
             raise ModelError(
                 f"the operating point of {c[0]} is not given, and {next(t for k, t in pairs if k == c)} depends on it; "
-                f"give its value with at={{{c[0]!r}: …}}"
+                f"give its value with {parameter('at')}"
             )
     values = {c: point.get(c, 0.0) for c in channels}
     equations = tuple(_linearized_equation(item, values) for item in model.equations)

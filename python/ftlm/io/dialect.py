@@ -642,7 +642,7 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], lines: list[_Line], s
         at, example = rows[0][0].at, rows[0][1].strip()[:40]
         raise DataError(
             f"{source}: line {at}: the commas of {example!r} may be cell separators or decimal marks; give "
-            f"{layout_parameter(separator='comma')}, or {layout_parameter(decimal='comma')} if spaces separate the cells"
+            f"{layout_parameter(separator='comma')}, or {layout_parameter(decimal='comma')} if spaces separate"
         )
 
 

@@ -112,7 +112,7 @@ class Excitation:
         pair = [a for a in map(finite_number, amplitudes) if a is not None and a >= 0]
         if len(amplitudes) != 2 or len(pair) != 2:
             raise ModelError(
-                f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current; give one in A for both hubs, or a pair"
+                f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current; give one, or a pair, in A"
             )
         for k, (value, limit) in enumerate(zip(pair, CURRENT_LIMIT, strict=True)):
             if value > limit:

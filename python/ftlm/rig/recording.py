@@ -123,7 +123,7 @@ class PartialRecording:
             self.kept += len(rows)
         except OSError as error:
             raise RigFault(
-                f"the recording cannot be written to disk ({error.strerror or error}); free disk space, or choose another folder"
+                f"the recording cannot be written to disk ({error.strerror or error}); free disk space"
             ) from None
 
     def _append(self, content: bytes) -> None:
