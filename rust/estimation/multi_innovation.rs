@@ -216,7 +216,7 @@ pub fn estimate(
     Ok(weighted_solution((columns, target, &starts), length, &prior, columns.len())?.0)
 }
 
-/// Return the coefficients after every step of the recursion, eq. (44) of the paper, on m = Q X.
+/// Return the coefficients after every step of the recursion, eq. (44) of the paper, with the regressors `columns`.
 ///
 /// The steps are concatenated, with k coefficients each. The last coefficients equal [`estimate`]. The cost is O(M k³)
 /// for M rows and k columns.

@@ -630,7 +630,7 @@ def _mixed_line(line: _Line, source: str) -> DataError:
 
 
 def _check_commas(rows_of_text: Sequence[tuple[int, str]], lines: list[_Line], source: str) -> None:
-    """Raise DataError if commas may be both separators and decimal marks."""
+    """Raise DataError if it is ambiguous whether commas are separators or decimal marks."""
     rows = [(line, text) for line, (_, text) in zip(lines, rows_of_text, strict=True) if line.has_only_numbers]
     if not rows:
         return

@@ -313,7 +313,7 @@ class Structure:
         if not (self.all_filtered or sensor.has_impulse_transient):
             through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
-                f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run has "
+                f"{' and '.join(through)} passed a sensor filter with a fractional order or a zero, and a run has "
                 "nonzero initial conditions: the transient of such a filter is not a sum of impulse responses; use "
                 f"{parameter('initial', 'rest')} and begin the run at rest, or give the exponents of its initial "
                 "terms"

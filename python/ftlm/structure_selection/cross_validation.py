@@ -320,7 +320,7 @@ class Trial:
 
     @property
     def mean_relative_error(self) -> float:
-        """Mean of the logarithm of the parameters' relative standard errors; lower is better."""
+        """Logarithm of the geometric mean of the parameters' relative standard errors; lower is better."""
         relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
         return float(np.mean([math.log(min(max(r, 1e-12), 1e12)) for r in relative])) if relative else 0.0
 

@@ -142,7 +142,7 @@ const RESONATOR_DAMPING: f64 = 0.2;
 /// also determine the direction of this component.
 const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
-/// Add noise-free substitutes ([`project`]) for all signals except the inputs to a record.
+/// Return a record to which noise-free substitutes ([`project`]) of all signals except the inputs are added.
 ///
 /// `inputs` flags the signals that are inputs.
 ///

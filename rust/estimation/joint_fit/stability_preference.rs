@@ -216,12 +216,11 @@ impl StableSearch<'_, '_> {
         Ok(fits)
     }
 
-    /// Minimize along the stability limit and return the best result.
+    /// Continue from `end` along the stability limit, and return the best result.
     ///
-    /// One autoregressive coefficient is fixed at a time.
-    ///
-    /// An optimization stops if a step of all parameters would be unstable. The cost can still decrease along the
-    /// limit.
+    /// The optimization of all parameters stopped at `end` because its next step would be unstable. The cost can still
+    /// decrease along the limit. Each autoregressive coefficient in turn is therefore fixed at its value in `end`, and
+    /// the cost is minimized over the other parameters.
     fn minimize_along_limit(&self, end: &Candidate) -> Result<Candidate> {
         let status = end.result.status;
         let mut best = end.clone();

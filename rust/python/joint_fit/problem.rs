@@ -19,7 +19,7 @@ use crate::python::order_search::watch::{run_interruptible, Stop};
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 
-/// Parameter set of a joint fit.
+/// Optimization problem of a joint fit: its free parameters and model.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct JointProblem {
     pub(super) inner: Arc<ParameterSet>,

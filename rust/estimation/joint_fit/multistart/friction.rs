@@ -1,9 +1,10 @@
 //! Multistart for equations with friction: linear fits with the measured sign of the velocity are the initial guesses.
 //!
 //! With the measured sign of the velocity, the equation is linear. While the body sticks, the measured sign is noise.
-//! The resulting bias is acceptable for an initial guess. Fits without friction add guesses with several amounts of
-//! friction. If no guess leads to the noise level, the optima of the structure without friction are further initial
-//! guesses. Stribeck friction starts from the best fits with Coulomb friction.
+//! The resulting bias is acceptable for an initial guess. Further guesses combine a linear fit without friction with
+//! several assumed friction forces. If no guess leads to the noise level, the structure without friction is optimized in
+//! full, and its optima are additional initial guesses. Stribeck friction starts from the best fits with Coulomb
+//! friction.
 
 use std::collections::BTreeMap;
 
