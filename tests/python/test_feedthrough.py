@@ -193,3 +193,19 @@ def test_slopes_of_a_term_above_its_equation_are_those_of_differences(behind):
         up, down = (np.asarray(at(point + s * shift * np.eye(2)[k], 0)["residuals"]) for s in (1, -1))
         # Initial terms are projected out of both, so what counts is the slope of the sum of squares.
         assert slope @ residuals == pytest.approx((up - down) @ residuals / (2 * shift), rel=1e-5)
+
+
+@pytest.mark.parametrize("samples", [150, 600])
+def test_a_resistor_under_a_constant_current_is_no_level(samples):
+    """Voltage of R + Q^-1 s^-0.5 at a constant current: R and an output level would be collinear."""
+    t = 0.02 * np.arange(samples)
+    clean = 2.0 + 3.0 * np.sqrt(t) / 0.886226925452758
+    for seed in range(4):
+        y = clean + 0.01 * clean.std() * np.random.default_rng(seed).standard_normal(samples)
+        run = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.ones(samples)}, outputs={"y": y})
+        found = ftlm.identify(run, ftlm.equation("D^alpha y = r D^alpha u + b u"))
+        assert found.joint.initial == "rest"
+        assert "not_converged" not in {f.code for f in found.findings}
+        for name, value in (("alpha", 0.5), ("r", 2.0), ("b", 3.0)):
+            assert abs(found.parameters[name].value - value) < 4.0 * found.standard_errors[name]
+            assert found.standard_errors[name] < 0.05 * value

@@ -89,8 +89,9 @@ class Stability:
         if self.origin_order > 0:
             why.append(f"it integrates its input with order {self.origin_order:g}")
         verdict = "stable" if self.stable else f"not stable: {', '.join(why)}"
-        plane = "s" if self.base == 1.0 else f"s^{self.base:g}"
-        how = f"poles in {plane}" if self.method == "poles" and self.base else self.method
+        how = self.method
+        if self.method == "poles" and self.base:
+            how = "poles in s" if self.base == 1.0 else f"poles in s^{self.base:g}"
         return f"{verdict} ({how})"
 
 

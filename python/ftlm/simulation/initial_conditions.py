@@ -253,7 +253,8 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
 
     Initial terms and offsets that the user gave are kept. The initial conditions ``"auto"`` become ``"rest"``, but
     remain ``"auto"`` if a run may have been in motion. The offset becomes ``"level"`` if outputs or inputs were at rest
-    at nonzero values, or if it is ``"constant"`` and no input changes.
+    at nonzero values, or if it is ``"constant"`` and no input changes. Under an input that is constant from the first
+    sample on, direct feedthrough explains a nonzero first output as well, and a level is not separately identifiable.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
@@ -261,7 +262,9 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     evidence = [rest_evidence(run, structure) for run in runs]
     available = [f for f in evidence if f is not None]
     constant = structure.offset == "constant" and any(f.rows == 0 for f in available)
-    offset = "level" if constant or any(f.shows_level for f in available) else structure.offset
+    direct = any(t.order == e.order for e in structure.equations for t in e.terms)
+    shown = any(f.shows_level and not (direct and f.rows == 0) for f in available)
+    offset = "level" if constant or shown else structure.offset
     initial = "rest" if automatic and len(available) == len(evidence) else structure.initial
     return replace(structure, initial=initial, offset=offset)
 
