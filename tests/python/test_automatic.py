@@ -336,3 +336,20 @@ def test_blocks_in_which_the_output_rests_are_fitted_too(seed):
     found = ftlm.select(run, "auto")
     assert {"no_candidate_fits", "worse_than_mean"}.isdisjoint(f.code for f in found.findings)
     assert found.winner.validation_fit > 80
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_the_fit_of_a_candidate_is_that_of_its_optimum(seed):
+    """An integrator with a lag that rests at a level in colored noise: offsets of comparisons are those of the fits."""
+    g = np.random.default_rng(seed)
+    u = np.where(np.arange(300) < 20, 0.0, 1.0)
+    b, a, _ = cont2discrete(([2.0], [0.3, 1.0, 0.0]), 0.02)[:3]
+    y = lfilter(b.ravel(), a, u)
+    e = lfilter([1.0], [1.0, -0.8], g.standard_normal(300))
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y - 0.2 + 0.03 * y.std() / e.std() * e})
+    found = ftlm.select(run, "auto")
+    at_rest = [t for t in found.trials if t.joint and t.joint.initial == "rest"]
+    fits = [(t.estimation["y"], 100.0 * (1.0 - t.joint.noise["y"] / run["y"].std())) for t in at_rest]
+    assert len(fits) >= 3
+    for estimation, expected in fits:
+        assert estimation == pytest.approx(expected, abs=0.2)

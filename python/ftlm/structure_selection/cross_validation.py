@@ -18,6 +18,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import prepare
+from ftlm.simulation.initial_conditions import resolve_start
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.structure import Structure
 from ftlm.utils.formatting import plural
@@ -334,12 +335,13 @@ def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structu
     """Return the structure with fixed initial conditions: rest, or Caputo's initial terms.
 
     They replace ``"auto"``, whose history (powers of t for past inputs) has more terms if more orders are free. A
-    candidate with more free orders could then fit more than its model explains.
+    candidate with more free orders could then fit more than its model explains. The offset is that of a comparison with
+    these runs; see :func:`resolve_start`.
     """
-    if structure.initial != "auto":
-        return structure
-    start = prepare(runs, structure.without_input_nonlinearities(), None, power_of_two=False, gaps=True)[0].initial
-    return replace(structure, initial="rest" if start == "rest" else "caputo")
+    if structure.initial == "auto":
+        start = prepare(runs, structure.without_input_nonlinearities(), None, power_of_two=False, gaps=True)[0].initial
+        structure = replace(structure, initial="rest" if start == "rest" else "caputo")
+    return resolve_start(runs, structure)
 
 
 def fit(
