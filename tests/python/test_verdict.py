@@ -17,6 +17,7 @@ import ftlm
 from ftlm import cli
 from ftlm.estimation import estimators as estimating
 from ftlm.estimation import nuisance_parameters as history
+from ftlm.estimation.model_validation import validate_model
 from ftlm.estimation.output_error import ProfileInterval, fit_output_error
 from ftlm.estimation.verdict import saved_verdict, verdict
 from ftlm.findings import MAX_SUMMARY_FINDINGS, Finding, finding_catalogue, group_findings, make_finding
@@ -301,7 +302,7 @@ def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch)
     saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
     for runs in ([], [other]):
         live = verdict(found, found.validate(runs) if runs else None)
-        judged = saved_verdict(saved, [saved.compare(run) for run in runs])
+        judged = saved_verdict(saved, [validate_model(saved, run) for run in runs])
         assert (judged.level, judged.reasons) == (live.level, live.reasons)
         assert live.trusted == (bool(runs) and fault in TRUSTED)
 

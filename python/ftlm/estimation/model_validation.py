@@ -6,6 +6,9 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
 from ftlm.data.run import Run
 from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
@@ -13,39 +16,45 @@ from ftlm.estimation.model_checks import discretization_findings, enumerate_name
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import UNSTABLE_PLANT_CODES
 from ftlm.findings import Finding, make_finding, unique
+from ftlm.model.model import Model
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import (
     Comparison,
     compare,
     simulate_runs,
-    simulation_sensitivities,
     validation_findings,
 )
 from ftlm.validation.residual_tests import DEFAULT_LAGS, NEGLIGIBLE_RESIDUAL_RATIO, run_residual_tests
 
+#: Step of numerical derivatives with respect to a parameter, in standard errors. It is small enough for the curvature
+#: of the output, and large enough for the tolerance of the simulation.
+DERIVATIVE_STEP_IN_ERRORS = 0.1
+
 
 def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
     """Return a comparison of the model with validation runs; see :meth:`ftlm.Identification.validate`."""
-    comparison = compare(result.model, runs)
-    findings = [
-        *comparison.findings,
-        *validation_findings(result.comparison, comparison),
-        *discretization_findings(result.model, comparison),
-        *_validation_residual_findings(result, runs, comparison),
-    ]
-    return replace(comparison, findings=unique(findings))
+    comparison = validate_model(result.model, runs)
+    findings = [*comparison.findings, *validation_findings(result.comparison, comparison)]
+    return replace(comparison, findings=unique([*findings, *discretization_findings(result.model, comparison)]))
 
 
-def _validation_residual_findings(
-    result: Identification, runs: Run | Sequence[Run], comparison: Comparison
-) -> list[Finding]:
+def validate_model(model: Model, runs: Run | Sequence[Run]) -> Comparison:
+    """Return a comparison of a model, such as a saved one, with validation runs and their findings."""
+    comparison = compare(model, runs)
+    return replace(comparison, findings=unique([*comparison.findings, *_residual_findings(model, runs, comparison)]))
+
+
+def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comparison) -> list[Finding]:
     """Return a finding for each output whose residuals on validation runs depend on an input.
 
-    The part of the residuals that errors of the parameters explain is not tested. An estimation run may not excite the
-    dynamics that a model lacks, so that only a validation run shows them.
+    The part of the residuals that errors of the parameters explain is not tested, so a model without a covariance is
+    not tested. An estimation run may not excite the dynamics that a model lacks, so that only a validation run shows
+    them.
     """
-    model, several = result.model, as_runs(runs)
-    if result.joint is None or any(f.code in UNSTABLE_PLANT_CODES for f in result.findings):
+    estimate, several = model.estimate, as_runs(runs)
+    if estimate is None or estimate.covariance is None:
+        return []
+    if any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings):
         return []
 
     def sensitivities() -> dict[str, list[Floats]]:
@@ -69,3 +78,37 @@ def _validation_residual_findings(
                 make_finding("validation_follows_input", output=name, input=", ".join(signals), shown=words)
             )
     return findings
+
+
+def simulation_sensitivities(
+    model: Model, runs: Run | Sequence[Run], comparison: Comparison
+) -> dict[str, list[Floats]]:
+    """Return the derivatives of simulated outputs with respect to the uncertain parameters of a model.
+
+    Parameters
+    ----------
+    model
+        Identified model with a finite covariance, or without one. A parameter is uncertain if its variance is not 0.
+    runs, comparison
+        Runs, and the comparison of the model with them.
+
+    Returns
+    -------
+    dict
+        By output, one array per run with shape (uncertain parameters, samples). Each parameter takes one comparison.
+
+    Raises
+    ------
+    FtlmError
+        If a simulation with a changed parameter fails.
+    """
+    values, covariance = parameter_vector(model), covariance_of(model)
+    errors = np.zeros(values.size) if covariance is None else np.sqrt(np.diag(covariance))
+    columns: dict[str, list[list[Floats]]] = {name: [[] for _ in each] for name, each in comparison.simulated.items()}
+    for k in np.flatnonzero(errors):
+        step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
+        shifted = compare(with_parameter_vector(model, values + step * np.eye(values.size)[k]), runs)
+        for name, each in comparison.simulated.items():
+            for column, centre, other in zip(columns[name], each, shifted.simulated[name], strict=True):
+                column.append((other - centre) / step)
+    return {name: [np.array(column) for column in each] for name, each in columns.items()}

@@ -176,11 +176,13 @@ def _combined_verdict(
     reported = [f.output for f in own if f.code in POOR_FIT_CODES]
     findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, reported)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
-    findings += [f for comparison in runs for f in comparison.findings if f.code == "validation_follows_input"]
     # A remedy must not suggest the method that was used.
     findings = [replace(f, method=method) for f in findings]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
-    return verdict_from([*own_first, *findings, *own, *([] if has_validation else [make_finding("not_validated")])])
+    # Findings of the fit name what is missing more precisely.
+    last = [f for comparison in runs for f in comparison.findings if f.code == "validation_follows_input"]
+    last += [] if has_validation else [make_finding("not_validated")]
+    return verdict_from([*own_first, *findings, *own, *last])
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:

@@ -10,6 +10,7 @@ import numpy as np
 from ftlm.analysis.frequency_response import covariance_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
+from ftlm.estimation.model_validation import simulation_sensitivities
 from ftlm.model.model import Model
 from ftlm.svg.charts import BarChart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figures
@@ -18,7 +19,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import Comparison, simulation_sensitivities
+from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
 #: (lower, upper) edge of a band over time.

@@ -20,7 +20,7 @@ from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
-from ftlm.estimation.model_validation import validate
+from ftlm.estimation.model_validation import validate, validate_model
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_html
@@ -59,7 +59,6 @@ from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html
 from ftlm.validation.comparison import (
     Comparison,
-    compare,
     errors_table,
     initial_terms_table,
     validation_fit_findings,
@@ -673,7 +672,7 @@ def model_page(
     others = [] if validation is None else as_runs(validation)
     estimate = model.estimate
     findings = [] if estimate is None else list(estimate.findings)
-    validated = [compare(model, run) for run in others]
+    validated = [validate_model(model, run) for run in others]
     for run, comparison in zip(others, validated, strict=True):
         findings_there = [*comparison.findings, *data_notes(run)]
         if estimate is not None:

@@ -12,7 +12,6 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ftlm import _core
-from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
 from ftlm.data.run import Run
 from ftlm.data.runs import Runs, as_runs
 from ftlm.data.sampling import drop_missing
@@ -71,9 +70,6 @@ class Metrics:
         return attributes(self, ("error", "rmse", "nr", "fit"))
 
 
-#: Step of numerical derivatives with respect to a parameter, in standard errors. It is small enough for the curvature
-#: of the output, and large enough for the tolerance of the simulation.
-DERIVATIVE_STEP_IN_ERRORS = 0.1
 #: Metrics of an output whose error cannot be computed: all are NaN.
 UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
@@ -639,40 +635,6 @@ def validation_fit_findings(estimation_fits: Mapping[str, float], validation: Co
 
 
 _METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")
-
-
-def simulation_sensitivities(
-    model: Model, runs: Run | Sequence[Run], comparison: Comparison
-) -> dict[str, list[Floats]]:
-    """Return the derivatives of simulated outputs with respect to the uncertain parameters of a model.
-
-    Parameters
-    ----------
-    model
-        Identified model with a finite covariance, or without one. A parameter is uncertain if its variance is not 0.
-    runs, comparison
-        Runs, and the comparison of the model with them.
-
-    Returns
-    -------
-    dict
-        By output, one array per run with shape (uncertain parameters, samples). Each parameter takes one comparison.
-
-    Raises
-    ------
-    FtlmError
-        If a simulation with a changed parameter fails.
-    """
-    values, covariance = parameter_vector(model), covariance_of(model)
-    errors = np.zeros(values.size) if covariance is None else np.sqrt(np.diag(covariance))
-    columns: dict[str, list[list[Floats]]] = {name: [[] for _ in each] for name, each in comparison.simulated.items()}
-    for k in np.flatnonzero(errors):
-        step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
-        shifted = compare(with_parameter_vector(model, values + step * np.eye(values.size)[k]), runs)
-        for name, each in comparison.simulated.items():
-            for column, centre, other in zip(columns[name], each, shifted.simulated[name], strict=True):
-                column.append((other - centre) / step)
-    return {name: [np.array(column) for column in each] for name, each in columns.items()}
 
 
 def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None) -> Table:
