@@ -62,6 +62,7 @@ SEARCH = (
     "--order-grid",
     "nu=0.3:0.7:0.1",
 )
+MULTI_INNOVATION = tuple("multi-innovation" if word == "least-squares" else word for word in SEARCH)
 
 
 def test_help_is_a_command_as_well() -> None:
@@ -206,21 +207,22 @@ BAD = [
     (("identify", "none.csv", "--structure", EQUATION), 3, "none.csv"),
     (("identify", "square.csv"), 2, "structure"),
     (("identify", "square.csv", "--structure", "flexible-link:3"), 2, "flexible-link:3"),
+    (("identify", "square.csv", "--structure", EQUATION, "--structure", "D y = a y"), 2, "is given 2 times"),
     (("identify", "square.csv", "--structure", "D^alpha y = = u"), 2, "character"),
     (("identify", "square.csv", "--structure", "D^1.5 z = a0 z + b0 u"), 3, "z"),
-    (("identify", "square.csv", *SEARCH, "--method", "magic"), 2, "magic"),
+    (("identify", "square.csv", "--structure", EQUATION, "--method", "magic"), 2, "magic"),
     (
-        ("identify", "square.csv", *SEARCH, "--innovation-length", "0", "--method", "multi-innovation"),
+        ("identify", "square.csv", *MULTI_INNOVATION, "--innovation-length", "0"),
         2,
         "--innovation-length 0",
     ),
     (
-        ("identify", "square.csv", *SEARCH, "--prior-covariance", "-1", "--method", "multi-innovation"),
+        ("identify", "square.csv", *MULTI_INNOVATION, "--prior-covariance", "-1"),
         2,
         "--prior-covariance -1",
     ),
     (("identify", "square.csv", *SEARCH, "--m", "4096"), 2, "4096"),
-    (("identify", "square.csv", *SEARCH, "--m", "1000", "--method", "multi-innovation"), 2, "power of two"),
+    (("identify", "square.csv", *MULTI_INNOVATION, "--m", "1000"), 2, "power of two"),
     (("identify", "square.csv", *SEARCH, "--threads", "0"), 2, "threads"),
     (("identify", "square.csv", *SEARCH, "--top", "0"), 2, "choose the number of rows"),
     (("identify", "square.csv", *SEARCH, "--window", "5"), 2, "--window"),

@@ -222,7 +222,7 @@ REFUSED = [
     ((*WORDS, "MODEL", "--path", "0.3:0.5", "--trajectory", "p.txt"), "does not end in .csv"),
     ((*WORDS, "MODEL", "--limit", -1), "--limit -1"),
     ((*WORDS, "MODEL", "--rate", 0), "--rate 0"),
-    ((*WORDS, "MODEL", "--samples", -1), "--samples -1"),
+    ((*WORDS[:-2], "MODEL", "--samples", -1), "--samples -1"),
     ((*WORDS, "MODEL", "--input", "U"), "input = 'U' is not one"),
     ((*WORDS, "no.json"), "cannot be read"),
     (("input-shaper", "MODEL", "--modes", 0), "--modes 0"),
