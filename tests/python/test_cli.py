@@ -26,6 +26,7 @@ from ftlm.app.server import DEFAULT_PORT
 from ftlm.cli import framework
 from ftlm.cli.framework import print_text, wrap_line
 from ftlm.cli.main import COMMAND_HELP, CommandTable, app
+from ftlm.cli.options import StructureOptions
 from ftlm.order_search.search import score_profiles
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
@@ -736,3 +737,8 @@ def test_a_score_profile_has_the_scores_of_the_search_along_one_order(tmp_path: 
     assert along == pytest.approx([scores[best["alpha"], beta] for beta in grid.orders["beta"]], rel=1e-9)
     assert np.nanmin(marked) == pytest.approx(search.score, rel=1e-9)
     assert np.count_nonzero(np.isfinite(marked)) == 1
+
+
+def test_equations_are_coupled_as_in_python():
+    words = "D x = -a x + b y; D y = -c y + d u"
+    assert StructureOptions().structure(words).coupling == ftlm.equation(words).coupling == "measured"
