@@ -124,7 +124,7 @@ def test_bounds_that_are_none_are_refused(run, bounds, options, words):
 
 
 def test_bounds_of_a_delay_are_where_it_is_freed(run):
-    with pytest.raises(ftlm.ModelError, match=r"the bounds of the delay of u, 0 to 0\.2, are stated where it is freed"):
+    with pytest.raises(ftlm.ModelError, match=r"the bounds of the delay of u, 0 to 0\.2, are part of the structure"):
         ftlm.identify(run, OSCILLATOR.with_delays({"u": (0, 0.2)}), bounds={"delay_u": (0, 0.1)})
 
 

@@ -441,7 +441,7 @@ def test_auto_says_where_an_offset_cannot_be_told():
         ftlm.search_orders(still, ftlm.equation("D^alpha y = -a y + b u", offset="auto"))
     with pytest.raises(ftlm.ModelError, match=r"offset='auto' lets ftlm\.identify decide"):
         ftlm.Model(ftlm.equation("D y = -2 y + 3 u", offset="auto"))
-    with pytest.raises(ftlm.ModelError, match="a store keeps those of one"):
+    with pytest.raises(ftlm.ModelError, match="a store keeps only one"):
         ftlm.identify(
             still, ftlm.equation("D^alpha y = -a y + b u"), method=ftlm.LeastSquares(store="never"), offset="auto"
         )

@@ -131,7 +131,7 @@ class CircuitProblem(ResponseProblem):
         return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
 
     def capacitor_of(self, name: str) -> str:
-        """Return an unused name of a capacitor that replaces the constant-phase element with the exponent `name`."""
+        """Return an unused name for a capacitor that replaces the constant-phase element whose exponent is `name`."""
         taken = {parameter.partition("_")[0] for parameter in (*self.names, *self.circuit.values)}
         number = name.removeprefix("CPE").removesuffix("_alpha")
         return next(c for c in (f"C{number}", *(f"C{k}" for k in range(1, len(taken) + 2))) if c not in taken)
@@ -266,7 +266,7 @@ def profile_intervals(
     """Return profile-likelihood intervals of imprecise parameters, and the parameters that may be 0 or infinite.
 
     A positive parameter is imprecise if its relative standard error exceeds `MAX_WALD_RELATIVE_ERROR`. A bound of its
-    interval is 0 or infinite if the data are compatible with this limit.
+    interval is 0 or infinite if the data are compatible with that value.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def profile_intervals(
     factor
         Half-width of a 95 % interval divided by the standard error.
     optimize
-        Function that fits the other parameters.
+        Function of a problem and an initial point that returns the optimum and its cost.
 
     Returns
     -------
@@ -352,7 +352,10 @@ def _bound_crossing(
 
 
 def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
-    """Return a least-squares solution in which negative components are replaced by 0.001 of the largest component."""
+    """Return a positive least-squares solution x of ``table @ x = goal``.
+
+    Components that are not positive are replaced by 0.001 of the largest component, for columns of unit norm.
+    """
     lengths = np.linalg.norm(table, axis=0)
     scaled = table / lengths
     is_active = np.ones(lengths.size, dtype=bool)

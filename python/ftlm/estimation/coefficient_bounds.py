@@ -64,7 +64,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
             item = inputs[name]
             raise ModelError(
                 f"{parameter('bounds')} has {name}, but the bounds of the {item.words}, {item.bounds[0]:g} to "
-                f"{item.bounds[1]:g}, are stated where it is freed; change them there"
+                f"{item.bounds[1]:g}, are part of the structure; change them there"
             )
         low, high = map(float, pair)
         value = start.get(name) if isinstance(start, Mapping) else None

@@ -115,7 +115,7 @@ class ProfileResult:
     lower_optimum
         Parameters of an optimum with a lower cost than the fit; None if there is no significantly lower one.
     lower_on_finer_grid
-        Whether that optimum has a lower cost on the next finer grid as well.
+        Whether that optimum has a lower cost with the next smaller time step as well.
     incomplete_names
         Parameters whose profile needed more simulations than allowed.
     evaluations
@@ -157,8 +157,8 @@ def profile_intervals(
     threads, progress
         Number of threads, and a callback with (bounds found, total bounds).
     budget
-        Limits on the number of simulations: the maximum total, and the number of remaining simulations below which the
-        search for a further bound is not started. None for no limit.
+        Maximum total number of simulations, and minimum number of simulations that must remain when the search for a
+        bound starts. None for no limit.
     evaluations
         Maximum number of evaluations of a minimization that starts from the optimum before the bounds are searched.
 

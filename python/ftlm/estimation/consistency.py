@@ -50,8 +50,8 @@ class ParameterDifference:
     parts
         Indices of the two segments.
     difference_in_errors
-        Absolute difference divided by its standard error, which follows from the interval bounds that face each other.
-        NaN if the parameter is not identifiable from one segment.
+        Absolute difference divided by its standard error; NaN if the parameter is not identifiable from one segment.
+        The standard error follows from the upper bound of the smaller estimate and the lower bound of the larger one.
     disjoint
         Whether the 95 % intervals do not overlap.
     """
@@ -77,7 +77,7 @@ class Consistency(ReportMixin):
         size.
     distance, degrees
         Chi-squared statistic of all parameters about their common weighted mean, and its degrees of freedom under one
-        common model. None for a method without covariance.
+        common model. `distance` is None, and `degrees` 0, for a method without covariance.
     cross_validation
         ``cross_validation[k][j]`` is the fit in percent, by output, of the model of segment k on segment j.
     delays
@@ -421,9 +421,10 @@ def _segment_names(pieces: Sequence[Run]) -> list[str]:
 
 
 def _cross_validated_fit(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
-    """Return the fit in percent, by output, of one segment's model on another segment; {} if the simulation fails.
+    """Return the fit in percent, by output, of the model of `result` on the segment `piece`.
 
-    The simulation uses the initial conditions that were identified on the segment `piece`.
+    The simulation uses the initial conditions of `own`, the identification of this segment. The result is {} if the
+    simulation fails.
     """
     if result is own:
         return dict(result.fit)

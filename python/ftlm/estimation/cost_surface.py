@@ -52,7 +52,7 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
 def output_error_landscape(
     result: Identification, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
-    """Compute the output-error cost on a grid of two orders that spans four standard errors around the optimum.
+    """Compute the output-error cost on a grid of two orders, within four standard errors of the optimum.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def output_error_landscape(
     Returns
     -------
     Landscape or None
-        Grid with scores: 1 plus the increase of the sum of squares over the noise variance. For white residuals, the
-        joint 95 % region of both orders is where the score is below 7. None if there are no two orders with a finite
+        Grid of scores 1 + (S - S_min) / noise variance, with the sum of squares S. For white residuals, the score is
+        below 7 in the joint 95 % confidence region of both orders. None if there are no two orders with a finite
         standard error.
 
     Raises

@@ -265,7 +265,7 @@ def estimate_output_error(
 
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
-    """Return the covariance of all parameters, as a model file stores it; None if one is not identifiable."""
+    """Return the covariance of all parameters, as a model file stores it; None if a parameter is not identifiable."""
     jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
     inputs = problem.structure.with_inputs(joint.inputs).fixed_inputs
     jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
@@ -398,12 +398,12 @@ def run_order_searches(
 
 
 def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: SearchResult) -> int:
-    """Return the rank of the table row whose orders give the most likely simulation of all equations together.
+    """Return the rank in an order search of the orders with the most likely simulation of all equations together.
 
     The order search ranks candidates by simulations in which measured outputs enter each equation. Such simulations
     hardly distinguish neighboring orders. The criterion here is the sum over outputs of ln NR, where NR is the
-    normalized residual of eq. (47) of the paper. It is proportional to the negative log likelihood of white noise of
-    unknown variance, up to a constant.
+    normalized residual of eq. (47) of the paper. Except for a constant, this sum is proportional to the negative log
+    likelihood of white residuals of unknown variance.
     """
     best, rank = math.inf, 1
     for row in search.table:

@@ -110,10 +110,10 @@ class Extension:
     inputs
         Names of the inputs that the extension concerns.
     starts
-        Initial guesses by parameter name; None stands for automatic initial guesses.
+        Initial guesses, each with values by parameter name. The entry None stands for automatic initial guesses.
     near
-        Fit with the same free parameters. If given, the extension is fitted from the optimum of this fit and on its
-        grid, not from `starts`.
+        Fit with the same free parameters. If given, the extension is fitted from the optimum of this fit with its time
+        step, not from `starts`.
     local_start
         Parameter values at which the extended model nearly equals the fitted one. If a local fit from these values does
         not lower the criterion, the slower multistart from `starts` is skipped.
@@ -166,16 +166,15 @@ class ExtensionTests:
 def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     """Fit extended structures if residuals are colored, and report the best one if it predicts clearly better.
 
-    Residuals are colored by noise, or by a response that the structure lacks. An autoregression of the residuals
-    separates the two: its innovation variance does not depend on the structure for pure noise, but a missing response
-    raises it. An extension is reported only if its own residuals depend neither on an input nor on the direction of
-    motion.
+    Colored residuals are colored noise, or contain a response that the structure lacks. An autoregression of the
+    residuals distinguishes the two: only a missing response raises its innovation variance. An extension is reported
+    only if its own residuals depend neither on an input nor on the direction of motion.
 
     Residuals at the level of rounding and discretization errors are not tested.
 
     Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
-    with a coefficient law are tested only for drift and intersample behavior. Structures with other non-linear terms
-    are tested only for intersample behavior.
+    with a coefficient law are tested only for a constant, a drift and intersample behavior. Structures with other
+    non-linear terms are tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     large = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
@@ -263,10 +262,11 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return extensions by a constant and by a drift; [] for non-linear structures and for other offsets than a level.
+    """Return extensions by a constant and by a drift; only by a drift if the structure has a level.
 
-    The constant is omitted if the structure has a level. If the fit explains little (`is_poor`), the optimum with a
-    constant may be far from the fit. The extension is then also fitted from automatic initial guesses.
+    The result is [] for non-linear structures and for structures with a constant or a ramp. If the fit explains little
+    (`is_poor`), the optimum with a constant may be far from the fit. The extension by a constant is then also fitted
+    from automatic initial guesses.
     """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
@@ -516,11 +516,11 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
 
 def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
-    """Return an extension by a constant load from an unknown time on, in a list; [] for several or nonuniform runs.
+    """Return a list with an extension by a load step at an unknown time; [] for several or nonuniform runs.
 
-    The search starts from the parameters of each fit in `starts`. It places the step at the time at which a load and
-    parameter changes explain most of the residuals. It then fits the model with this load. Both steps are repeated
-    until the time no longer changes or the residuals no longer decrease.
+    The search starts from the parameters of each fit in `starts`. It chooses the time at which a load step and
+    parameter changes explain most of the residuals, and then fits the model with this load. Both are repeated until
+    the time no longer changes or the residuals no longer decrease.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:

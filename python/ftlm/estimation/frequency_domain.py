@@ -481,7 +481,7 @@ def _optimum_and_cost(problem: ResponseProblem, values: Floats) -> tuple[Floats,
 
 
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
-    """Fit a problem, starting from the optimum of another problem that has the same parameters."""
+    """Fit `problem`, starting from `end`, the optimum of a problem `other` that has the same parameters."""
     return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
 
 
@@ -718,7 +718,7 @@ def _model(
 
 
 def _student(degrees: int) -> float:
-    """Return the 97.5 % quantile of Student's t distribution by a series, accurate to 1 % from 4 degrees on."""
+    """Return the 97.5 % quantile of Student's t distribution, accurate to 1 % for at least 4 degrees of freedom."""
     z, n = NormalDist().inv_cdf(0.975), float(degrees)
     terms = [(z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384]
     return z + sum(t / n ** (k + 1) for k, t in enumerate(terms))

@@ -121,10 +121,10 @@ def identify(
         ``"level"``: an unknown constant that is added to each output. ``"ramp"``: c + d t with unknown c and d on the
         right-hand side of each equation.
         ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
-        ``.settings["offset_test"]``. Each run has its own offset, in ``.comparison.offsets``. It is not identifiable
-        together with ``initial="history"``. Default: the offset of the structure. If it has none, a level or, for
-        integrating or non-linear plants, a constant is added if it improves the fit. ``"none"`` prevents this, but the
-        level of a run that rests before an input changes is still used.
+        ``.settings["offset_test"]``. Each run has its own offset, in ``.comparison.offsets``. An offset is not
+        identifiable together with ``initial="history"``. Default: the offset of the structure. If it has none,
+        a level or, for integrating or non-linear plants, a constant is added if it improves the fit. ``"none"``
+        prevents this, but the level of a run that rests before an input changes is still used.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m
@@ -284,7 +284,7 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
     check_linear(structure.equations, f"the test of {parameter('offset', 'auto')}")
     if getattr(method, "store", None) is not None:
         raise ModelError(
-            f"{parameter('offset', 'auto')} may need two searches, and a store keeps those of one; use "
+            f"{parameter('offset', 'auto')} may need two searches, but a store keeps only one; use "
             f"{parameter('offset', 'none')} or {parameter('offset', 'constant')} with {parameter('store')}"
         )
 
@@ -399,7 +399,7 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
 
 
 def _undecided_color(item: Finding) -> Finding:
-    """Return the finding that replaces one on colored residuals if no input tells noise from missing dynamics."""
+    """Return the finding on colored residuals for data that do not distinguish noise from missing dynamics."""
     return make_finding("color_undecided", output=item.output)
 
 
@@ -472,9 +472,9 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     """Return findings of failed residual tests.
 
-    Findings on colored residuals are omitted for a joint fit, because the fit itself already reports them. Only its
-    residuals are orthogonal to the effects of all parameters. Those of other estimates, such as with orders from a
-    grid, also depend on the direction of motion without friction.
+    For a joint fit, findings on colored residuals are omitted, because the fit itself already reports them. For other
+    fits, findings on the direction of motion are omitted: their residuals are not orthogonal to the effects of all
+    parameters, and depend on this direction even without friction.
     """
     if has_loop_noise_model(fit.settings):
         # Such a fit is consistent in a closed loop, so detected feedback is no finding.

@@ -266,7 +266,7 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 
 
 def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bool) -> Fit:
-    """Return a fit with findings that report its initial conditions, which differ from those first chosen.
+    """Return a fit whose initial conditions differ from the first choice, with findings that report them.
 
     Other runs may start differently, so the model is reset to the requested initial conditions of `structure`. If a
     start from rest was rejected in favor of other initial conditions, the model keeps those of the fit, because a

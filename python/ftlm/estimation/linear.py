@@ -69,8 +69,8 @@ def estimate_coefficients(
 ) -> CoefficientFit:
     """Return the coefficients at given orders, estimated by the linear method ``settings.coefficients``.
 
-    Derivatives of measured signals in non-linear terms are computed in two ways, from raw and from smoothed signals.
-    Of the two estimates, the one with the better simulation is returned.
+    If a non-linear term contains the derivative of a measured signal, the coefficients are estimated twice, with
+    derivatives of the raw and of the smoothed signals. The estimate with the smaller simulation error is returned.
     """
     if settings.coefficients == "instrumental-variables":
         check_linear(structure.equations, "an instrument")

@@ -199,7 +199,7 @@ class EstimationMethod(Protocol):
         threads: int | None,
         progress: ProgressCallback,
     ) -> Fit:
-        """Fit a structure with a fixed choice of offset to checked runs; other arguments as in `identify`."""
+        """Fit a structure to validated runs; arguments as in `identify`, but the offset is not ``"auto"``."""
 
 
 @check_arguments
@@ -215,11 +215,11 @@ class OutputError:
     ----------
     loss
         ``"squares"``, or ``"huber"``, which limits the influence of residuals beyond 1.345 standard deviations. Without
-        outliers it has 95 % of the efficiency of least squares. The reported fit and errors count all samples in full.
+        outliers it has 95 % of the efficiency of least squares. The reported error metrics weight all samples equally.
     intervals
         Kind of the 95 % intervals. ``"quadratic"``: estimate ± 1.96 standard errors, exact for a quadratic cost.
-        ``"profile"``: profile likelihood for every parameter, ten to a hundred simulations each. ``"auto"``: profile
-        likelihood for parameters whose Wald interval is wrong by over a tenth. Two simulations per parameter test this.
+        ``"profile"``: profile likelihood for every parameter, 10 to 200 simulations each. ``"auto"``: profile
+        likelihood for parameters whose quadratic interval is wrong by over a tenth, as tested by two simulations each.
         See :meth:`ftlm.Identification.profile`.
     start
         Additional initial guess: an identification, a model of the same outputs, or values of free parameters by name.

@@ -460,7 +460,7 @@ def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
-    """Whether residuals are as strongly correlated as a missing term or a wrong initial condition makes them."""
+    """Whether residuals of an output are so correlated that a missing term or a wrong initial condition is likely."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
     return max(inflation) > START_SETTINGS.white_inflation
 
@@ -537,8 +537,8 @@ def refit_after_screening(
     First, the cost is minimized from the optimum of `joint` with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
     RMS residuals are multiplied by `CONVERGED_RESIDUAL_SHARE` if this minimization converged, otherwise by
     `SCREENING_RESIDUAL_SHARE`. The products are an optimistic estimate of the residuals of a complete fit. If `accepts`
-    rejects this estimate, the result is None. Otherwise the structure is fitted on the same grid. With `refine`, a fit
-    that `accepts` accepts is repeated with a refined step. The returned fit may be one that `accepts` rejects.
+    rejects this estimate, the result is None. Otherwise the structure is fitted with the time step of `joint`. With
+    `refine`, an accepted fit is repeated with a refined step. The returned fit may be one that `accepts` rejects.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

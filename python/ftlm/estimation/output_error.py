@@ -62,8 +62,8 @@ class ProfileInterval:
     ----------
     low, high
         Ends of the interval, in the unit of the parameter. An end is infinite if the cost does not reach the threshold
-        within the bounds of the parameter or within the range of finite simulations. Below a parameter with a lower
-        bound of 0, such as a delay, it is 0 instead.
+        within the bounds of the parameter or within the range of finite simulations. For a parameter with a lower bound
+        of 0, such as a delay, `low` is then 0.
     level
         Confidence level.
     points
@@ -141,17 +141,17 @@ class JointFit:
     samples
         Number of residuals, without missing samples.
     refinement
-        Number of block pulses per sampling interval on the finest grid. The estimates are extrapolated from this grid
-        and the next coarser one to step 0.
+        Number of block pulses per sampling interval on the finest time grid. The estimates are extrapolated to step 0
+        from this grid and the next coarser one.
     step_converged
         Whether halving the step changed every estimate by less than a tenth of its standard error.
     converged
         Whether the gradient vanishes except along active bounds. False if the maximum number of evaluations was
         reached, no step lowered the cost, or the iterates left the range that the time grid can represent.
     starts
-        (cost per residual on a coarse grid, origin as text) of every initial guess, best first.
+        (cost per residual on a coarse time grid, origin as text) of every initial guess, best first.
     survivors
-        (cost per residual on a coarse grid, parameters) of the distinct best candidates of the multistart.
+        (cost per residual on a coarse time grid, parameters) of the distinct best candidates of the multistart.
     residuals
         Residuals divided by the noise standard deviation, for each run by output; NaN for missing samples.
     products
@@ -165,7 +165,7 @@ class JointFit:
     robust_weights
         Robust weights of the samples, an array (outputs, samples) for each run.
     finest_grid_values
-        Parameters at the optimum of the finest grid, in the sequence of the rows of `covariance`.
+        Parameters at the optimum on the finest time grid, in the sequence of the rows of `covariance`.
     origin
         Description of the initial guess if there was no multistart.
     profiles
@@ -307,9 +307,9 @@ def fit_output_error(
 
     A coefficient law of the structure is imposed. The structure must not have ``initial="auto"``. `start` gives values
     of all free parameters by name and replaces the automatic initial guesses, whereas `guesses` adds to them. `near` is
-    a fit of the same structure to nearly the same runs. The grid and the weights of `near` are reused. `multistart` is
-    the result of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval.
-    `progress` is called with (parts done, total parts). Optima are compared by the loss on all samples, and initial
+    a fit of the same structure to nearly the same runs, whose optimum, time step and weights are reused. `multistart`
+    is the result of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval.
+    `progress` is called with (work done, total work). Optima are compared by the loss on all samples, and initial
     guesses by the sum of squared residuals.
 
     Raises

@@ -429,8 +429,8 @@ def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> F
     """Return, for each grid point, the corner frequency that fixes the coefficient of the slowest output term.
 
     The slowest output term is the one that dominates at low frequencies. The corner frequency is NaN for the first
-    points (`first` is their number), where this coefficient is estimated. These points are followed by several points
-    per row of `slow`, with corner frequencies distributed over the measured band.
+    points (`first` is their number), where this coefficient is estimated. The other points are repetitions of the
+    points in `slow`, each with corner frequencies distributed over the measured band.
 
     If noise hides a small arc of an impedance, iteratively reweighted least squares are biased. The coefficients of
     output terms are then far too small or too large. If the slowest output term is fixed, the remaining bias is small.

@@ -378,7 +378,7 @@ class Identification:
         is followed continuously from the optimum, so another optimum behind a ridge is not found.
 
         A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley. This amounts
-        to 10 to 200 simulations per parameter on the finest grid of the fit. The result does not depend on the number
+        to 10 to 200 simulations per parameter with the time step of the fit. The result does not depend on the number
         of threads. Ctrl-C stops the search after at most one refit.
 
         Parameters

@@ -72,9 +72,8 @@ class Verdict:
     def __call__(self, validation: Any = None) -> Verdict:
         """Return ``validation.verdict``, or this verdict without a validation.
 
-        So ``result.verdict(v)`` is the same as ``v.verdict``.
-
-        The validation must be one of the same result, which is not checked.
+        So ``result.verdict(v)`` is the same as ``v.verdict``. The validation must belong to the same result; this
+        condition is not checked.
 
         Raises
         ------
