@@ -599,8 +599,8 @@ ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
 def common_rows(one: Floats, other: Floats) -> int:
     """Return the number of samples that two excerpts of one recording share; 0 if they share none.
 
-    Both arrays have shape (outputs, samples). They share samples if one contains the first samples of the other and
-    agrees with the other from there on.
+    Both arrays have shape (outputs, samples). They share samples if the later excerpt starts within the earlier one,
+    and both are equal where they overlap.
     """
     if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
         return int(one.shape[1])

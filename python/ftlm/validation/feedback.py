@@ -235,7 +235,7 @@ def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
 
 
 def _line_regressors(u: Floats) -> list[Floats]:
-    """Return cosines and sines at spectral lines of an input, whose periodic parts lagged samples do not predict."""
+    """Return cosines and sines at the spectral lines of an input, as regressors beside its lagged samples."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
@@ -313,7 +313,7 @@ def _local_autocorrelation(w: Floats) -> float:
 
 
 def _local_explained_fraction(w: Floats, past: Floats) -> float:
-    """Return the share of an innovation that `past` explains in short blocks, over its limit for independent series."""
+    """Return the fraction of `w` that `past` explains in short blocks, divided by its limit for independent series."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
@@ -477,8 +477,8 @@ class _Innovations:
     def _same_sample_ratio(self, clipped: Floats) -> float:
         """Return the signed score statistic of the output innovation in the same sample, divided by its critical value.
 
-        This statistic detects integral control. There the past input already contains the past outputs, so they do not
-        improve the prediction of the input.
+        This statistic detects integral control, under which the past input already contains the past outputs. These
+        outputs therefore do not improve the prediction of the input.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)

@@ -152,7 +152,7 @@ class OutputResiduals:
 
     @property
     def follows_direction(self) -> bool:
-        """Whether residuals depend on the direction of motion but not on an input, without feedback."""
+        """Whether residuals depend on the direction of motion but not on an input, and no feedback was found."""
         return self.direction is not None and self.direction.failed and self.is_noise and not self.feedback
 
     @property
@@ -328,9 +328,9 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     within a run. The 99 % band of one autocorrelation of white noise is ±2.576/√N.
 
     Independence: residuals and input are filtered by the whitening filter of the residuals, an autoregression whose
-    order minimizes BIC. Without it, chance correlations of two slow signals hide a missing dead time (Box and Jenkins,
-    chapter 11). The statistic is the largest correlation at lags >= 0, and its limit is the simultaneous 99 % band of
-    all of them (Šidák). The variance of one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N
+    order minimizes BIC. Without this filter, chance correlations of two slow signals hide a missing dead time (Box and
+    Jenkins, chapter 11). The statistic is the largest correlation at lags >= 0, and its limit is the simultaneous 99 %
+    band of all of them (Šidák). The variance of one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N
     (doi:10.2307/2983611), but at least that for white residuals. It is also at least the mean of Σ eₜ² uₜ₋ₖ² over all
     lags, which permits noise that grows with the input. If the model has no feedthrough and only lag 0 is outside the
     band, feedback or feedthrough within one sample explains it, and only the other lags are tested.
@@ -479,9 +479,9 @@ def _test_beyond_parameters(
 ) -> OutputResiduals:
     """Return the residuals of an output, with failed tests replaced by passed ones if parameter errors explain them.
 
-    ``signs`` are the signs of the velocity. Errors of the parameters can correlate residuals with an input, or with the
-    direction of motion: on validation data, and on estimation data because least squares ignores the color of the
-    noise. One generalized least-squares step removes that part of the residuals.
+    ``signs`` are the signs of the velocity. Errors of the parameters correlate the residuals on validation data with an
+    input or with the direction of motion. They also do so on estimation data, because least squares ignores the color
+    of the noise. One generalized least-squares step removes the part of the residuals that these errors explain.
     """
 
     def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
@@ -607,7 +607,7 @@ def sign_tanh_slope(velocities: Sequence[Floats]) -> float:
 
 
 def friction_term(output: str, coefficient: str, tanh_slope: float = math.inf) -> str:
-    """Return a friction term as text: ``sign(D y)``, or ``tanh(s y)`` of slope s for an output y in velocity."""
+    """Return a friction term as text: ``- fc*sign(D y)``, or ``- fc*tanh(s y)`` if a finite slope s is given."""
     velocity = f"sign(D {output})" if math.isinf(tanh_slope) else f"tanh({tanh_slope:.3g} {output})"
     return f"- {coefficient}*{velocity}"
 
