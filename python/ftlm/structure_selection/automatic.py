@@ -263,7 +263,7 @@ class AutomaticSelection:
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
         """Return the inputs that depend on the output through feedback, as tested on residuals of the best form.
 
-        This form must not have direct feedthrough.
+        The `fits`, best first, must be of forms without direct feedthrough.
 
         Feedback and direct feedthrough both correlate an input with the output in the same sample. With negative
         feedback the correlation and the static gain have opposite signs.

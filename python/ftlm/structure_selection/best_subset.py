@@ -139,9 +139,10 @@ class BaseModel:
 
 @dataclass
 class Products:
-    """Inner products between the responses of the columns and the residual of the model without inputs.
+    """Gram matrices of the responses to the columns and of the residual of the model without inputs.
 
-    ``values`` has the shape (grid points, runs, columns + 1, columns + 1); the last row and column are the residual.
+    ``values`` has the shape (grid points, runs, columns + 1, columns + 1). The last row and column of each matrix
+    contain the inner products with the residual.
     """
 
     points: list[tuple[float, ...]]
@@ -260,7 +261,7 @@ def _decimation(runs: Sequence[Run]) -> int:
 def score_subsets(
     base: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
 ) -> list[ScreenedSubset]:
-    """Return subsets of the columns of a base model with scores from their residuals on validation data.
+    """Return the subsets of the columns of a base model, with their scores on validation data.
 
     The coefficients of output terms are those at the given `points`, or on a grid that is refined around the best ones.
     """
@@ -271,7 +272,7 @@ def score_subsets(
     places = [problem.coefficients.index(f"column{k}") for k in range(len(base.columns))]
 
     def products_at(point: tuple[float, ...]) -> Floats | None:
-        """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
+        """Return the Gram matrix of column responses and residual for each run; None if a response diverges."""
         values = base.coefficients(point)
         iterate = Iterate([], [values.get(n, 0.0) for n in problem.coefficients], "", {})
         try:

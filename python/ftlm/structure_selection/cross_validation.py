@@ -88,9 +88,9 @@ class Fold:
         return Runs(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
     def norm(self, output: str) -> float:
-        """Return the norm of the validation samples of an output about its mean, at the variance of the whole run.
+        """Return √n σ of an output, for n validation samples and the standard deviation σ of the whole run.
 
-        At the variance of the block itself, no model would fit a block in which the output rests.
+        With the standard deviation of the block itself, no model would fit a block in which the output rests.
         """
         values = self.validation_run[output]
         first, last = self.rows or (0, values.size)
@@ -180,8 +180,8 @@ class Folds:
         Raises
         ------
         ModelError
-            If the option is unknown, there is one run where several are required, or a validation run is an estimation
-            run.
+            If `validation` is unknown, there is one run where several are required, or a validation run is an
+            estimation run.
         DataError
             If runs differ in names or units, or are too short to be divided.
         """
@@ -335,8 +335,8 @@ def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structu
     """Return the structure with fixed initial conditions: rest, or Caputo's initial terms.
 
     They replace ``"auto"``, whose history (powers of t for past inputs) has more terms if more orders are free. A
-    candidate with more free orders could then fit more than its model explains. The offset is that of a comparison with
-    these runs; see :func:`resolve_start`.
+    candidate with more free orders could then fit more than its model explains. The offset may become a level; see
+    :func:`resolve_start`.
     """
     if structure.initial == "auto":
         start = prepare(runs, structure.without_input_nonlinearities(), None, power_of_two=False, gaps=True)[0].initial
@@ -389,7 +389,8 @@ def log_residual_power(joint: JointFit) -> float:
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """Return the trial of a candidate, which is fitted to each fold from the optimum `joint` of the fit to all runs.
 
-    Raise FtlmError, with the name of the fold, if a fit or a simulation fails.
+    With `fine`, the time step of these fits is refined until converged. Raise FtlmError, with the name of the fold, if
+    a fit or a simulation fails.
     """
     model = fitted_model(joint, structure)
     estimation = compare(model, folds.runs).fit
@@ -456,10 +457,9 @@ def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, r
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:
     """Return a lower bound of the validation score from the fit to all data alone; -inf if no bound can be given.
 
-    Consider a second fit, which omits the data of one fold. Over all data, its sum of squares cannot be smaller than
-    that of the first fit. Over the data that the second fit uses, its sum of squares cannot be larger than that of the
-    first fit on the same data. On the data of the fold, its sum of squares is therefore at least that of the first fit.
-    For several outputs this holds for the weighted sum of squares only.
+    The fit to all data minimizes the sum of squares over all data. A fit without the data of one fold minimizes the sum
+    of squares over the remaining data. On the data of the fold, the sum of squares of the latter fit is therefore at
+    least that of the former. For several outputs, this holds only for the weighted sum of squares.
     """
     if not joint.converged:
         return -math.inf

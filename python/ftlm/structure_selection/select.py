@@ -134,8 +134,9 @@ def select(
         One run or several with the same names and units.
     candidates
         A structure, whose nested structures are searched; several structures, by name or by their equations; or
-        ``"auto"``: every input (none for a free decay), integer orders 1 to 4 with zeros, delays, direct feedthrough,
-        an integrator, an output level and a drift, then fractional orders. Fractional orders are chosen if they predict
+        ``"auto"``. This option tries equations of integer orders 1 to 4 in all inputs (none for a free decay), with
+        zeros, delays, direct feedthrough, an integrator, friction, an output level and a drift, and then fractional
+        orders. Fractional orders are chosen if they predict
         better, or as well with a Schwarz criterion lower by 10. Feedthrough is not tried if an input depends on the
         output (a closed loop), because feedback without delay resembles feedthrough. Each output has its own
         selection, and the chosen equations are identified together.
@@ -176,14 +177,18 @@ def select(
     ConvergenceError
         If no candidate can be fitted.
 
-    Notes ----- Initial terms are Caputo's (none from rest, otherwise initial values such as position and velocity)
-    unless the structure states otherwise. A history (powers of t for past inputs) would have more terms if more orders
-    are free, so candidates could not be compared. Each step of forward selection takes one fit for each possible
-    addition. For records of more than about 1800 samples the candidates are prescreened on subsampled records, and only
-    survivors are fitted. With three or more input terms in one equation and validation on whole runs, selection starts
-    from the best subset of these terms. For this purpose, every subset at integer orders is scored in closed form, with
-    the coefficients of output terms on a grid. For a list of more than 200 candidates, a ``UserWarning`` states the
-    estimated remaining time after the first fits.
+    Notes
+    -----
+    Initial terms are Caputo's (none from rest, otherwise initial values such as position and velocity) unless the
+    structure states otherwise. A history (powers of t for past inputs) would have more terms if more orders are free,
+    so candidates could not be compared.
+
+    Each step of forward selection takes one fit for each possible addition. For records of more than about 1800
+    samples, the candidates are prescreened on subsampled records, and only survivors are fitted. With three or more
+    input terms in one equation and validation on whole runs, selection starts from the best subset of these terms. For
+    this purpose, every subset at integer orders is scored in closed form, with the coefficients of output terms on a
+    grid. For a list of more than 200 candidates, a ``UserWarning`` states the estimated remaining time after the first
+    fits.
     """
     workers = check_threads(threads)
     several = as_runs(runs)

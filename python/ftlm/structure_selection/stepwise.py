@@ -226,8 +226,8 @@ def initial_guesses(
     """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
     Orders that are free in this structure but were fixed to integers in the nested one start near these integers, which
-    `whole` contains by name. A coefficient that is not in `values` starts at
-    0. A friction parameter that is not in `values` is omitted.
+    `whole` contains by name. A coefficient that is not in `values` starts at zero. A friction parameter that is not in
+    `values` is omitted.
     """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
@@ -390,7 +390,8 @@ class StepwiseSelection:
     ) -> tuple[Trial, FittedVariant] | None:
         """Eliminate one term at a time from the full structure at integer orders, and return the best result.
 
-        The result is None if the full structure has fewer than two terms more than `low`, or cannot be fitted.
+        `values` are additional estimates, by name, of which each gives an initial guess. The result is None if the full
+        structure has fewer than two terms more than `low`, or cannot be fitted.
         """
         full = self.inside.richest(low.change.variant)
         if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
@@ -426,7 +427,8 @@ class StepwiseSelection:
         """Return the trials of fitted variants, without those that cannot be the best.
 
         The first variant whose lower bound of the score exceeds `limit`, and all variants after it, are evaluated last.
-        They are skipped if all their lower bounds exceed the best score of the others by more than the margin.
+        These variants are skipped if all their lower bounds exceed the best score of the earlier variants by more than
+        `margin`.
         """
 
         def one(candidate: FittedVariant) -> Trial:
