@@ -72,7 +72,7 @@ def check_record(record: Record) -> None:
     if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
         raise ModelError("the sizes of a record are inconsistent")
     if not 0 <= record.states <= (0 if sensor is None else MAX_FILTER_STATES):
-        raise ModelError(f"a record with {record.states} states of its sensor filter")
+        raise ModelError(f"a block-pulse record has {record.states} states of its sensor filter")
     check_initial(record.initial)
 
 
@@ -217,10 +217,10 @@ class Section:
             self.table = frame
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
-            raise ModelError(f"batches {frame.first} to {frame.last} are not a valid range")
+            raise ModelError(f"block {frame.first} to {frame.last} is not a valid range")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.frames[self._firsts[place - 1]].last > frame.first:
-            raise ModelError(f"batches {frame.first} to {frame.last} are stored twice")
+            raise ModelError(f"block {frame.first} to {frame.last} overlaps a stored block")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
             return
@@ -234,10 +234,10 @@ class Section:
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
-            raise ModelError(f"batches {frame.first} to {frame.last} do not continue their block")
+            raise ModelError(f"block {frame.first} to {frame.last} contradicts its earlier record")
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
-            raise ModelError(f"batches {frame.first} to {frame.last} have an invalid position")
+            raise ModelError(f"block {frame.first} to {frame.last} has an invalid resumption point")
         if half is None or frame.restarted:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
         half.place, half.order, half.counts = frame.place, frame.order, frame.counts

@@ -209,8 +209,8 @@ class SearchResult(BestIdentification):
         Number of candidates that were simulated if the equations have nonlinear terms: the best by equation error. 0
         for linear equations, for which the search is exhaustive.
     verdict, model_findings
-        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. They are None and empty for a search
-        resumed from a checkpoint file, which does not contain the runs.
+        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. For a search resumed from a checkpoint
+        file, which does not contain the runs, `verdict` is None and `model_findings` is empty.
     best
         Identification at the orders of rank 1, from which fit, standard errors, intervals, covariance, report and
         validation are taken. None for a resumed search, and if the identification failed.

@@ -199,7 +199,7 @@ class Job:
         structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = record_signals(structure)
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
-            raise ModelError("it is neither a search of one equation nor of equations under an order law, with records")
+            raise ModelError("it has no block-pulse records, or several equations without an order law")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
             raise ModelError("its records lack a signal of its equation")
         if any(n not in request.values for n in structure.order_names):
@@ -703,8 +703,8 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
     """Return (lower, upper) estimates of the time of a search on this machine [s]; (0, 0) for a small grid.
 
-    The time is extrapolated from searches on coarser grids. Each of these has at most the fraction `MAX_PROBE_FRACTION`
-    of all candidates. None follows one that took `PROBE_TIME_S` seconds or more.
+    The time is extrapolated from searches on finer and finer subsets of the grid, each with at most the fraction
+    `MAX_PROBE_FRACTION` of all candidates. The last of these searches is the first that takes `PROBE_TIME_S` seconds.
     """
     whole = _candidates(job)
     trials: list[tuple[float, float]] = []
