@@ -273,8 +273,8 @@ def check_early_input(run: Run, name: str, delay: float) -> None:
     """Raise ModelError if an input has a negative delay (lead) of more than one sampling interval."""
     if delay < -run.step * (1.0 + MAX_EARLY_ROUNDING):
         raise ModelError(
-            f"delay of {name} = {delay:g} s is more than one sampling interval ({run.step:g} s) of run {run.name!r} "
-            "before the row that logs it; shift the rows of that input"
+            f"delay of {name} = {delay:g} s is a lead of more than one sampling interval ({run.step:g} s) of run "
+            f"{run.name!r}; shift the rows of that input"
         )
 
 

@@ -253,8 +253,8 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
 
     Initial terms and offsets that the user gave are kept. The initial conditions ``"auto"`` become ``"rest"``, but
     remain ``"auto"`` if a run may have been in motion. The offset becomes ``"level"`` if outputs or inputs were at rest
-    at nonzero values, or if it is ``"constant"`` and no input changes. Under an input that is constant from the first
-    sample on, direct feedthrough explains a nonzero first output as well, and a level is not separately identifiable.
+    at nonzero values, or if it is ``"constant"`` and no input changes. With direct
+    feedthrough, a nonzero output under constant inputs is no evidence of a level, because feedthrough explains it too.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
@@ -274,9 +274,9 @@ def deviations(
 ) -> tuple[Run, dict[str, float]]:
     """Return a run minus the levels of its signals before the first sample, and the levels of its outputs by name.
 
-    The level of a signal is its constant value before an input changes; without evidence of rest, it is the first value
-    of an output. Estimated `output_levels` replace these values. The level of an input with a saturation or dead zone
-    is not subtracted.
+    The level of a signal is its constant value before an input changes. Without evidence of rest, the level of an
+    output is its first value, and inputs are unchanged. Estimated `output_levels` replace these values. The level of an
+    input with a saturation or dead zone is not subtracted.
     """
     evidence = rest_evidence(run, structure)
     limited = {limit.signal for limit in structure.limits}
@@ -388,9 +388,9 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 
 
 def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the larger of :func:`misfit` and a quarter of the excess in the sum of squares over the noise variance.
+    """Return the larger of :func:`misfit` and a quarter of the excess of the sum of squares, for two separate fits.
 
-    Arguments are those of :func:`misfit`, with residuals of two separate fits.
+    The excess is divided by the noise variance. Arguments are those of :func:`misfit`.
     """
     squares = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):

@@ -42,8 +42,8 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
     """Return block-pulse means of shape (signals, pulses) with a further row for each non-linear term.
 
     An expression is evaluated at the means of its signals, which is accurate to second order in the `step` [s]. Means
-    are smoothed before differentiation if `smooth` is True. A row is NaN where the expression is not finite. All values
-    are NaN with a sensor filter, or if the expression contains the derivative of a zero-order-hold input; see
+    are smoothed before differentiation if `smooth` is True. A row is NaN where its expression is not finite. The whole
+    row is NaN with a sensor filter, or if its expression contains the derivative of a zero-order-hold input; see
     :func:`check_columns`.
     """
     columns = nonlinear_columns(structure)

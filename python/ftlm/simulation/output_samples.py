@@ -71,10 +71,10 @@ class OutputSamples:
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
-        Number of block pulses per sampling interval on the finest grid; 1 for an exact simulation.
+        Number of block pulses per sampling interval at the smallest step; 1 for an exact simulation.
     change
         For each output, the change of its samples in the last halving of the step, relative to its largest value;
-        infinite with fewer than three grids.
+        infinite with fewer than three steps.
     """
 
     outputs: Floats
@@ -156,7 +156,7 @@ def simulate_samples(
 def add_levels(
     model: Model, levels: Mapping[str, float], outputs: Floats, initial: Terms
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Return samples and initial terms with the levels of the outputs before the run added.
+    """Add the levels that the outputs had before the run to samples and initial terms, and return both.
 
     `outputs` and `initial` are deviations from these levels.
     """

@@ -66,7 +66,7 @@ def simulate_refined(
     tolerance
         Change, relative to the largest value of each output, at which the refinement terminates.
     on_grid
-        Whether samples are simulated at the uniform grid of the run even if it is compared at nonuniform times.
+        Whether samples are simulated at the uniform sample times even if the run is compared at nonuniform times.
     """
     if initial is not None:
         return _simulate_refined(model, run, initial, tolerance, max_m, on_grid)
