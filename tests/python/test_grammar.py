@@ -122,7 +122,7 @@ def test_delays_are_read(text, delay, free):
         ("y' = -wn^2 y + u", "write one name for it, as in 'a1 y'"),
         ("y'' = u - fc*sign(y'')", r"friction depends on the first derivative; write sign\(D y\)"),
         ("D y' = -y + u", "y has both D and primes"),
-        ("y' = -y + sat(u', 2)", r"limits a signal, not its derivative; write sat\(u, …\)'"),
+        ("y' = -y + sat(u', 2)", r"limits a signal, not its derivative; write sat\(u, …\)"),
         ("y = 1/(1 + s/T) u", "'T' at character 14 divides, but a divisor must be a number"),
         ("y = u/(s + 1)", r"write '1/\(s \+ 1\) u' if u is the input"),
         ("y = 2*u/(s + 1) + v", r"write '2/\(s \+ 1\) u' if u is the input"),
@@ -197,7 +197,7 @@ def test_what_is_printed_is_read(structure):
     ("text", "message"),
     [
         ("D y = a y^2.5 + u", "at character 9: the power 2.5 of y is not a whole number; write abs(y)^2.5"),
-        ("D y = a y^-1 + u", "at character 9: the power -1 of y is not in [1, 100]; a quotient of signals is a signal"),
+        ("D y = a y^-1 + u", "at character 9: the power -1 of y is not in [1, 100]; give a quotient of signals as a"),
         ("D y = a y/u", "'u' at character 11 divides"),
         ("D y = a sin(y/u)", "'u' at character 15 divides inside a non-linear term"),
         ("D y = a D y^2", "a power of D y at character 12 has two meanings; write (D y)^…"),

@@ -240,7 +240,7 @@ def test_linear_model_about_a_point(model):
 
 
 def test_an_input_that_makes_the_output_jump_is_refused():
-    with pytest.raises(ftlm.ModelError, match="order 2 of h is not below alpha = 2, and the non-linear term k y"):
+    with pytest.raises(ftlm.ModelError, match="order 2 of h is not below alpha = 2, but the non-linear term k y"):
         ftlm.equation("D^2 y = a y + k y^3 - D^2 h")
     coupled = ftlm.equation("D^2 y = a y + k y^3 - D^2 h; D^2 h = b u", coupling="simulated")
     assert coupled.has_nonlinear_terms

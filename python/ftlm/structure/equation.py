@@ -361,8 +361,8 @@ class Equation:
         for signal, inner in shape.channels:
             if signal == self.output and inner > alpha - order + ORDER_RESOLUTION:
                 raise ModelError(
-                    f"{words} has the derivative of order {inner:g} of {signal}, above {alpha - order:g}, the order "
-                    f"alpha = {alpha:g} less that of the term; lower it"
+                    f"{words} has the derivative of order {inner:g} of {signal}, above {alpha - order:g}: with the "
+                    f"order of the term, {order:g}, it exceeds alpha = {alpha:g}; lower it"
                 )
 
     def _check_friction(self, friction: Friction) -> None:
@@ -414,8 +414,8 @@ class Equation:
                 terms = self.nonlinear_terms
                 follows, what = (f"the non-linear term {terms[0]}", "motion") if terms else ("friction", "velocity")
                 raise ModelError(
-                    f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, and "
-                    f"{follows} in the equation of {self.output} then has no {what} to follow; lower it"
+                    f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, but "
+                    f"{follows} in the equation of {self.output} requires a continuous {what}; lower it"
                 )
 
     @property

@@ -260,7 +260,8 @@ def power(base: Expression, exponent: float) -> Expression:
             raise ModelError(f"the power {exponent:g} of {base} is not in (0, {MAX_POWER}]; choose another")
     elif not 1 <= exponent <= MAX_POWER:
         raise ModelError(
-            f"the power {exponent:g} of {base} is not in [1, {MAX_POWER}]; a quotient of signals is a signal of the run"
+            f"the power {exponent:g} of {base} is not in [1, {MAX_POWER}]; give a quotient of signals as a signal of "
+            "the run"
         )
     elif not float(exponent).is_integer():
         raise ModelError(f"the power {exponent:g} of {base} is not a whole number; write abs({base})^{exponent:g}")

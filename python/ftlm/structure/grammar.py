@@ -528,7 +528,7 @@ class EquationParser(TokenReader):
         plain_before = set(self.plain)
         signal = self._signal()
         if self._primes:
-            raise self._error(f"{value}(…) limits a signal, not its derivative; write {value}({signal}, …)'")
+            raise self._error(f"{value}(…) limits a signal, not its derivative; write {value}({signal}, …)")
         self.plain = plain_before | (self.plain - {signal})
         if law == "dead_zone" and (signal, "saturation") in self.limits:
             raise self._error(f"a dead zone acts before a saturation: write sat(dead({signal}, …), …)")
@@ -752,12 +752,10 @@ class EquationParser(TokenReader):
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
-        """True if a token ends a transfer function.
+        """Whether a token ends a transfer function; `symbols` are the three tokens after it.
 
-        If `is_named`, this is the name of the input at its end; otherwise it is the next plus or minus sign or the end
-        of the text.
-
-        `symbols` are the three tokens after the token.
+        With `is_named`, the name of the input ends the transfer function. Otherwise a plus or minus sign or the end of
+        the text ends it.
         """
         if not is_named:
             return kind == "end" or (kind == "symbol" and value in "+-")

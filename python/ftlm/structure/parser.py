@@ -54,8 +54,9 @@ def equation(
         order law, ``D y``, ``y'`` or ``dy/dt`` the first derivative. A coefficient is a name, a number (fixed) or a
         number times a name. Terms may stand on both sides, as in ``"y'' + 2 y' + y = u(t - 0.1)"`` with a delay [s] of
         the input, and transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. An
-        input may have a higher order than its equation, and lead it as in ``u(t + 0.1)``: such an equation has a
-        frequency response, and :func:`identify` states which inputs of a run it requires. The equation is solved for
+        input may have a higher order than its equation, or a lead, as in ``u(t + 0.1)``. Such an equation
+        can always be fitted to a frequency response, but :func:`identify` raises ModelError if the order or the lead is
+        too large for a run. The equation is solved for
         the highest derivative of its output, the signal that is differentiated most on the left-hand side. Separate
         equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an offset, an unknown constant;
         write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is Coulomb friction of the

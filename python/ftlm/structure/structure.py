@@ -383,8 +383,8 @@ class Structure:
     def equation(self, output: str) -> Structure:
         """Return the equation of one output as a structure, with measured coupling and without order laws.
 
-        An order that is an expression of free orders becomes a single free order. In a term without modeled outputs, it
-        becomes 0. Numbers and single free orders are unchanged.
+        An order that is an expression of free orders becomes a single free order, or 0 in a term without modeled
+        outputs. Numbers and single free orders are unchanged.
 
         Raises
         ------
