@@ -403,9 +403,9 @@ def fit_with_initial_conditions(
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
     `start` are the initial conditions suggested by the data. A fit with a history (powers of t that represent past
-    inputs) is kept unless Caputo initial terms, of which there are fewer, give equally small residuals. A fit from rest
-    is kept unless a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`,
-    the first of `guesses` is the only initial guess.
+    inputs) is replaced by one with Caputo initial terms, of which there are fewer, if its residuals are equally small.
+    A fit from rest is replaced only if a history improves it significantly. The result names the fitted terms in
+    ``initial``. With `alone`, the first of `guesses` is the only initial guess.
     """
 
     def fit_initial_terms(

@@ -509,9 +509,10 @@ class Identification:
 
         *Do not use*:
 
-        - The simulation overflows, or the model has an unstable pole.
-        - A parameter is not identifiable (infinite standard error).
-        - NR of an output exceeds 0.5, over all estimation or validation runs or on one of them.
+        - The simulation overflows, or the model has a significantly unstable pole.
+        - The motion is chaotic, or a parameter is not identifiable (infinite standard error).
+        - NR of an output exceeds 0.5, over all estimation or validation runs or on one of them. If noise or an outlier
+          at an end of the run explains this, the level is "with care".
         - The orders of an equation make it nearly an identity.
 
         *With care*:
@@ -520,11 +521,13 @@ class Identification:
           residual, 100 minus the fit, exceeds 10 % and three times the estimation residual, or 5 % and five times it.
         - Stability is not decided, or the damping of an oscillatory mode is not significantly positive. An integrator
           is permitted.
-        - Residuals are correlated with an input, are not white, or are colored in a closed loop. Residuals below a
+        - Residuals are correlated with an input or depend on the direction of motion. Or they are not white, and no
+          test shows that they are independent of the inputs. Or a closed loop biases the estimates. Residuals below a
           thousandth of the output do not count.
         - The fit did not converge.
-        - A parameter has no effect. The relative standard error of a coefficient exceeds 0.5, or the standard error of
-          an order exceeds 0.25. The interval of a delay, saturation or dead zone is unbounded.
+        - The relative standard error of a coefficient exceeds 0.5, or its profile-likelihood interval is unbounded or
+          contains 0. The standard error of an order exceeds 0.25. The interval of an order, delay, saturation or dead
+          zone has no upper bound.
         - Initial conditions may hide an offset.
         - Another finding has this level, the method gives no standard errors, or there is no validation.
 

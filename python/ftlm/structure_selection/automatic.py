@@ -309,11 +309,10 @@ class AutomaticSelection:
         return free and not (self.feedback and form.has_feedthrough)
 
     def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
-        """Return the fits extended by forms with zeros, sorted by BIC.
+        """Return the fits extended by `forms`, and by variants of them with fewer zeros, sorted by BIC.
 
-        First all zeros are added, then forms with fewer zeros that can still have the lowest BIC.
-
-        Fewer zeros cannot reduce the residuals, so they lower BIC by at most the penalty of the removed zeros.
+        Fewer zeros cannot reduce the residuals, so they lower BIC by at most the penalty of the removed zeros. Only
+        variants that can still have the lowest BIC are fitted.
         """
         forms_before = {f.form for f in fits}
         full = _rank([*fits, *self._fit([f for f in forms if f not in forms_before])])

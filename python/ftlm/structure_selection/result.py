@@ -34,8 +34,8 @@ class Selection(BestIdentification):
     Parameters
     ----------
     trials
-        Validated candidates, best prediction first. They are followed by candidates that fail on a part of the
-        validation data although others predict it. Candidates without a fit are last.
+        Candidates, best prediction first. Candidates that fail on a part of the validation data that others predict
+        follow, then unstable candidates, and then candidates without a fit.
     chosen
         Index of the chosen candidate in `trials`.
     best

@@ -123,9 +123,10 @@ def select(
     A candidate fails on a run or a block if its residual there exceeds half of the output and twice the residual of
     another candidate. Candidates with the fewest failures are eligible. Of those that predict as well as the best, the
     one with the lowest Schwarz criterion is chosen. The criterion uses a number of samples that is corrected for the
-    autocorrelation of the residuals. A candidate predicts as well as the best if its residual is at most 1 % larger. Up
-    to 5 % are tolerated if the difference over three or more folds is not significant at 95 %. With fewer folds, up to
-    5 % are tolerated if the criterion is lower by 10. Ties are decided by fewer parameters, then lower order, then
+    autocorrelation of the residuals. A candidate predicts as well as the best if its residual is at most 1 % larger.
+    With three or more folds, a difference that is not significant at 95 % is tolerated up to 5 %, and without limit if
+    the criterion is lower by 10. With fewer folds, up to 5 % are tolerated if the criterion is lower by 10. Ties are
+    decided by fewer parameters, then lower order, then
     better prediction.
 
     Parameters
@@ -486,7 +487,7 @@ def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
 
 
 def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
-    """Return trials sorted by the number of failures, then by the mean score, best first.
+    """Return trials sorted by stability, number of failures and mean score, best first; failed fits are last.
 
     By the mean score alone, good fits on other blocks would compensate for a failure on one block.
     """

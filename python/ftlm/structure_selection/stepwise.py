@@ -50,8 +50,8 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
     """Return the ascending indices of the structures that are worth a fit on all samples.
 
     Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
-    exceeds the lowest cost by the factor that the multistart uses for successive halving. At least `least` structures
-    remain. All remain if records are too short for subsampling or a structure is non-linear.
+    exceeds `MAX_PRESCREEN_COST_RATIO` times the lowest cost. At least `least` structures remain. All remain if records
+    are too short for subsampling or a structure is non-linear.
     """
     every = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))

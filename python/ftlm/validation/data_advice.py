@@ -234,7 +234,7 @@ def _smallest_change(y: Floats) -> float:
 
 
 def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
-    """Whether a signal is steep just before and after an interval of equal values, which indicates clipping."""
+    """Whether an interval of equal values is an extreme of a signal that is steep just before and after it."""
     moving = np.abs(np.diff(y))
     typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
     # A slow turning point that ends with an input step is steep on one side only.
@@ -417,7 +417,7 @@ def _offset(run: Run, name: str) -> Iterator[Finding]:
 def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
     """Yield a finding on each output with a linear trend that the inputs do not explain.
 
-    First-order lags and integrals of the inputs are the regressors.
+    The regressors are the inputs, their first-order lags and their integrals.
     """
     m = min(DRIFT_PULSES, run.length - 1)
     if m < 4 * DRIFT_BLOCKS:
