@@ -234,7 +234,7 @@ def test_initial_values_of_the_textbook_are_refused_with_caputos_powers():
         step=0.05, inputs={"f": 1 + t}, outputs={"y": np.zeros(t.size)}, intersample={"f": "foh"}
     )
     model = ftlm.Model(ftlm.equation("D^2 y = -1 D^1.5 y - 1 y + 1 f"))
-    with pytest.raises(ftlm.ModelError, match=r"Caputo's definition are \{0: 1, 0\.5: 1\.12838, 1: 1, 1\.5: 0\.752"):
+    with pytest.raises(ftlm.ModelError, match=r"fractional order; give \{0: 1, 0\.5: 1\.12838, 1: 1, 1\.5: 0\.752"):
         model.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1.0}})
     powers = {0.0: 1.0, 0.5: 1.1283791671, 1.0: 1.0, 1.5: 0.7522527781}
     assert model.simulate(run, initial={"y": powers})["y"] == pytest.approx(1 + t, abs=1e-5)

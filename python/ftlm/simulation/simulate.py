@@ -196,9 +196,9 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
     if lacking:
         text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(needed.items()))
         raise ModelError(
-            f"initial terms of {item.output}: powers of t {', '.join(map(str, sorted(values)))}, and the equation has "
-            f"a term of fractional order: initial values by Caputo's definition are {{{text}}} in the "
-            f"equation that is integrated; give all of these, or t^{lacking[0]:g} as 0 if only the powers are meant"
+            f"initial terms of {item.output}: powers of t {', '.join(map(str, sorted(values)))}, but initial values by "
+            f"Caputo's definition imply further powers in an equation of fractional order; give {{{text}}} for such "
+            f"initial values, or t^{lacking[0]:g} as 0 if only the given powers are meant"
         )
 
 
