@@ -419,7 +419,7 @@ class FrequencyIdentification:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the model without validation data; :meth:`validate` returns a verdict with them.
+        """Verdict on the model without validation data; :meth:`validate` gives one that includes such data.
 
         It is "do not use" if a parameter is not identifiable, the error exceeds half of a response, or the model is
         unstable. It is "with care" if residuals are not white or exceed the stated standard deviations, a parameter is

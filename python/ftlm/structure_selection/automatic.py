@@ -172,7 +172,7 @@ class OutputProblem:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Form with its fit, variance inflation of the residuals, and BIC."""
+    """Fit of a structure with its form (None for fractional orders), variance inflation of residuals, and BIC."""
 
     structure: Structure
     joint: JointFit

@@ -513,8 +513,8 @@ def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
 def residual_variance_inflation(joint: JointFit) -> float:
     """Return the largest variance inflation of the residuals over runs and outputs, at least 1.
 
-    The variance inflation is the ratio of the variance of the sum of the residuals to that of the sum of white noise of
-    the same power.
+    The variance inflation is the variance of the sum of the residuals, divided by its value for white noise of the same
+    power.
     """
     return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 

@@ -265,8 +265,8 @@ class StepwiseSelection:
         """Run forward selection, then backward elimination. Return all trials in the sequence of their validation.
 
         Each integer value of the highest orders gives its own initial structure, because the best of the simplest
-        structures need not be nested in the best structure. With several inputs, one may act as a proxy for the others,
-        so the best structure is also approached from the full structure at integer orders by backward elimination. If
+        structures need not be nested in the best structure. With several inputs, one input may act as a proxy for the
+        others. Backward elimination therefore also starts from the full structure at integer orders. If
         there are enough input terms for best-subset screening, selection starts from the best subset. If no term is
         optional, the structure with all orders free is a second initial structure.
         """

@@ -120,11 +120,11 @@ def feedback_test(
     """Test whether an input depends on past outputs: feedback in Granger's sense (doi:10.2307/1912791).
 
     The innovation of the input is its residual after regression on its own past and on the other inputs. In open loop
-    the innovation is independent of past outputs, provided that the regression includes enough lags and that no other
-    input depends on both the output and this input. A heteroskedasticity-robust score test (White, doi:10.2307/1912934)
-    tests whether past residuals, their differences, their low-pass part and past innovations of the output predict the
-    innovation of the input. The present residual is not used, because feedback within one sample cannot be
-    distinguished from direct feedthrough.
+    the innovation is independent of past outputs. This requires that the regression includes enough lags, and that no
+    other input depends on both the output and this input. A heteroskedasticity-robust score test (White,
+    doi:10.2307/1912934) tests whether past residuals, their differences, their low-pass part and past innovations of
+    the output predict the innovation of the input. The present residual is not used, because feedback within one sample
+    cannot be distinguished from direct feedthrough.
 
     Parameters
     ----------
