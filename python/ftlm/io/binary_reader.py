@@ -2,15 +2,15 @@
 
 `ftlm.utils.resources.python_child` runs this file by its path with the arguments KIND OPTIONS FILE…; the parent process
 never imports it. KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS is a JSON object with the requested
-sheet. For every file the reader writes one line of JSON to standard output, followed by the numbers:
+sheet. For every file the reader writes an answer to standard output: one line of JSON, the header, then the numbers.
 
-``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
-little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may have a
-``"unit"``. An array of timestamps has values in nanoseconds after a reference time. This time is stored under
-``"since"`` in integer nanoseconds since 1970. Columns that do not come from matrices have ``"text": true``. A run
-written by ftlm has its header under ``"ftlm-run"``. A sheet has its name under ``"sheet"`` and the names of all other
-sheets under ``"others"``. Under ``"bytes"`` it has the number of bytes of UTF-8 text that follow: one line per row,
-tabs between cells.
+The header is ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}``, and the arrays
+follow as little-endian float64, column after column. For an unreadable file, the answer is only ``{"error": reason,
+"way_out": remedy}``. An array may have a ``"unit"``. An array of timestamps has values in nanoseconds after a reference
+time. This time is stored under ``"since"`` in integer nanoseconds since 1970. A file with columns instead of matrices
+has ``"text": true``. The run header that ftlm wrote to a file is under ``"ftlm-run"``. A sheet has its name under
+``"sheet"`` and the names of all other sheets under ``"others"``. Its ``"bytes"`` is the number of bytes of UTF-8 text
+that follow: one line per row, tabs between cells.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def read_parquet(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header and the numeric and date columns of an Arrow table; others are listed as skipped.
+    """Return the header and the numeric and date columns of an Arrow table; other columns are listed as skipped.
 
     Raise UnreadableError if row count or digest of a run written by ftlm is wrong.
     """
@@ -281,9 +281,9 @@ class Arrays:
         self.left = budget
 
     def fits(self, name: str, shape: tuple[int, ...], kind: Any) -> bool:
-        """Whether an array of this shape and dtype is read; if not, record the reason in the header.
+        """Return whether an array of this shape and dtype is supported; if not, record the reason in the header.
 
-        Raise UnreadableError if the array exceeds the limit of size or number of arrays.
+        Raise UnreadableError if the array would exceed the size limit or the maximum number of arrays.
         """
         why = None
         if kind.hasobject:
@@ -363,7 +363,10 @@ def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
-    """Return one NumPy array, or None if it is skipped; raise UnreadableError if its size is wrong or too large."""
+    """Return the NumPy array in a binary stream, or None if its shape or dtype is not supported.
+
+    `name` is the name of the array. Raise UnreadableError if its size is wrong, or exceeds the limit of `arrays`.
+    """
     form: Any = importlib.import_module("numpy.lib.format")
     version = form.read_magic(stream)
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)

@@ -34,9 +34,9 @@ _MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", 
 
 @functools.cache
 def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
-    """Return the regular expression of a number with grouped thousands; its first group matches the decimals.
+    """Return a regular expression for numbers with grouped thousands; its group 1 is the decimal mark and decimals.
 
-    `mark` is the thousands separator, and `comma` whether the decimal mark is a comma.
+    `mark` is the name of the thousands separator. `comma` states whether the decimal mark is a comma.
     """
     point = "," if comma else "[.]"
     return re.compile(
@@ -46,7 +46,10 @@ def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
 
 
 def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
-    """Return the thousands separator of a number if its decimals make the separator unambiguous, otherwise None."""
+    """Return the name of the thousands separator in a number, or None unless decimals make it unambiguous.
+
+    `comma` states whether the decimal mark is a comma.
+    """
     if len(cell) < len("1.234,"):
         return None
     for mark in THOUSANDS_SEPARATORS:
@@ -64,8 +67,9 @@ def may_group(cell: str, mark: str, *, comma: bool) -> bool:
 def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
     """Return the number in a cell, 1 for true and 0 for false; raise ValueError if there is none.
 
-    Underscores between digits, which Python accepts, are rejected. With decimal commas, a point is also rejected unless
-    `mark` is a point, as thousands separator.
+    `comma` states whether the decimal mark is a comma, and `mark` is the name of the thousands separator. Underscores
+    between digits, which Python accepts, are rejected. With decimal commas, points are accepted as thousands separators
+    only.
     """
     if mark is not None and may_group(cell, mark, comma=comma):
         cell = re.sub(THOUSANDS_SEPARATORS[mark], "", cell)
@@ -205,15 +209,16 @@ class Timestamps:
     Parameters
     ----------
     parts
-        Three numbers of each date in the sequence of the text, shape (N, 3); zeros if the text is only a time of day.
+        Three numbers of each date in the sequence of the text, shape (N, 3); zeros without a date.
     mark
         Separator of the date; "" without a date.
     clock
-        Time of day [ns], shape (N,); in UTC if the text has a time zone.
+        Time of day (in UTC if the text has a time zone), duration, or time since a reference [ns], shape (N,).
     first
         Text of the first cell.
     notation
         Notation of the text: separator of the date, whether there is a time zone, and whether there is AM/PM.
+        Durations have a notation of their own.
     """
 
     parts: npt.NDArray[np.int64]
@@ -316,7 +321,7 @@ class Timestamps:
 
 
 def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: str, zone: str) -> int:
-    """Return the time of day [ns] from its texts; in UTC if there is a time zone."""
+    """Return the time of day [ns] from the texts of its parts (`half` is AM or PM); in UTC if there is a time zone."""
     hours, offset = int(hour or 0), 0
     if half:
         hours = hours % 12 + (12 if half in "Pp" else 0)

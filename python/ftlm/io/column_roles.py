@@ -16,10 +16,11 @@ from ftlm.utils.validation import CSV_TIME, join_names
 
 @dataclass
 class ColumnSelection:
-    """Selection of the columns of a run, with units and layout, from arguments, a columns file or the ftlm header.
+    """Selection of the columns of a run, with units and layout.
 
-    `time` and `step` [s] are alternatives. `inputs` and `outputs` map each signal to the name or position of its
-    column.
+    It comes from arguments, a columns file or the header of a file that ftlm wrote. At most one of the column `time`
+    and the `step` [s] is set; without both, the time column is detected. `inputs` and `outputs` map each signal to the
+    name or position of its column.
     """
 
     time: Hashable | None
@@ -61,9 +62,9 @@ def words_of(column: str) -> set[str]:
 def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the columns whose names suggest an input, and those whose names suggest an output.
 
-    Both lists are empty if the names are ambiguous. If the other columns include inputs and outputs, references are
-    omitted, and so are commands whose quantity is also measured. A single column is an output, unless its name suggests
-    an input.
+    Both lists are empty if the names are ambiguous. References, and commands whose quantity is also measured, are
+    omitted unless all inputs or all outputs are among them. A single column is an output, unless its name suggests an
+    input.
     """
     if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
         return [], list(columns)
@@ -113,7 +114,10 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def known_unit(text: str, column: str = "") -> str:
-    """Return the ftlm unit for a unit in a file; "" if it is unknown, or if degrees may mean a temperature."""
+    """Return the ftlm unit for the unit `text` in a file; "" if it is unknown.
+
+    The result is also "" for degrees if the name of the column suggests a temperature.
+    """
     unit = parse_unit(text) or ""
     return "" if unit in ("deg", "°") and words_of(column) & _WORDS_BY_ROLE["temperature"] else unit
 
@@ -145,7 +149,7 @@ def has_numbers(column: Column) -> bool:
 def assume_roles(
     selection: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
 ) -> tuple[Assumption, ...]:
-    """Set inputs and outputs of a selection in place if it has neither, and return the assumption on them.
+    """Set inputs and outputs of a selection in place if it has neither, and return any assumption on them.
 
     Parameters
     ----------
@@ -193,7 +197,7 @@ def assume_roles(
 
 
 def add_file_units(selection: ColumnSelection, pool: ColumnTable) -> None:
-    """Add the units in a file to a selection, in place, for selected columns without a unit."""
+    """Add the known units in the files to a selection, in place, for signals without a unit in the selection."""
     for name, spec in (selection.inputs | selection.outputs).items():
         column = pool.find(spec, f"signal {name!r}")
         unit = known_unit(column.file_unit, column.name_with_unit)

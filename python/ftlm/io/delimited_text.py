@@ -68,7 +68,7 @@ class _BadCells:
     moments
         Whether some of them are dates or times of day.
     other
-        First cell of the column, if the cells are dates or times in another notation; otherwise "".
+        First cell of the column if it is a date or time in a notation that differs from `cell`; otherwise "".
     """
 
     line: int
@@ -257,7 +257,10 @@ def _dialect_with_empty_rows(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """Return an assumption; if it is about missing names, add a comment line that has one word per column."""
+    """Return an assumption with its words extended by a remark (comment line above the table).
+
+    This applies to an assumption about the header, if the remark has as many words as the table has columns (`width`).
+    """
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
@@ -527,10 +530,11 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
-    """Store the timestamps of a column, or its invalid cells, in `rows`, because not all its cells are numbers.
+    """Store the timestamps or invalid cells of a column in `rows`; not all cells of the column are numbers.
 
-    `index` is the column, and `lines` are the line numbers of its cells. If all invalid cells mean missing values, the
-    column of `values` gets the numbers, with NaN for missing values.
+    `column` has the texts of the cells in a block, `index` is the index of the column, and `lines` are the line numbers
+    of the cells. If all invalid cells mean missing values, the column of `values` is filled with the numbers, and with
+    NaN for missing values.
     """
     comma, mark = rows.dialect.comma, rows.dialect.mark
     if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):

@@ -161,7 +161,7 @@ class Assumption:
     otherwise : str
         Text of the argument that replaces the assumption; empty if there is none.
     counts : bool
-        Whether values or rows of the run depend on the assumption, so that its warnings list the assumption.
+        Whether values or rows of the run depend on the assumption; the warnings of the run then list it.
     """
 
     option: str
@@ -175,9 +175,9 @@ class Assumption:
 
 
 def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
-    """Return the name of a value of an option, which is given by name (``comma``) or by character (``,``).
+    """Return the name of a layout option's value, which the user gives by name (``comma``) or by character (``,``).
 
-    `words` are the characters by name. Raise DataError for an unknown value.
+    `words` maps names to characters. Raise DataError for an unknown value.
     """
     if isinstance(value, str):
         if value in words:
@@ -223,8 +223,8 @@ class TableDialect:
     Parameters
     ----------
     separator, comma, mark
-        Cell separator (None for white space), whether the decimal mark is a comma, and thousands separator (None if
-        there is none).
+        Cell separator (None for white space), whether the decimal mark is a comma, and name of the thousands separator
+        (None if there is none).
     names, units
         Names and units of the columns; None if the header does not have them.
     begin

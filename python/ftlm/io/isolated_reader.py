@@ -255,7 +255,7 @@ class _ReaderOutput:
 def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layout) -> FileTable:
     """Return the table in the cells of a sheet, which the reader sends as tab-separated text.
 
-    If the user did not name the sheet and there are others, which are empty, an assumption lists the sheet.
+    An assumption names the sheet if the user did not, and the workbook has other sheets, all of them empty.
     """
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
     if layout.sheet is None and others:

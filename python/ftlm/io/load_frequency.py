@@ -71,7 +71,21 @@ HEADERLESS_PARTS = ("frequency", "real", "imag")
 
 @dataclass(frozen=True)
 class _ResponseColumn:
-    """Column of a frequency response: part, unit, whether its name inverts the sign, and its recognized name."""
+    """Column of a frequency response.
+
+    Parameters
+    ----------
+    column
+        Column of the file.
+    part
+        Part of the response: "frequency", "real", "imag", "magnitude", "phase" or "deviation".
+    unit
+        Unit in the file; "" if there is none.
+    is_negated
+        Whether the name of the column inverts the sign, as in ``-Z''``.
+    word
+        Name of the column without unit and sign.
+    """
 
     column: Column
     part: str
@@ -288,7 +302,7 @@ def _phase_unit(unit: str) -> str | None:
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
-    """Return the part of a response by the name of its column, such as ``Re(Z)`` or ``dB``; None if unknown."""
+    """Return a column of a response with the part that its name denotes, such as ``Re(Z)`` or ``dB``; else None."""
     whole, file_unit = column.name.strip(), column.file_unit
     own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
@@ -418,7 +432,8 @@ def _resolve_unit(
 ) -> str:
     """Return the unit of a column: the option of the user, else the unit in the file, else the first of `choices`.
 
-    In the last case, a note is added to `notes`. Raise DataError if the option is unknown or contradicts the file.
+    `what` is "magnitude" or "phase". In the last case, a note is added to `notes`. Raise DataError if the option is
+    unknown or contradicts the file.
     """
     if option is not None:
         if option not in choices:

@@ -95,7 +95,7 @@ class OpenedFile:
     assumed : tuple of Assumption
         Assumptions about layout, time and roles, each with the argument that replaces it.
     options : dict
-        Arguments of :func:`ftlm.load` that give the same run without assumptions.
+        Arguments with which :func:`ftlm.load` returns the previewed run without assumptions.
     step : float or None
         Sampling interval [s]; None if `problem` is set.
     problem : str
@@ -379,7 +379,7 @@ class _FilePreview:
         return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
-        """Return the arguments of :func:`ftlm.load` that give the same run without assumptions."""
+        """Return the arguments with which :func:`ftlm.load` returns the previewed run without assumptions."""
         selection = self.selection
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and selection.step is None and self.table.header is None:
