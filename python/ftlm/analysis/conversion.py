@@ -129,7 +129,7 @@ def matlab_text(model: Model) -> str:
 
 @check_arguments
 def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> str:
-    """Return a Python script that builds the python-control system without ftlm.
+    """Return a Python script that builds the approximation of a model as a python-control system, without ftlm.
 
     Parameters
     ----------
@@ -217,7 +217,8 @@ def to_tf(model: Model) -> Any:
     -------
     control.TransferFunction
         System with named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders
-        is included). Its attribute ``delay`` has the delay [s] of each input, which python-control cannot represent.
+        is included). Its attribute ``delay`` has the nonzero delays [s] by input, because python-control cannot
+        represent them.
 
     Warns
     -----
@@ -227,8 +228,8 @@ def to_tf(model: Model) -> Any:
     Raises
     ------
     ModelError
-        If an order is fractional, the model has friction, an input has a saturation, a dead zone or the sensor filter,
-        or python-control is not installed.
+        If an order is fractional, the model has friction, an input has a saturation or a dead zone or is measured
+        through the sensor filter, or python-control is not installed.
     """
     control = python_control()
     check_no_input_nonlinearity(model, "a transfer function")
@@ -263,7 +264,7 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
     -------
     control.StateSpace
         System with named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders
-        is included). In continuous time, its attribute ``delay`` has the delay [s] of each input.
+        is included). In continuous time, its attribute ``delay`` has the nonzero delays [s] by input.
 
     Warns
     -----
@@ -273,8 +274,8 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
     Raises
     ------
     ModelError
-        In the cases of :func:`to_tf`, if the step is not positive, or if an input has a negative delay in discrete
-        time.
+        In the cases of :func:`to_tf`, if an input order is above the order of its equation, if the step is not
+        positive, or if an input has a negative delay in discrete time.
     """
     control = python_control()
     check_linear(model.equations, "a linear system in state space")
@@ -301,12 +302,12 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
 
 
 def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
-    """Return a system with an attribute `delay`, and warn about each delay that is not 0."""
+    """Set the attribute `delay` of a system to the nonzero delays [s], warn about each, and return the system."""
     system.delay = {name: seconds for name, seconds in delay.items() if seconds}
     for name, seconds in system.delay.items():
         warn_caller(
-            f"the delay of {name}, {seconds:g} s, is not in the system; it is in its attribute delay, to_ss with "
-            f"{parameter('step')} includes it, and to_control with {parameter('band')} approximates it"
+            f"the delay of {name}, {seconds:g} s, is not in the system, only in the attribute delay; to_ss with "
+            f"{parameter('step')} includes delays, and to_control with {parameter('band')} approximates them"
         )
     return system
 
@@ -360,7 +361,10 @@ def _sample_system(
     expm = importlib.import_module("scipy.linalg").expm
 
     def hold(column: Floats, seconds: float) -> tuple[Floats, Floats]:
-        """Return the state-transition matrix over a duration [s], and the zero-state response to a unit input."""
+        """Return the state-transition matrix over a duration [s], and the final zero-state response to a unit input.
+
+        `column` is the input matrix of this input, shape (states, 1).
+        """
         whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
         return whole[:-1, :-1], whole[:-1, -1:]
 

@@ -64,7 +64,9 @@ class Ratio:
                 "identify_frequency"
             )
         if not 0 < order <= MAX_ORDER:
-            raise ModelError(f"the denominator is of order {order:g}; an equation has an order from 0 to {MAX_ORDER:g}")
+            raise ModelError(
+                f"the denominator is of order {order:g}; an equation has an order above 0, at most {MAX_ORDER:g}"
+            )
         terms = [(-c / gain, output, p + shift) for p, c in bottom.items() if p != highest]
         terms += [(c / gain, signal, p + shift) for p, c in top.items()]
         words = " + ".join(f"{c!r} D^{p!r} {name}" for c, name, p in terms).replace("+ -", "- ")
@@ -119,9 +121,10 @@ def transfer_function(
 
 
 def _polynomial(name: str, values_argument: Any) -> Polynomial:
-    """Return a polynomial from coefficients in descending powers, (coefficient, power) pairs, or two lists of these.
+    """Return a polynomial from coefficients in descending powers, (coefficient, power) pairs, or a tuple of two lists.
 
-    `name` names the argument in messages. Raise ModelError for other input.
+    The lists are the coefficients and the powers. `name` names the argument in messages. Raise ModelError for other
+    input.
     """
     if isinstance(values_argument, zip):
         raise ModelError(

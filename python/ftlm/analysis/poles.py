@@ -65,8 +65,8 @@ class Stability:
     method
         Method used: ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
     base
-        Largest number of which all orders are multiples; None if there is none, or the method is the argument
-        principle.
+        Largest number, at most 1, of which all powers of s are multiples; None if it would be below 0.01, or the method
+        is the argument principle.
     """
 
     stable: bool
@@ -119,7 +119,7 @@ def common_base(powers: Sequence[float]) -> float | None:
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     """Return the common base q of the powers of s in a polynomial, and its nonzero roots in the variable s^q.
 
-    Return None if there is no common base, the degree exceeds 100, or frequencies or coefficients overflow.
+    Return None if there is no common base, the degree exceeds 100, or a root or a coefficient overflows.
     """
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
@@ -408,7 +408,7 @@ class Mode:
         time for fractional orders.
     frequency_error, damping_error, time_constant_error
         Standard errors from the parameter covariance of the model, in the units of the values; None without a
-        covariance.
+        covariance. The damping of a relaxation has no standard error.
     """
 
     pole: complex

@@ -125,7 +125,10 @@ _Signal = dict[tuple[Literal["state", "input", "output"], int], float]
 
 
 def _sum(signals: Iterable[tuple[float, _Signal]]) -> _Signal:
-    """Return the sum of factor * signal over (factor, signal) pairs."""
+    """Return the sum of factor * signal over (factor, signal) pairs.
+
+    A signal is a linear combination of states, inputs and outputs.
+    """
     total: _Signal = {}
     for factor, signal in signals:
         for source, value in signal.items():
@@ -134,7 +137,10 @@ def _sum(signals: Iterable[tuple[float, _Signal]]) -> _Signal:
 
 
 def _dense(signals: Sequence[_Signal], kind: str, width: int) -> Floats:
-    """Return the coefficients of one kind ("state", "input", "output") in signals as a matrix, one row per signal."""
+    """Return the coefficients of all states, inputs or outputs in signals as a matrix, one row per signal.
+
+    `kind` is "state", "input" or "output", and `width` is the number of variables of this kind.
+    """
     matrix = np.zeros((len(signals), width))
     for i, signal in enumerate(signals):
         for (source, j), value in signal.items():

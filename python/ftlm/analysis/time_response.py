@@ -69,7 +69,8 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     model
         The model.
     time
-        Uniform time points from 0 [s], at least 3; by default up to the settling time.
+        Uniform time points from 0 [s], at least 3; by default about six time constants of the slowest mode, or 10 s
+        for a nonlinear model.
     kind
         ``"step"`` or ``"impulse"``.
 
