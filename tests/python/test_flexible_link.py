@@ -177,7 +177,7 @@ def test_friction_terms():
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c3"),
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c4"),
     ]
-    with pytest.raises(ftlm.ModelError, match="follows hubs of form='lagrange'"):
+    with pytest.raises(ftlm.ModelError, match="requires form='lagrange', in which hub friction"):
         ftlm.flexible_link(form="published", friction=True)
     followed = ftlm.flexible_link(stage=2, coupling="simulated", friction=True)
     assert [e.friction for e in followed.equations] == [ftlm.Friction("fc2"), None]

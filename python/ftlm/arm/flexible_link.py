@@ -361,9 +361,9 @@ def flexible_link(
         )
     if friction and coupling == "simulated" and form != "lagrange":
         raise ModelError(
-            f"{parameter('friction', True)} with {parameter('coupling', 'simulated')} follows hubs of "
-            f"{parameter('form', 'lagrange')}, where it does not enter the links' equations; use that form, or "
-            f"{parameter('coupling', 'measured')}, whose friction has the sign of the measured velocity"
+            f"{parameter('friction', True)} with {parameter('coupling', 'simulated')} requires "
+            f"{parameter('form', 'lagrange')}, in which hub friction does not enter the links' equations; use that "
+            f"form, or {parameter('coupling', 'measured')}, whose friction has the sign of the measured velocity"
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
@@ -525,12 +525,12 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
 
 
 def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
-    """Return the structure of a deflection by eq. (15) of the paper, with the measured hub angle as input.
+    """Return the structure of one or both link deflections by eq. (15) of the paper, with measured hub angles as input.
 
-    Elasticity and damping have free orders. The effect of the hub angle on the strain gauge and the offset of the gauge
-    are included. If both joints are measured (`both`), the equation also contains the accelerations of the other joint
-    and, if `rate` is True, the rate of its deflection. `filtered` states whether deflections passed the stock 2 Hz
-    low-pass.
+    `stage` is the joint, 1, 2 or "both". Elasticity and damping have free orders. The effect of the hub angle on the
+    strain gauge and the offset of the gauge are included. If both joints are measured (`both`), each equation also
+    contains the accelerations of the other joint and, if `rate` is True, the rate of its deflection. `filtered` states
+    whether deflections passed the stock 2 Hz low-pass.
 
     Initial conditions are those of Caputo derivatives. With a history before the run, a model of fractional orders
     would have more free initial terms on the validation run than a model of integer orders.
