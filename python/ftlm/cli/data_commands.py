@@ -17,7 +17,7 @@ def open_(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Preview a file: print columns, units, roles, step, assumptions with contrary evidence, and the next command.
+    """Preview a file: print columns, units, roles, step, assumptions, and the command for the next step.
 
     Arguments
     ---------

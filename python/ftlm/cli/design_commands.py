@@ -66,7 +66,7 @@ def control(
     force: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Design a controller for a model, and print its margins with their ranges over the uncertainty of the model.
+    """Design a controller for a model, and print stability margins with 95 % intervals over the model uncertainty.
 
     Options
     -------
@@ -103,7 +103,7 @@ def control(
     samples
         Parameter samples on which the design is checked.
     seed
-        Seed of these samples.
+        Seed of the parameter samples.
     out : FILE
         Write the controller to this .json file.
     """
@@ -201,7 +201,7 @@ def input_shaper(
     rate
         Sampling rate of the reference [Hz].
     out : FILE
-        Write its impulse response to this .csv file.
+        Write the shaper's impulse response to this .csv file.
     """
     shaper = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
     taps = shaper.impulses(rate)

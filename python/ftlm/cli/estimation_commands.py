@@ -131,7 +131,7 @@ def select_structure(
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
-    """Return the expected total time [s] of `fits` output-error fits of all parameters, which share the runs."""
+    """Return the expected total time [s] of `fits` output-error fits, each to an equal share of the samples."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
@@ -352,7 +352,7 @@ def certify(
     order_grid : NAME=LOW:HIGH:STEP
         Interval of an order; alpha stands for every alpha.
     tolerance
-        Fraction by which errors at other orders may be smaller.
+        Fraction by which other orders may beat the smallest error.
     min_separation
         Minimum distance of orders; default the increment.
     max_term_ratio
@@ -438,7 +438,7 @@ def resume(
     Options
     -------
     recover
-        Continue a damaged file; a copy of the damaged file is kept.
+        Resume from a damaged file, of which a copy is kept.
     """
     results = {}
     with resumable(store), Store(store, recover=recover) as open_store:
@@ -613,7 +613,7 @@ def select(
     Method
     ------
     validation : runs|blocks|FILE
-        Cross-validate over runs or quarters (blocks); or use a run.
+        Cross-validation over runs or quarters of runs, or a run.
 
     Output
     ------

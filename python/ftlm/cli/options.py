@@ -67,7 +67,7 @@ class StructureOptions:
     sensor_filter : stock|HZ[:DAMPING]
         Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.
     filtered_signals : SIGNAL
-        Signal of an equation in words that passed the filter.
+        Filtered signal of an equation in words.
     orders : NAME=VALUE
         Fix an order.
     saturation : INPUT=LIMIT
@@ -75,7 +75,7 @@ class StructureOptions:
     dead_zone : INPUT=LIMIT
         Dead zone of an input; LOW:HIGH estimates it.
     initial
-        auto, rest, caputo, history, or exponents of t: 0,1.
+        Initial terms: auto, rest, caputo, history, exponents 0,1.
     offset
         Offset of each equation and run; default the equation's.
     """
@@ -156,7 +156,7 @@ class StructureOptions:
         return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(defaults, f.name)]
 
     def _check_equation(self, count: int) -> None:
-        """Raise ModelError for options of the flexible link, which do not apply to `count` equations given as text."""
+        """Raise ModelError if an option is set that does not apply to a structure of `count` equations as text."""
         wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
@@ -192,10 +192,10 @@ class StructureOptions:
             ) from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
-        """Return the structure of the link deflections of the real arm, with all angles as inputs.
+        """Return the structure of one or both link deflections of the real arm, with the measured angles as inputs.
 
-        Only the order of the elastic term is free. If `alone` is True (one link, with the other joint locked), only the
-        order of the damping term is free. These choices improved the fit on validation runs. The offset of each run is
+        Only the order of the elastic term is free or, if `alone` is True (one link, with the other joint locked), only
+        the order of the damping term. These choices improved the fit on validation runs. The offset of each run is
         the zero of the strain gauge. The initial conditions are the angle and velocity of the link by default, because
         terms of nearly integer order have little memory.
         """

@@ -104,7 +104,7 @@ def reproduce(
     noise
         Noise on every angle of the virtual rig [rad].
     seed
-        Seed of that noise.
+        Seed of the noise.
     arms : ARM
         Simulated arm for the verdicts; several, or all.
     records

@@ -137,7 +137,7 @@ class ReadingOptions:
     def preview_file(self, file: str) -> OpenedFile:
         """Return the preview of a file without loading it as a run; raise ModelError for the option --detrend."""
         if self.detrend is not None:
-            raise ModelError("--detrend is not used with open; give it to the commands that open names")
+            raise ModelError("--detrend is not used with open; give it to the command that loads the file next")
         announce_reading([file])
         return preview_selection(file, *self._selection())
 

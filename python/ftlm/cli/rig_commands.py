@@ -210,7 +210,7 @@ def record(
     sensor_filter : stock
         Record through the stock 2 Hz low-pass; default none.
     watchdog
-        Time after which the motors are stopped [s].
+        Time without a write after which the motors are stopped [s].
     arm
         Confirm that a real arm may move.
     board
