@@ -37,8 +37,8 @@ Matrix: TypeAlias = list[list[float]]
 class Lag(msgspec.Struct, forbid_unknown_fields=True):
     """First-order lag of a fractional PID controller, as stored in a controller file.
 
-    The state for the control error e is x_k = keep x_{k-1} + now e_k + before e_{k-1}. ``weight`` is its factor in the
-    output, and ``of`` the part of the controller to which the lag belongs.
+    The state for the control error e is x_k = keep x_{k-1} + now e_k + before e_{k-1}. ``weight`` is the factor of the
+    state in the controller output, and ``of`` is the part of the controller to which the lag belongs.
     """
 
     of: Literal["integral", "derivative"]

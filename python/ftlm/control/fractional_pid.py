@@ -118,9 +118,9 @@ class _Bank:
 class DiscretePid:
     """Discrete-time fractional PID controller: Oustaloup's approximation as a sum of first-order lags.
 
-    Call it once per sample with the control error; it returns the controller output. The error before the first sample
-    is assumed to be constant, so the controller starts without a derivative kick. While the output is saturated, the
-    integral is not increased in the direction of the saturation (anti-windup).
+    Call it once per sample with the control error; it returns the controller output. The derivative part starts in the
+    steady state of a constant error, so there is no derivative kick at the first sample. While the output is saturated,
+    the integral is not increased in the direction of the saturation (anti-windup).
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ class DiscretePid:
         """Return ("integral" or "derivative", (keep, now, before, weight)) of each first-order lag.
 
         The state of a lag at sample k is x_k = keep x_{k-1} + now e_k + before e_{k-1}, where e is the error. The
-        output is the sum of weight x_k over all lags.
+        controller output before saturation is (kp + `direct`) e_k plus the sum of weight x_k over all lags.
         """
         banks: tuple[tuple[Literal["integral", "derivative"], _Bank], ...] = (
             ("integral", self._integral),
@@ -365,7 +365,7 @@ class PidDesign(LoopDesign):
         """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
         The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
-        is its response to the reference, shape (W,).
+        is the response of the command to the reference, shape (W,).
         """
         response = DiscretePid(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
@@ -439,9 +439,9 @@ def fractional_pid(
     ------
     ModelError
         If the model is unstable (an integrator is permitted), has friction, or is too uncertain. It is too uncertain if
-        for more than 5 % of the parameter samples the loop is unstable or has less than half the phase margin. Also if
-        no nonnegative gains meet the requirements, or if all loops that meet them have a second crossover above the
-        requested one.
+        for more than 5 % of the parameter samples the loop is unstable or has less than half the requested phase
+        margin. Also if no nonnegative gains meet the requirements, or if all loops that meet them are unstable or have
+        a second crossover above the requested one.
 
     Notes
     -----
@@ -528,8 +528,8 @@ def plant_of(
 ) -> Plant:
     """Return the plant of a sampled loop from the input `driver` to an output of a model.
 
-    With None, the only input or output is used. Raise ModelError if a name is unknown or missing, or the model is not
-    linear.
+    If `output` or `driver` is None, the only output or input of the model is used. Raise ModelError if a name is
+    unknown or missing, or the model is not linear.
     """
     check_model(model)
     if not isinstance(sensor, bool):

@@ -48,7 +48,7 @@ class Loop(Protocol):
         """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
         The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
-        is its response to the reference, shape (W,).
+        is the response of the command to the reference, shape (W,).
         """
 
 
@@ -169,7 +169,7 @@ def inverse_dynamics(
         Loop design. The inverted response includes the exact fractional model, delay, hold and the discrete-time
         controller.
     path : array_like
-        Desired path, one row per sample at the rate of the loop. It must be at rest at both ends. The reference may
+        Desired path, one value per sample at the rate of the loop. It must be at rest at both ends. The reference may
         have to start before the move, so the path must begin with a sufficiently long dwell.
     output : str, optional
         Output of the model, or a sum of outputs such as ``"theta11 + theta12"``; may be omitted for a model with one
@@ -264,7 +264,7 @@ def inverse_dynamics(
             "may be "
             f"{worst:.2g}, and {unshaped_residual:.2g} with the path itself as reference; "
             f"{least_certain_parameter(design.plants[0].model)}; identify from a longer or richer run (ftlm "
-            "design-input lays it out)"
+            "design-input designs one)"
         )
     ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
     return Trajectory(reference, rows, effort, ways, worst, unshaped_residual)
@@ -297,5 +297,5 @@ def _path(path: ArrayLike) -> Floats:
 
 
 def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
-    """Return the RMS deviation of an output from the path `rows`, over index `ends` and all later samples."""
+    """Return the RMS deviation of an output from the path `rows`, from sample index `ends` to the last sample."""
     return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))

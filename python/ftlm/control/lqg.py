@@ -439,7 +439,7 @@ class LqgDesign(LoopDesign):
         """Return the names of the measured outputs, and two frequency responses of the controller at w [rad/s].
 
         The first is the response of the command to the negative of each measured output, shape (outputs, W). The second
-        is its response to the reference, shape (W,).
+        is the response of the command to the reference, shape (W,).
         """
         feedback_response, reference_response = self.controller.response(w)
         return self.controller.observer.measured, -feedback_response, reference_response
@@ -567,8 +567,9 @@ def lqg(
     nominal = loop_margins(model)
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
         raise ModelError(
-            f"the loop is not a design on the exact response of the model ({nominal}): such loops have no guaranteed "
-            "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
+            f"the loop with the exact response of the model is unstable or not robust ({nominal}): LQG loops have no "
+            "guaranteed margins; make max_input smaller, process_noise larger or the noise smaller, or allow for "
+            "larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
     failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
@@ -577,7 +578,7 @@ def lqg(
             f"the confidence intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the "
             f"parameters the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
-            "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
+            "identify from a longer or richer run (ftlm design-input designs one), or make max_input smaller"
         )
     return LqgDesign(controller, realization, nominal, margins, tuple(plants))
 

@@ -351,6 +351,6 @@ def _discretize(
 
 
 def _scaled_error(realization: Realization) -> float:
-    """Return the largest ratio of a gain or phase error to its target; at most 1 if the targets are met."""
+    """Return the largest gain or phase error of all outputs, relative to its target of 0.1 dB or 1 degree."""
     worst = max(max(realization.gain_error.values()) / GAIN_DB, max(realization.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

@@ -41,7 +41,7 @@ class Margins:
         Minimum phase margin over all frequencies with abs(L) = 1 [degrees]; 180 without one.
     gain
         Gain margin: smallest factor above 1 such that multiplying or dividing the loop gain by it makes L = -1 at some
-        frequency.
+        frequency; infinite without one.
     sensitivity
         Maximum sensitivity: largest abs(1/(1 + L)) over frequency.
     """
