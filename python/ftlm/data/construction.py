@@ -299,7 +299,7 @@ class RunArguments:
 
 @dataclass(frozen=True)
 class _TimeAxis:
-    """Sample times [s], the step [s] if the user gave it, the rounding error of the times [s], and notes."""
+    """Time axis: sample times [s], the step [s] if the user gave it, the rounding error of the times [s], and notes."""
 
     times: Floats
     step: float | None

@@ -234,7 +234,8 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
     def read(cls, path: Path, where: str, text: str) -> Header:
         """Return the header from its text; raise DataError if it is corrupt or has another version.
 
-        `where` is the position of the header in the file, for messages. The start time is set to 0.
+        `where` is the position of the header in the file, for messages. The start time is set to 0, because it follows
+        from the samples.
         """
         version, _, body = text.partition(" ")
         if version.strip() != str(CSV_VERSION):

@@ -74,8 +74,8 @@ class Run:
         Original samples at nonuniform times; None if all samples lie on the uniform grid. With nonuniform samples, the
         grid has interval means of zero-order-hold inputs and linear interpolations of all other signals.
     unmasked_run : Run or None
-        Original run of a run with masked outputs; its first samples determine the initial state. None without a mask,
-        and for every run derived from this run.
+        Original run of a run with masked outputs; its first samples determine the initial state. None without a mask.
+        Methods that return a changed run set it to None.
     """
 
     name: str
@@ -105,7 +105,7 @@ class Run:
 
     @classmethod
     def _from_checked(cls, **values: Any) -> Run:
-        """Return a run from validated fields; arrays become read-only, and only data of its signals are kept."""
+        """Return a run from validated fields; arrays become read-only, and only data of the named signals are kept."""
         run = object.__new__(cls)
         vars(run).update(values)
         samples = run.sample_times
@@ -171,7 +171,8 @@ class Run:
             Treatment of missing values: NaN, None in a list, masked values, gaps in a regular `time`. ``"refuse"``:
             DataError. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and
             validation; other methods raise. ``"hold"``: in addition, missing inputs take their last value (linear
-            interpolation for ``"foh"``). Both interpolate missing values of `time`, except the first and the last.
+            interpolation for ``"foh"``). With ``"weight"`` and ``"hold"``, missing values of `time` are interpolated,
+            except the first and the last.
             `warnings` lists the missing samples.
 
         Returns
@@ -404,7 +405,7 @@ class Run:
         ----------
         duration : float
             Minimum duration of each returned run [s], > 0. Each has at least three rows. A run shorter than twice this
-            minimum is returned whole.
+            minimum is returned whole and unchanged.
 
         Returns
         -------
@@ -713,7 +714,7 @@ class Run:
     def advice(self, structure: Structure | None = None) -> Advice:
         """Check this run for faults and poor excitation before estimation, and return the findings.
 
-        The checks cover dead, constant and zeroed channels, saturation, spikes, encoder wraps, outputs that do not
+        The checks cover dead, constant and duplicate channels, saturation, spikes, encoder wraps, outputs that do not
         start at rest, unexplained drift, feedback from outputs to inputs, short runs and poor excitation. The data are
         not changed.
 
@@ -726,7 +727,7 @@ class Run:
         Returns
         -------
         Advice
-            Findings as sentences; empty if the checks find nothing.
+            Findings, printed as sentences; empty if the checks find nothing.
         """
         from ftlm.validation.data_advice import advise
 

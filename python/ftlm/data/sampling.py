@@ -38,7 +38,7 @@ def uniform_times(rows: int, step: float) -> Floats:
 
 
 def make_read_only(values: Floats) -> Floats:
-    """Return a read-only view of an array, which itself becomes read-only; a contiguous array is not copied."""
+    """Make an array read-only, and return a read-only view of it; an array that is not contiguous is copied first."""
     owner = np.ascontiguousarray(values)
     if owner.flags.writeable:
         owner.setflags(write=False)
@@ -175,7 +175,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
-    """Raise DataError if lengths differ; the message names the first column of another length than most columns."""
+    """Raise DataError if lengths differ; the message names the first column without the most frequent length."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -295,7 +295,7 @@ def regular_step(
         share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
         way_out = (
             f"put the inputs on a regular grid with {parameter('resample', Placeholder('STEP'))}; outputs are "
-            "compared when they were read"
+            "then compared at their original times"
         )
         is_late = deviation > _MAX_JITTER_SHARE * mean
         raise masked_rows_error(thing, f"jitter of up to {share}", is_late, way_out, offset)
@@ -334,9 +334,8 @@ def check_step_agrees(step: object, clock: Floats, thing: str) -> None:
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
     """Return the decimal with the fewest digits that agrees with the mean step, or the mean step if there is none.
 
-    A decimal agrees if the total length of `count` such steps differs from that of `count` mean steps by at most
-    `rounding` [s]. The limit is `observed` [s] for a decimal whose relative difference from the mean step is at most
-    1e-9.
+    A decimal agrees if `count` such steps and `count` mean steps differ by at most `rounding` [s]. A decimal within a
+    relative difference of 1e-9 of the mean step also agrees if they differ by at most `observed` [s].
     """
     for digits in range(12):
         short = float(f"{mean:.{digits}e}")
@@ -432,7 +431,10 @@ def resample_uniform(
 
 
 def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_times: bool) -> str:
-    """Return text on how each signal is resampled; with `keep_times`, original output samples are kept as well."""
+    """Return text on how each signal is resampled.
+
+    `keep_times` states whether output-error fits use the original output samples at their own times.
+    """
     signals = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
     if keep_times:

@@ -135,8 +135,8 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
     """Return the unit of the coefficient of D^order signal in the equation of D^alpha output, such as ``s^-1.8 rad/A``.
 
-    `units` has the units of signals by name. The result is empty if the unit of a signal is unknown or the coefficient
-    is dimensionless.
+    `units` has the units of signals by name. The result is empty if the coefficient is dimensionless, or if the unit of
+    one of two different signals is unknown.
     """
     seconds = round(order - alpha, 4)
     time = "" if seconds == 0 else f"s^{seconds:g}"
