@@ -238,7 +238,7 @@ def design_input(
     fit = ModelFit.of(solved, per_signal_values("noise", noise, solved.outputs, free.noise))
     _check_signals(fit, reference_run)
     if free.covariance is None:
-        _raise_too_uncertain(fit, "some of its numbers have infinite intervals", None)
+        _raise_too_uncertain(fit, "some of its parameters have infinite intervals", None)
     stated = (solved.about.get("step"), None) if reference_run is None else (reference_run.step, reference_run.duration)
     time = _positive("step", stated[0] if step is None else step, "a step [s]")
     length = _positive("duration", stated[1] if duration is None else duration, "a length [s]")

@@ -136,7 +136,7 @@ def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
 def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
     """Return a mask of the holds whose level can change by `step`, shape (holds,).
 
-    With `gap` above 0, the level of the hold `gap` later must also be able to change by -`step`.
+    With `gap` above 0, the level of the hold that is `gap` holds later must also be able to change by -`step`.
     """
     is_feasible: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
@@ -159,12 +159,13 @@ class Hold:
     spectrum
         Fourier transform of `block` along its last axis.
     offsets
-        Inner products of `block`, for each start, with the basis of the responses to offsets, shape (holds, parameters,
-        basis vectors).
+        Inner products of `block`, shifted to each start, with the basis of the responses to offsets, shape (holds,
+        parameters, basis vectors).
     own
-        Fisher information of the response to an exchange at each start, shape (holds, parameters, parameters), by the
-        distance in holds between the two holds of the exchange. Distance 0 means an exchange of one hold. For a larger
-        distance, the second hold is subtracted, because the two levels change by opposite amounts.
+        Fisher information of the response to a unit exchange, shape (holds, parameters, parameters), by the distance of
+        the two holds of the exchange [holds]. The first axis is the first hold of the exchange. Distance 0 means an
+        exchange of one hold. For a larger distance, the response to the second hold is subtracted, because the two
+        levels change by opposite amounts.
     """
 
     starts: NDArray[np.int64]
@@ -222,7 +223,7 @@ class Hold:
             yield gap, pair, own
 
     def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
-        """Return derivatives, or with `of_response` outputs, after an exchange.
+        """Return the output derivatives or, with `of_response`, the outputs after an exchange.
 
         `series` are the values before the exchange. The level of the hold with index `at` changes by `step`. With `gap`
         above 0, the level of the hold that starts `gap` holds later changes by -`step`.
@@ -247,9 +248,9 @@ def _hold_response(kernel: Floats, hold: int) -> Floats:
 
 
 def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
-    """Return the inner products of two responses that both begin at the same start and end with the run.
+    """Return, for each start, the inner products of responses that begin at this sample and end with the run.
 
-    The responses have shapes (p, outputs, rows) and (q, outputs, rows), the result (starts, p, q).
+    The responses `one` and `other` have shapes (p, outputs, rows) and (q, outputs, rows), the result (starts, p, q).
     """
     products = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):

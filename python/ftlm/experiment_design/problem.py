@@ -239,7 +239,7 @@ class ModelFit:
 
     @classmethod
     def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
-        """Return the data that a design requires, from an output-error model and noise deviations by output."""
+        """Return the fit of an output-error model; `noise` has the noise standard deviation of each output."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
         return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
