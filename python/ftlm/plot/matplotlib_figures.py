@@ -483,7 +483,7 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     model
         A model or an identification.
     time
-        Uniform sample times that begin at 0 [s]; by default up to the settling time.
+        Uniform sample times that begin at 0 [s]; by default up to about six time constants of the slowest mode.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -685,7 +685,7 @@ def response(
     result
         Result of :func:`ftlm.identify_frequency`, or a model.
     data
-        Measured responses to draw; by default those of the identification. A model requires them.
+        Measured responses to draw; by default those of the identification. Required if `result` is a model.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 

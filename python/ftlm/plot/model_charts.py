@@ -65,7 +65,7 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[LineChart]:
 
 
 def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
-    """Return a gain chart and a phase chart for every Bode curve; `omega` are its frequencies [rad/s]."""
+    """Return a gain chart and a phase chart for every Bode curve; `omega` are the frequencies [rad/s] of all curves."""
     charts = []
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
@@ -78,7 +78,7 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
 def pole_points(model: Model) -> tuple[float, Complex]:
     """Return the order q of the pole plane s^q, and the poles as complex values in this plane.
 
-    There are no poles for a nonlinear model.
+    The array of poles is empty for a nonlinear model.
     """
     q = plane_order(model)
     model_modes = modes(model) if model.structure.is_linear else ()
