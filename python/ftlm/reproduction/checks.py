@@ -200,7 +200,7 @@ def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: boo
 def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
     """Return text with numbers of the multi-innovation trials on the first record of the main arm.
 
-    The numbers are sorted by prior covariance K0, then by angle.
+    The numbers are sorted by prior covariance K0, then by angle. `numbers` returns the numbers of one trial.
     """
     texts = []
     for prior in PRIOR_COVARIANCES:
@@ -223,10 +223,10 @@ def _printed_text(
 
 
 def deviation_text(reproduction: Reproduction) -> str:
-    """Return text on the ratios of implied to simulated standard deviations of the printed models.
+    """Return text on the ratios of the implied to the simulated standard deviation of each printed model.
 
-    NR is the RMSE divided by the standard deviation. If a ratio makes the printed NR of a row impossible, the text also
-    has the smallest possible NR.
+    The implied standard deviation of the measured angle is RMSE / NR of the printed row. If a ratio makes the printed
+    NR of a row impossible, the text also has the smallest possible NR.
     """
     ratios = sorted(r.deviation_ratio for r in reproduction.ran)
     # If the standard deviation of a response is r times smaller than that of the angle, NR is at least 1 - 1/r.

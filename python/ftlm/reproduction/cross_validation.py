@@ -392,7 +392,7 @@ def cross_validate_orders(
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
-    """Return the numbers of the joints (stages) both of whose angles all runs contain.
+    """Return the numbers of the joints (stages) for which every run contains both angles.
 
     Raises
     ------
@@ -460,7 +460,7 @@ def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> l
 def rate_effect_table(result: OrderCrossValidation) -> Table | None:
     """Return a table of the verdicts without and with the term in the other deflection's rate.
 
-    None if only one joint was measured.
+    Return None if only one joint was measured.
     """
     rows = {
         symbol(output): [

@@ -319,8 +319,9 @@ class AsPrinted:
 class _AngleRegression:
     """Regressors of one angle at any orders, and coefficients by the closed form of eq. (44) of the paper.
 
-    `angles` has the block-pulse means of both angles of the joint, and `current` has the block-pulse means of the motor
-    current. `step` is the width of a block pulse [s].
+    `output` is this angle. `angles` has the block-pulse means of both angles of the joint, and `current` has those of
+    the motor current. `step` is the width of a block pulse [s]. The methods name the signals "own" (this angle),
+    "other" (the other angle of the joint) and "u" (the current).
     """
 
     def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
@@ -336,7 +337,7 @@ class _AngleRegression:
         self._transforms: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
     def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
-        """Return the fractional integral of the signal "own", "other" or "u", in time and as Haar transform (m,)."""
+        """Return the fractional integral of the signal "own", "other" or "u", and its Haar transform, each (m,)."""
         key = signal, round(order, 6)
         if key not in self._transforms:
             kernel = block_pulse_kernel(order, self.m, step=self.step)

@@ -372,7 +372,7 @@ def run_jobs(
 
 
 def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
-    """Return the numbers of the joints (stages) all of whose signals the square run contains.
+    """Return the numbers of the joints (stages) for which the square run contains all signals.
 
     Raises
     ------

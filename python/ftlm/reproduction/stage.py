@@ -543,7 +543,7 @@ def compare_orders(
 
 
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
-    """Return the cases for verdicts from the results of one joint; trials only for a run that starts at rest."""
+    """Return the cases for verdicts from the results of one joint; trials are omitted for a run not from rest."""
     freed = OrderComparison.of(
         arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
     )
@@ -705,7 +705,7 @@ class StageWork:
         return self.candidate(label, link_model(stage=self.number, form="published"))
 
     def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
-        """Return the model `exact` with simulation errors of the explicit Euler method, which the paper uses."""
+        """Return the candidate `exact` with the errors of simulations by explicit Euler, the method of the paper."""
 
         def by_euler(run: Run, comparison: Comparison) -> Comparison:
             means = euler_means(exact.model, run, comparison.m)
@@ -831,7 +831,8 @@ class StageWork:
     ) -> Candidate:
         """Return a model of both equations fitted by output error from the current alone; arguments as in `joint`.
 
-        If no fit converges, the measured other angle is an input of each equation, and a note is added.
+        If no fit converges, a model with measured coupling is fitted, in which the measured other angle is an input of
+        each equation, and a note is added.
         """
         words = f"{what}, by output error"
         try:
