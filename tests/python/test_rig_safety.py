@@ -264,7 +264,7 @@ def test_every_step_of_the_way_out_is_tried(bench, failing, monkeypatch):
     assert done == ["write", "enable", "stop", "stop_watchdog", "close"]
     assert "no answer" in link.shutdown_errors[0]
     assert link.shutdown_errors[1:] == (
-        ["the watchdog was let expire instead, which puts 0 V out"] if failing in ("write", "enable") else []
+        ["the watchdog was allowed to expire instead, which sets 0 V"] if failing in ("write", "enable") else []
     )
     monkeypatch.undo()
     shut_down(bench.board)

@@ -135,7 +135,7 @@ def test_a_virtual_board_that_can_neither_write_nor_disable_is_stopped_by_its_wa
     state, troubles = virtual(tmp_path, monkeypatch, ("write", "enable"))
     assert state[:2] == ((0.0, 0.0), False)
     assert [t.split(" failed")[0] for t in troubles[:2]] == ["writing 0 V", "disabling the amplifiers"]
-    assert troubles[2] == "the watchdog was let expire instead, which puts 0 V out"
+    assert troubles[2] == "the watchdog was allowed to expire instead, which sets 0 V"
 
 
 @pytest.mark.slow
@@ -227,7 +227,7 @@ def test_a_failed_write_keeps_its_cause(monkeypatch, tmp_path):
     with pytest.raises(ftlm.RigFault, match="was disconnected") as fault:
         rig.record(board, arm=True, duration=1.0, out=tmp_path / "run.csv")
     assert "-599" not in str(fault.value)
-    assert "the watchdog was let expire" in str(fault.value)
+    assert "the watchdog was allowed to expire" in str(fault.value)
     assert "expired" in [what for what, _, _ in hardware.log]
     assert hardware.volts == (0.0, 0.0)
     assert not hardware.enabled

@@ -247,7 +247,7 @@ class ControllerSource:
         return currents
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, with the computing time of the controller added if it exceeded one sample."""
+        """Return a fault message; add the computing time if the controller took over one sample or did not return."""
         where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
         if self._since is not None and fault.startswith("stopped by"):
             return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"

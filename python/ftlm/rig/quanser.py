@@ -295,7 +295,7 @@ class QuanserBoard:
                 return
 
     def take(self) -> Floats:
-        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
+        """Return the samples since the last call, shape (n, 9): RIG_COLUMNS, then the delay of the sample [s]."""
         rows, self._rows = self._rows, []
         return np.array(rows, dtype=np.float64).reshape(-1, len(RIG_COLUMNS) + 1)
 

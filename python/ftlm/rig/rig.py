@@ -48,7 +48,7 @@ class OutputGate:
             self.reason = self.reason or reason
 
     def check(self) -> None:
-        """Raise RigFault with its reason if the gate is closed, so that it passes no command to the motors."""
+        """Raise RigFault with the reason if the gate is closed, so that the caller sends no command to the motors."""
         if self.reason is not None:
             raise RigFault(self.reason)
 
@@ -162,7 +162,7 @@ def check_thread(board: Board) -> None:
 
 
 def describe_signal(number: int) -> str:
-    """Return the text "stopped by …" with the name of a signal, or with "an exit" for an unknown signal number."""
+    """Return the text "stopped by …" with the name of a signal; an unknown number means an exit of the program."""
     if number == signal.SIGINT:
         return "stopped by Ctrl-C"
     names = {int(s): s.name for s in signal.Signals}
@@ -447,7 +447,7 @@ class Board(Protocol):
         """
 
     def take(self) -> Floats:
-        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
+        """Return the samples since the last call, shape (n, 9): RIG_COLUMNS, then the delay of the sample [s]."""
 
     def stop(self) -> None:
         """Stop sampling."""
@@ -485,7 +485,7 @@ def shut_down(board: Board) -> list[str]:
         _try_step("waiting for the watchdog", lambda: results.append(let_expire()), errors)
         expired = any(results)
         if expired:
-            errors.append("the watchdog was let expire instead, which puts 0 V out")
+            errors.append("the watchdog was allowed to expire instead, which sets 0 V")
     if not (zero or off or expired):
         errors.append(MOTORS_LIVE_MESSAGE)
         return errors
@@ -679,7 +679,7 @@ class Rig:
         raise RigFault(why) from cause
 
     def take(self) -> Floats:
-        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
+        """Return the samples since the last call, shape (n, 9): RIG_COLUMNS, then the delay of the sample [s]."""
         return self.board.take()
 
 

@@ -179,7 +179,7 @@ class VirtualBoard:
         self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
 
     def take(self) -> Floats:
-        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
+        """Return the samples since the last call, shape (n, 9): RIG_COLUMNS, then the delay of the sample [s]."""
         return np.empty((0, 9)) if self._arm is None else self._arm.take()
 
     def stop(self) -> None:

@@ -68,7 +68,7 @@ class RegisterPage:
         finally:
             os.close(descriptor)
         if self._map[: len(PAGE_SIGNATURE)] != PAGE_SIGNATURE:
-            raise ValueError(f"{self.path} is not a page of the virtual rig")
+            raise ValueError(f"{self.path} is not a register file of the virtual rig")
         if create:
             self.set("state1", math.nan)
             self.set("state2", math.nan)
@@ -113,9 +113,9 @@ def create_page_file() -> Path:
 def watch(path: str, *, keep: bool) -> None:
     """Monitor the heartbeat in a register file; apply the expiration states if it stops for longer than the timeout.
 
-    The function returns when the program closes the registers. If the program has ended without doing so, the function
-    returns after the watchdog has expired, or at once if the watchdog was not started. The file is then removed unless
-    `keep` is True.
+    The function returns when the program sets the register "closed". If the program has ended without doing so, the
+    function returns after the watchdog has expired, or immediately if the watchdog was not started. On return, the file
+    is removed unless `keep` is True.
     """
     page = RegisterPage(path)
     parent = os.getppid()
