@@ -57,8 +57,8 @@ def check_arguments(decorated: Decorated) -> Decorated:
 
     For a class, the constructor, the public methods and the operators in `_CHECKED_OPERATORS` are decorated. Arguments
     are compared with their annotations only after a call has failed, so successful calls take no additional time. Other
-    errors of ftlm, and exceptions from code of the user, are not changed. A range with more than 50 million values is
-    rejected before the call.
+    errors of ftlm, and exceptions from code of the user, are not changed. A Python ``range`` with more than 50 million
+    values is rejected before the call.
     """
     if inspect.isclass(decorated):
         type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))
@@ -132,7 +132,10 @@ def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, An
 
 
 def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:
-    """Raise ModelError for the first argument that does not match its annotation; return if all arguments match."""
+    """Raise ModelError for the first argument that does not match its annotation; return if all arguments match.
+
+    Raise TypeError for an unknown keyword.
+    """
     signature = inspect.signature(function)
     try:
         bound = signature.bind(*args, **kwargs)

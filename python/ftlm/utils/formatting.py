@@ -83,7 +83,10 @@ def format_bound(value: float, spec: str = ".3g") -> str:
 
 
 def plural(count: int, noun: str, verb: str = "") -> str:
-    """Return a count with its noun and a verb in its plural form, such as ``3 rows remain`` or ``1 row is``."""
+    """Return a count with a noun and a verb that agree in number, such as ``3 rows remain`` or ``1 row is``.
+
+    `noun` is given in the singular, and `verb` in the plural.
+    """
     singular = {"": "", "are": " is"}.get(verb, f" {verb}s")
     return f"{count} {noun}{singular if count == 1 else f's {verb}'.rstrip()}"
 
@@ -94,7 +97,7 @@ def truncate_text(text: str, most: int) -> str:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Return "value ± error" as text, rounded to two digits of the standard error; without one, five digits."""
+    """Return "value ± error" rounded to two digits of the error; without an error, the value with five digits."""
     if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
         return f"{value:.5g}"
     decimals = 1 - math.floor(math.log10(error))

@@ -132,7 +132,10 @@ def machine_slowdown() -> float:
 
 
 def estimate_duration(seconds: float, threads: int) -> float:
-    """Return the expected duration [s] on this machine of a computation that takes `seconds` on one reference core."""
+    """Return the expected duration [s] of a computation on this machine with a number of threads.
+
+    `seconds` is its time on one core of the reference machine.
+    """
     return seconds * machine_slowdown() / (1.0 + PARALLEL_EFFICIENCY * (max(threads, 1) - 1))
 
 
@@ -157,7 +160,7 @@ _STOP_FLAG: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
 
 
 def stop_flag() -> _core.Stop | None:
-    """Return the stop flag of this thread, with which the Rust core can be interrupted; None outside of a pool."""
+    """Return the stop flag that interrupts the Rust core in this thread; None outside of :func:`interruptible_pool`."""
     return _STOP_FLAG.get()
 
 
@@ -205,7 +208,7 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
 
 
 def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Return ``work(*arguments)`` in a worker process, which is set to end when its parent process is killed."""
+    """Return ``work(*arguments)``; a worker process that calls this function ends when its parent process ends."""
     # Tasks of a process pool run in the main thread, those of a thread pool do not.
     if threading.current_thread() is threading.main_thread():
         _end_with_parent(os.getpid())

@@ -185,7 +185,10 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
 
 
 def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
-    """Return a mapping unchanged; raise DataError for any other value of the argument."""
+    """Return a mapping unchanged; raise DataError for any other value of the argument.
+
+    `of` is the kind of its values in the message.
+    """
     if not isinstance(value, Mapping):
         raise DataError(f"{parameter(argument)} is {type_name(value)}; pass a dict of name: {of}")
     return value
