@@ -561,9 +561,10 @@ def _rounded_order_zeros(polynomial: Polynomial, base: float, max_argument: floa
 
 
 def _two_term_zeros(powers: Floats, values: Floats, max_argument: float) -> Complex:
-    """Return initial guesses for zeros as ln s: for each pair of terms, the zeros of their sum.
+    """Return initial guesses for zeros of a sum of c s^p, as ln s: for each pair of terms, the zeros of their sum.
 
-    The guesses are accurate for zeros of very small or large magnitude if orders differ little.
+    `powers` and `values` are p and c. The guesses are accurate for zeros of very small or large magnitude if orders
+    differ little.
     """
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
@@ -578,7 +579,10 @@ def _two_term_zeros(powers: Floats, values: Floats, max_argument: float) -> Comp
 
 
 def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
-    """Return the zeros, as ln s, to which Newton's method converges from the initial guesses `w`."""
+    """Return the zeros of a sum of c s^p, as ln s, to which Newton's method converges from the initial guesses `w`.
+
+    `powers` and `values` are p and c.
+    """
     if not w.size:
         return []
     for _ in range(MAX_NEWTON_ITERATIONS):
@@ -593,7 +597,10 @@ def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
 
 
 def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
-    """Return the terms c s^p at each w = ln s, divided by their largest magnitude m, and ln m."""
+    """Return the terms c s^p at each w = ln s, divided by their largest magnitude m, and ln m.
+
+    `powers` and `values` are p and c.
+    """
     exponents = np.outer(powers, w)
     largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
     return np.asarray(values[:, None] * np.exp(exponents - largest)), largest

@@ -294,9 +294,9 @@ def _integral(power: float, pole_band: tuple[float, float], order: int) -> tuple
 
 
 def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
-    """Return a sum of first-order lags, discretized exactly for signals that are linear between samples.
+    """Return `factor` times (`direct` plus the sum of residue/(s + pole)) in discrete time.
 
-    `step` is the sampling interval [s], and `factor` a gain of the whole sum.
+    The discretization is exact for signals that are linear between samples. `step` is the sampling interval [s].
     """
     x = poles * step
     keeps = np.exp(-x)
@@ -528,8 +528,8 @@ def plant_of(
 ) -> Plant:
     """Return the plant of a sampled loop from the input `driver` to an output of a model.
 
-    If `output` or `driver` is None, the only output or input of the model is used. Raise ModelError if a name is
-    unknown or missing, or the model is not linear.
+    If `output` or `driver` is None, the only output or input of the model is used. Other arguments are those of
+    :class:`Plant`. Raise ModelError if a name is unknown or missing, or the model is not linear.
     """
     check_model(model)
     if not isinstance(sensor, bool):
@@ -561,7 +561,7 @@ def _best_controller(
     plant_responses: Complex,
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
-    """Return the controller with the largest low-frequency gain among those that meet all conditions; None without one.
+    """Return the controller with the largest low-frequency gain that meets all conditions and `is_allowed`, or None.
 
     At the frequency `wc` [rad/s], the controller has the response `target`, and its phase slope is minus the phase
     slope `slope` of the plant. `plant_responses` are the responses of the plant at the frequencies `w`, one row per

@@ -198,7 +198,8 @@ def observer(
 def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return the plants from one input of a model to each output that depends on the input.
 
-    Raise ModelError if the model is unstable, or if no output depends on the input.
+    Arguments are those of :func:`plant_of`. Raise ModelError if the model is unstable, or if no output depends on the
+    input.
     """
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
@@ -214,7 +215,8 @@ def kalman_filter(
 ) -> Observer:
     """Return the steady-state Kalman filter of a realization.
 
-    Raise ModelError if the measured outputs do not make all states observable, so that the filter is unstable.
+    `measured`, `noise` and `process_noise` are those of :class:`Observer`. Raise ModelError if the measured outputs do
+    not make all states observable, so that the filter is unstable.
     """
     bare = Observer(realization, measured, noise, process_noise, np.zeros((0, 0)), {})
     a, b, c = bare.matrices

@@ -189,7 +189,10 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
 
 
 def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
-    """Return the mean or least-squares line of a signal, as a function of time since its start [s] and as text."""
+    """Return the mean or, with `linear`, the least-squares line of a signal, as a function of time [s] and as text.
+
+    Time begins at the first sample, and `step` is the sampling interval [s]. Missing samples (NaN) are ignored.
+    """
     is_present = ~np.isnan(values)
     mean = float(np.mean(values[is_present]))
     if not linear:
@@ -424,7 +427,8 @@ def resample_uniform(
 ) -> dict[str, Floats]:
     """Return signals with sample times `since` [s], resampled to a uniform step [s]; see :func:`check_rows` for errors.
 
-    Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
+    Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `behaviour` has the
+    intersample behavior by input.
     """
     check_rows(since, step)
     return NonuniformSamples(since, dict(data)).resample(behaviour, step)
@@ -529,7 +533,8 @@ class NonuniformSamples:
     def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
         """Return the signals resampled to a regular grid with the given step [s].
 
-        Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
+        Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `behaviour` has the
+        intersample behavior by input.
         """
         rows = int(np.floor(float(self.times[-1]) / step + 1e-6)) + 1
         grid = uniform_times(rows, step)
@@ -545,7 +550,8 @@ class NonuniformSamples:
     ) -> NonuniformSamples:
         """Return the samples with times from `start` to `stop` + `step` [s]; the new times are counted from `start`.
 
-        If there is no sample at `start`, a sample is added there, with values for the inputs and NaN for the outputs.
+        If there is no sample at `start`, a sample is added there, with NaN for the outputs, and with values for the
+        inputs by their intersample `behaviour`.
         """
         tiny = 1e-9 * step
         rows = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
@@ -584,6 +590,9 @@ MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 
 
 def longest_delay(length: int, step: float) -> float:
-    """Return the default upper limit of a delay search [s]: 60 samples, or a twelfth of the run if that is less."""
+    """Return the default upper limit of a delay search [s]: 60 samples, or a twelfth of the run if that is less.
+
+    `length` is the number of samples, and `step` the sampling interval [s].
+    """
     # Three digits, because the limit is printed in the name of a structure.
     return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_SHARE) * step:.3g}")

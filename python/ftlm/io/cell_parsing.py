@@ -60,7 +60,7 @@ def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
 
 
 def may_group(cell: str, mark: str, *, comma: bool) -> bool:
-    """Whether a cell may be a number with the thousands separator `mark`."""
+    """Whether a cell may be a number with the thousands separator named `mark`; `comma` means decimal commas."""
     return _grouped_number_pattern(mark, comma).fullmatch(cell) is not None
 
 
@@ -88,7 +88,7 @@ def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> 
 
 
 def is_number(cell: str, *, comma: bool = False, mark: str | None = None) -> bool:
-    """Whether a cell is a number."""
+    """Whether a cell is a number; arguments are those of :func:`parse_number`."""
     try:
         parse_number(cell, comma=comma, mark=mark)
     except ValueError:
@@ -286,7 +286,10 @@ class Timestamps:
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
     def inferred_date_order(self, dates: str | None) -> str:
-        """Return the inferred sequence of day and month ("dmy" or "mdy") if the times depend on it, otherwise ""."""
+        """Return the inferred sequence of day and month ("dmy" or "mdy") if the times depend on it, otherwise "".
+
+        The result is also "" if the user gave the sequence (`dates`).
+        """
         if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
             return ""
         order = self._detect_date_order()

@@ -599,7 +599,11 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
 
 
 def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
-    """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped."""
+    """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped.
+
+    `marks` are whether the decimal mark is a comma, and the name of the thousands separator. `width` is the number of
+    cells per row of the table, for the message.
+    """
     comma, mark = marks
     rows = [
         line
