@@ -7,7 +7,8 @@ use crate::error::{check_finite, check_length, check_points, check_step, Error, 
 use crate::fractional::kernels::{block_pulse_kernel, MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
-/// Difference below which two orders count as equal. Orders of a grid are multiples of its increment up to rounding.
+/// Difference below which two orders count as equal. Orders on an order grid are multiples of its increment only up to
+/// rounding.
 pub const ORDER_GRAIN: f64 = 1e-9;
 
 /// Term D^ν s of an equation. The [`Equation`] stores its coefficient.
@@ -48,8 +49,8 @@ const OFFSET_EXPONENT_TOLERANCE: f64 = 0.05;
 pub enum Initial {
     /// Zero initial conditions, without initial terms.
     Rest,
-    /// Powers of t from Caputo derivatives. An equation of order α has t^i for i < ⌈α⌉. Each of its terms of order ν
-    /// adds t^{α−ν+i} for i < ⌈ν⌉.
+    /// Initial values of Caputo derivatives, as powers of the time t. An equation of order α has t^i for i = 0, …, ⌈α⌉
+    /// − 1. Each of its terms of order ν adds t^{α−ν+i} for i = 0, …, ⌈ν⌉ − 1.
     Caputo,
     /// Powers of t with explicit exponents.
     Powers(Vec<f64>),
@@ -66,8 +67,8 @@ pub enum Initial {
     },
     /// Output level: an unknown constant that is added to the simulated output, one per record and equation.
     ///
-    /// It is not a term of the equation, so its value does not depend on the orders. The record contains deviations
-    /// from a reference. The equation error has no term for the level.
+    /// It is not a term of the equation, so its value does not depend on the orders. The signals of the record are
+    /// deviations from reference values, so the equation error needs no term for the level.
     Level {
         /// Other initial conditions, without an offset.
         base: Box<Initial>,
@@ -103,8 +104,8 @@ impl Equation {
         Ok(equation)
     }
 
-    /// Return an error for an invalid equation. `signals` is the number of signals in the record, all of which may be
-    /// inputs.
+    /// Return an error for an invalid equation. `signals` is the number of signals in the record. All of them except
+    /// the output may have the negative orders of inputs.
     ///
     /// # Errors
     /// [`Error::Structure`] for a signal that does not exist, [`Error::OutOfRange`] for an invalid order.
@@ -285,8 +286,8 @@ impl Structure {
     /// Return an error for invalid orders or signals. `signals` is the number of signals, and `is_input` is true for
     /// inputs.
     ///
-    /// The order α must be in (0, 10], orders of the output in [0, α), and orders of other signals in [0, α + 1).
-    /// Orders of inputs may be negative down to −3.
+    /// The order α must be in (0, 10], orders of output terms in [0, α), orders of inputs in [−3, α + 1), and orders of
+    /// other signals in [0, α + 1).
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an order that is out of range, [`Error::Structure`] for a signal that does not exist.

@@ -109,10 +109,10 @@ pub enum Error {
         /// Remedy.
         remedy: String,
     },
-    /// Response or estimate that overflows.
+    /// Simulation, derivative or estimate without a finite result.
     #[error("the {what} is not finite from index {index} on; the model is unstable on this record, so change its orders or coefficients")]
     Diverged {
-        /// Name of the computation that overflows.
+        /// Name of the computation.
         what: String,
         /// Index of the first value that is not finite.
         index: usize,
@@ -133,7 +133,7 @@ pub enum Error {
         /// Name of the output.
         output: String,
     },
-    /// Run that cannot be sampled on the requested grid.
+    /// Run with unusable data: too few samples, a signal that is too small, or a body with friction that does not move.
     #[error("{what}; {remedy}")]
     Recording {
         /// Cause.
@@ -289,8 +289,8 @@ pub fn check_step(step: f64) -> Result<()> {
     }
 }
 
-/// Maximum number of points of a series or a record, which take 1 GiB per signal. A larger number is a mistake that
-/// would exhaust memory. The tables of prime divisors, which store 32-bit integers up to twice this number, allow it.
+/// Maximum number of points of a series or a record: 1 GiB per signal. A larger number is probably a mistake, and would
+/// exhaust memory. Twice this number fits into the 32-bit integers of the tables of prime divisors.
 pub const MAX_POINTS: usize = 1 << 27;
 
 /// Return an error if `m` exceeds [`MAX_POINTS`].

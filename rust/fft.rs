@@ -54,8 +54,8 @@ pub fn fast_length(n: usize) -> usize {
 const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 /// Total number of points of longer plans above which the least recently used plans are evicted.
 ///
-/// Otherwise, refining a grid repeatedly would leave all its plans in memory. If a plan is evicted too early, its new
-/// computation costs about two transforms.
+/// Without eviction, the plans of all pulse grids of a repeatedly refined simulation would stay in memory. If a plan is
+/// evicted too early, its new computation costs about two transforms.
 const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
 /// Number of most recent requests for long plans. The plans of these requests are not evicted, even if the total
 /// exceeds the limit. One evaluation of a large problem may need more points than the limit.
@@ -106,9 +106,8 @@ impl Plans {
         (plan, evicted)
     }
 
-    /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until the remaining plans
-    /// of this length have at most `points` points in total. Recently requested plans are not evicted. Return the
-    /// evicted plans.
+    /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until the remaining long
+    /// plans have at most `points` points in total. Recently requested plans are not evicted. Return the evicted plans.
     fn evict(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
             .plans

@@ -10,7 +10,8 @@
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error; [`friction`]: dry friction in one pulse;
 //!    [`expression`], [`nonlinear`]: simulation and output error with friction and non-linear terms;
-//! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
+//! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, saturations, dead zones and sensor filters,
+//!    sampled on any grid of block pulses;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
 //! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, by exact state
 //!    space, and at sample times in the limit of zero step; output and equation error, figures of merit;

@@ -3,9 +3,9 @@
 //! A global thread pool hangs after a fork. Work therefore runs on the thread pool of the current search, or serially
 //! if there is none.
 //!
-//! After a fork, the child process has one thread. A lock that another thread had taken stays locked forever. Attempts
-//! to take a fork-safe lock end after some microseconds, far longer than any thread keeps it locked. The caller then
-//! continues without the value.
+//! After a fork, the child process has one thread. A lock that another thread had taken stays locked forever. A thread
+//! therefore tries to take a fork-safe lock only for some microseconds, which is far longer than any thread holds it.
+//! After that, the caller continues without the value.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};

@@ -392,7 +392,7 @@ impl Record {
         passes.then(|| power_pulses(exponent, self.m(), self.step))
     }
 
-    /// Return a series after the record's sensor filter, unchanged without a filter.
+    /// Apply the record's sensor filter to a series. Without a filter, return the series unchanged.
     pub(crate) fn apply_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
@@ -432,8 +432,8 @@ impl Key {
     }
 }
 
-/// Distinct regressors in the sequence of first use, identical for all records of a search. The position of a regressor
-/// is its column in a bank.
+/// Distinct regressors of a search, in the sequence of their insertion unless sorted. All records share this index. The
+/// position of a regressor is its column in each bank.
 #[derive(Debug, Default, Clone)]
 pub struct Index {
     keys: Vec<Key>,
@@ -474,7 +474,8 @@ pub struct Bank {
     m: usize,
     /// Values of all columns, one column after another.
     columns: Vec<f64>,
-    /// Kernels of the columns that are integrals of the output, one kernel after another.
+    /// Kernels of the columns that are integrals of the output, one after another. The kernel of I^η is its power
+    /// series in the one-step delay.
     kernels: Vec<f64>,
     /// Index of the kernel of each column, `None` if the column is not an integral of the output.
     own: Vec<Option<usize>>,
@@ -620,8 +621,8 @@ impl Bank {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Return the kernel of a column that is an integral of the output, one value per pulse. Empty for any other
-    /// column.
+    /// Return the kernel of a column that is an integral I^η of the output: the power series of I^η in the one-step
+    /// delay, one value per pulse. Empty for any other column.
     ///
     /// # Panics
     /// If the column does not exist.

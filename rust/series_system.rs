@@ -127,8 +127,9 @@ impl<'a> System<'a> {
     /// system whose outputs `bounded` accepts. The flag is true for a damped copy.
     ///
     /// The damped copies have decays of 4, 8, 16, … per record ([`crate::simulate::respond_damped`]). The last copy is
-    /// returned if `bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. While the
-    /// inverse of the matrix is finite, the damped inverse is the same series at ρz. A copy then takes only products.
+    /// returned if `bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. If the
+    /// inverse of the matrix is finite, the inverse of a copy is the same series at ρz, so that no further division is
+    /// needed.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn respond_stabilized(
         &self,
@@ -330,8 +331,8 @@ fn damp_series(decay: f64, series: &[f64]) -> Vec<f64> {
     series.iter().enumerate().map(|(k, a)| a * libm::exp(-decay * k as f64)).collect()
 }
 
-/// Maximum number of samples of a signal up to its last nonzero one for which a product is summed directly. Longer
-/// signals are transformed.
+/// Maximum number of samples, up to the last nonzero one, of a signal whose products are summed directly. Products of
+/// longer signals use Fourier transforms.
 const MAX_DIRECT_PULSES: usize = 64;
 
 /// Return true if the second half of a series is so large that a transform loses digits of the first half.

@@ -96,8 +96,9 @@ pub fn respond_damped(
     build_system(equations, record, initial)?.with_damping(decay).respond(initial)
 }
 
-/// Return the inverse of the matrix of the equations. `[j][i]` is the response of output j to a unit pulse in the error
-/// of equation i. O(n³ m log² m) for n equations and m pulses.
+/// Return the inverse of the matrix A of the equations A y = b, whose elements are power series in the one-step delay.
+/// `[j][i]` is the response of output j to a unit pulse on the right-hand side of equation i. O(n³ m log² m) for n
+/// equations and m pulses.
 ///
 /// # Errors
 /// The errors of [`respond`], for invalid equations or equations that cannot be solved for the outputs.

@@ -353,8 +353,8 @@ pub(crate) struct InputGains {
 impl InputGains {
     /// Return the gains of the input with the input vector `input_vector`; None if they overflow.
     ///
-    /// `fraction` is the fraction of the interval after which the next value of a zero-order-hold input takes effect.
-    /// It is 0 without a delay.
+    /// `fraction` is the fractional part of the delay of a zero-order-hold input, in sampling intervals. If it is not
+    /// 0, the next value of the input takes effect after this fraction of the interval.
     pub(crate) fn new(
         interval: &Transition,
         system: &[f64],
