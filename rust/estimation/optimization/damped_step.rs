@@ -19,7 +19,7 @@ use crate::signal::statistics::inner;
 pub(crate) const MIN_DAMPING: f64 = 1e-12;
 /// Maximum distance from a linear constraint at which the constraint is active.
 ///
-/// The distance is measured by the change of the residuals along it, relative to their norm.
+/// The distance is the change of the residuals on the way to the constraint, relative to the norm of the residuals.
 const ACTIVE_CONSTRAINT_TOLERANCE: f64 = 1e-9;
 
 /// Linearization of a problem at a point: triangular factor R of the QR factorization of [J | e].
@@ -356,7 +356,7 @@ pub trait LeastSquaresProblem {
     /// Residuals of an evaluation.
     fn residuals<'a>(&self, evaluation: &'a Self::Evaluation) -> &'a [f64];
 
-    /// Derivatives of the residuals with respect to every parameter, one column per parameter.
+    /// Return the derivatives of the residuals: one vector per parameter, with one element per residual.
     ///
     /// # Errors
     /// The minimization shortens the step after an error that ends the simulation, and terminates after any other
@@ -373,7 +373,7 @@ pub trait LeastSquaresProblem {
         point
     }
 
-    /// Return true if every evaluation eliminates a parameter. Its steps then need no damping.
+    /// Return true if every evaluation eliminates this parameter. Its steps then need no damping.
     fn is_eliminated(&self, _parameter: usize) -> bool {
         false
     }

@@ -71,7 +71,7 @@ pub struct Minimum<P, E> {
     pub evaluation: E,
     /// Half the sum of squared residuals.
     pub cost: f64,
-    /// Derivatives of the residuals, one column per parameter; empty if only residuals were requested.
+    /// Derivatives of the residuals, one vector per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
