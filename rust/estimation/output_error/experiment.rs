@@ -7,8 +7,9 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// One run of measured data as block-pulse means. The samples lie at every `pulses_per_sample`-th edge between pulses,
-/// or at nonuniform times.
+/// One run of measured data as block-pulse means. The samples lie at every `pulses_per_sample`-th pulse edge, or at
+/// nonuniform times. The compared samples, which yield residuals, are all nonuniform samples, or all uniform samples
+/// except the first and the last.
 #[derive(Debug, Clone)]
 pub struct Experiment {
     /// Block-pulse means of all signals, shared by experiments that differ in weights only.
@@ -26,7 +27,7 @@ pub struct Experiment {
     pub point_values: Vec<PointValues>,
     /// Relative weight of each compared sample of each output, 0 for a missing sample; empty for unit weights.
     pub sample_weights: Vec<Vec<f64>>,
-    /// Nonuniform sample times; None for uniform samples on the grid.
+    /// Nonuniform sample times; None for uniform samples.
     pub nonuniform: Option<NonuniformSamples>,
     /// True if the signals of the record, and thus the simulated outputs, have already passed the filter.
     is_prefiltered: bool,
@@ -226,7 +227,7 @@ impl Experiment {
         self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
     }
 
-    /// Number of compared samples of each output: those between two pulses, or all nonuniform samples.
+    /// Number of compared samples of each output: all nonuniform samples, or the uniform samples between two pulses.
     #[must_use]
     pub fn compared_count(&self) -> usize {
         match &self.nonuniform {
@@ -293,7 +294,8 @@ impl Experiment {
         }
     }
 
-    /// Deviation of an input with a free parameter, and its derivative, at the compared samples.
+    /// Values of an input with a free parameter minus those computed from its pulse means, and the derivative of this
+    /// deviation, at the compared samples.
     ///
     /// `nonlinearity_output` contains the pulse means of the input after its nonlinearity, and their derivative with
     /// respect to the parameter. The deviation is half the jump of a zero-order hold, and 0 for other inputs.

@@ -244,10 +244,9 @@ impl JumpCorrection {
         structures.iter().map(feedthrough).collect()
     }
 
-    /// Subtract the part of the response that pulse means contain too early, with the given gains, from weighted
-    /// samples.
+    /// Subtract the correction for jumps and kinks from weighted samples: the given gains times the entries of `jumps`.
     ///
-    /// If `slopes` is true, the derivatives of the jumps replace the jumps.
+    /// If `slopes` is true, the derivatives of these entries are used instead.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {
         let (signals, compared) = (self.jumps.len(), experiment.compared_count());
         for (i, row) in samples.chunks_exact_mut(compared.max(1)).enumerate() {

@@ -32,8 +32,8 @@ pub struct OutputErrorFit {
     pub initial: Vec<Vec<Vec<f64>>>,
     /// Exponents of the initial terms, by equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Orthonormal basis of the weighted responses to the initial terms, by record; empty if more than one evaluation
-    /// was allowed.
+    /// Orthonormal basis of the weighted responses to the initial terms, by record. It is computed only if at most one
+    /// evaluation was allowed, and is otherwise empty.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
@@ -200,7 +200,8 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         (value - low, high - value)
     }
 
-    /// Return true for input parameters, because the response is piecewise linear in delays and limits.
+    /// Return true for input parameters, because the response is piecewise linear in delays, saturations and dead
+    /// zones.
     fn has_kinks(&self, point: &ParameterPoint, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
@@ -209,7 +210,8 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         evaluation.size()
     }
 
-    /// Return true if the grids resolve the dynamics of each equation and, if required, the model is stable.
+    /// Return true if the pulses or samples resolve the dynamics of each equation and, if required, the model is
+    /// stable.
     ///
     /// Unresolved modes would fit noise.
     fn is_admissible(&self, point: &ParameterPoint) -> bool {

@@ -37,7 +37,7 @@ struct Run {
     jumps: HashMap<usize, Vec<Bin>>,
 }
 
-/// Linear dependence of the weighted samples of an experiment on the eliminated coefficients and on the initial terms.
+/// Effects of the eliminated coefficients and of the initial terms on the weighted samples of an experiment.
 pub(crate) struct SampledSimulation {
     /// Orthonormal basis of the weighted responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,

@@ -8,8 +8,9 @@
 //! form, doi:10.1007/BF01932995).
 //!
 //! A sample at a time t is compared with the mean of the two pulses next to t, plus the direct feedthrough of the
-//! inputs. The grid of the pulses can be finer than the samples. Missing samples have zero weight. Nonuniform samples
-//! are compared at their own times. Integer orders, and any orders on long records, have exact samples without pulses.
+//! inputs. The pulses can be shorter than the sampling interval. Missing samples have zero weight. Nonuniform samples
+//! are compared at their own times. For integer orders, and for any orders on long records, exact samples are computed
+//! without pulses.
 
 pub(crate) mod evaluation;
 mod evaluation_cache;

@@ -113,7 +113,7 @@ pub struct ParameterPoint {
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free input parameters: delays \[s\], and limits in the unit of the input.
+    /// Free input parameters: delays \[s\], and saturation and dead-zone limits in the unit of the input.
     pub inputs: Vec<f64>,
 }
 
@@ -296,7 +296,8 @@ impl FreeModel {
         uncoupled && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
 
-    /// Return true if every grid resolves the autoregressive terms of each equation, or if equations are coupled.
+    /// Return true if the pulses of every experiment resolve the autoregressive terms of each equation, or if equations
+    /// are coupled.
     ///
     /// The check compares the denominator at the Nyquist frequency ([`nyquist_margin`]) with its leading coefficient.
     /// If their ratio is negative, the discretization has an unstable mode that alternates from pulse to pulse. If it
@@ -349,11 +350,11 @@ impl InputLaw {
     ///
     /// `value` is the parameter, `step` the pulse width \[s\], and `before` the value of the input before the first
     /// pulse. A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an
-    /// integer number of steps, its derivative is one-sided, toward longer delays. Limits act on every pulse
-    /// separately, which is exact for a zero-order hold.
+    /// integer number of steps, its derivative is one-sided, toward longer delays. Saturation and dead zone act on
+    /// every pulse separately, which is exact for a zero-order hold.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
+    /// [`Error::OutOfRange`] for a negative saturation or dead zone, or a parameter that is not finite.
     ///
     /// ```
     /// use ftlm::estimation::output_error::InputLaw;
@@ -397,11 +398,11 @@ impl InputLaw {
     /// Return the jumps of a zero-order hold within pulses after the nonlinearity, each with its derivatives.
     ///
     /// The second of each pair contains the derivatives of `share`, `before` and `after` with respect to the parameter.
-    /// A limit acts on both values of each of `jumps`. A delay ignores `jumps`: the input is assumed to jump at pulse
-    /// edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
+    /// Saturation and dead zone act on both values of each of `jumps`. A delay ignores `jumps`: the input is assumed to
+    /// jump at pulse edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
+    /// [`Error::OutOfRange`] for a negative saturation or dead zone, or a parameter that is not finite.
     #[allow(clippy::float_cmp)]
     pub(crate) fn apply_to_jumps(
         self,
@@ -460,7 +461,7 @@ impl TimeUnit {
 
     /// Return the unit of time for runs with the given `spans`, with its exponent for each coefficient of the model.
     ///
-    /// It is the geometric mean of sampling interval and duration over all runs, divided by π. `spans` contains
+    /// The unit is the geometric mean of sampling interval and duration over all runs, divided by π. `spans` contains
     /// ln(sampling interval × duration) of each run, in seconds.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {

@@ -8,7 +8,7 @@ const DOMINANCE_RATIO: f64 = 1e3;
 const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
 /// Minimum step in ln ω. A pole counts as on the imaginary axis if its relative distance from the axis is smaller.
 const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
-/// Maximum change of the angle of the curve between two points \[rad\].
+/// Maximum change of the angle of s^α − Σ c s^ν at s = jω between two frequencies ω \[rad\].
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
 /// Difference below which two exponents of s are merged. Powers of s whose exponents differ by less are distinguishable
 /// only above ω = e^1000.
