@@ -32,7 +32,8 @@ const COARSE_RESIDUAL_RATIO: f64 = 0.01;
 const MIN_NOISE_RATIO: f64 = 1e-3;
 /// Minimum noise standard deviation in a warm start, which avoids a division by zero.
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
-/// Maximum number of evaluations of each survivor in the fit on all samples, or on the first part of a long record.
+/// Maximum number of evaluations of each survivor of the multistart in the fit on all samples, or on the first part of
+/// a long record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
 /// Maximum ratio of the cost per residual on all samples to that on the first part of the runs.
 ///
@@ -99,7 +100,8 @@ pub enum Initialization {
     },
     /// A single initial guess: values of all free parameters.
     InitialGuess(Vec<f64>),
-    /// Warm start from a fit of the same structure to similar runs, with the grid and weights of that fit.
+    /// Warm start from a fit of the same structure to similar runs, with the simulation step and the weights of that
+    /// fit.
     WarmStart {
         /// Values of all free parameters.
         values: Vec<f64>,

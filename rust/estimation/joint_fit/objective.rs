@@ -31,7 +31,7 @@ const WHOLE_DELAY_TOLERANCE: f64 = 1e-9;
 pub struct Weights {
     /// Weight 1/σ of each output, with its noise standard deviation σ.
     pub outputs: Vec<f64>,
-    /// Robust weight of each compared sample, by run and output; None for unit weights.
+    /// Robust weight of each sample that is compared with the simulation, by run and output; None for unit weights.
     pub robust_weights: Option<Vec<Vec<Vec<f64>>>>,
 }
 
@@ -118,7 +118,7 @@ impl<'a> Objective<'a> {
         Self { experiments: Arc::new(experiments), ..self.clone() }
     }
 
-    /// Return the objective on a grid with half the step.
+    /// Return the objective on a pulse grid with half the step.
     ///
     /// # Errors
     /// An error if the runs cannot be sampled at half the step ([`Recordings::experiments`]). [`Error::Interrupted`]
@@ -226,7 +226,8 @@ impl<'a> Objective<'a> {
         self.is_refinement_significant(place, &self.finer()?)
     }
 
-    /// Return true if the simulated samples change significantly, relative to the residuals, on the given finer grid.
+    /// Return true if the simulated samples change significantly, relative to the residuals, on the pulse grid of
+    /// `finer`.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -243,10 +244,11 @@ impl<'a> Objective<'a> {
             || mean(&changes) > MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * mean_square)
     }
 
-    /// Return the indices of results, sorted by the larger of their costs on their own grid and on this finer grid.
+    /// Return the indices of results of a fit at twice this step, sorted by the larger of their costs at that step and
+    /// at this one.
     ///
     /// The pulse scheme of a stiff equation can have a mode that alternates from pulse to pulse. A fit can use this
-    /// mode to follow noise, but the simulation of such a fit differs on every other grid.
+    /// mode to follow noise, but the simulation of such a fit differs at every other step.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.

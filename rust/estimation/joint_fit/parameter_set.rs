@@ -171,9 +171,9 @@ impl ParameterSet {
         self.structure.coefficient_names().into_iter().map(of).collect()
     }
 
-    /// Return the free coefficients from unconstrained estimates by name.
+    /// Return the values of the free coefficients, given unconstrained estimates of coefficients by name.
     ///
-    /// A ratio is the median over the equations that determine it.
+    /// A ratio without an estimate is the median of its values from all coefficient laws that contain it.
     #[must_use]
     pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
         let of = |name: &String| {

@@ -126,7 +126,7 @@ impl Problem {
 
     /// Minimize the cost by the Levenberg–Marquardt method.
     ///
-    /// If `requires_stability`, a linear model that is stable does not become unstable.
+    /// If `requires_stability` is true, no step leads from a stable linear model to an unstable one.
     ///
     /// # Errors
     /// The error of the simulation of `start` if it fails. An error if the model does not match the experiments
@@ -197,8 +197,8 @@ pub struct OptimizationResult {
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms by run and equation. With friction or nonlinear terms, initial states by run.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Orthonormal basis of the weighted responses to the initial terms, by run; empty if more than one evaluation was
-    /// allowed.
+    /// Orthonormal basis of the weighted responses to the initial terms, by run. It is computed only if at most one
+    /// evaluation was allowed, and is otherwise empty.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,

@@ -134,9 +134,10 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// Return a candidate with negative coefficients of all output terms, and the parameter indices of the changed ones.
+/// Return the candidate with the coefficients of all its autoregressive terms made negative, and the parameter indices
+/// of the changed coefficients.
 ///
-/// The terms are on the right-hand side, so equations of an order up to 2 are then stable. In a fit, the changed
+/// These terms are on the right-hand side, so equations of an order up to 2 are then stable. In a fit, the changed
 /// coefficients should first be fixed while the others adapt. The input coefficients still belong to the unstable
 /// optimum.
 #[must_use]

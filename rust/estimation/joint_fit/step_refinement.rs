@@ -1,4 +1,5 @@
 //! Step refinement: the simulation step is halved until the estimate changes by a small part of its standard error.
+//! Each step defines a grid of block pulses (pulse grid).
 
 use super::covariance::covariance;
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
@@ -11,25 +12,25 @@ use crate::signal::statistics::inner;
 
 /// Maximum change of an estimate, in standard errors, at which the step refinement has converged.
 const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
-/// Increase of the negative log-likelihood per sample, due to halving the step, above which other survivors are fitted.
+/// Increase of the negative log-likelihood per sample, due to halving the step, above which the other survivors of the
+/// multistart are also fitted.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Minimum number of block pulses over all runs. With at least this number, the step error is corrected without fits on
-/// finer grids.
+/// Minimum number of block pulses over all runs at which the step error is corrected without fits on finer pulse grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
-/// Maximum number of corrections with the same pair of finer grids.
+/// Maximum number of corrections with the same pair of finer pulse grids.
 ///
-/// Each correction multiplies the remaining error by about the relative discretization error of the grid.
+/// Each correction multiplies the remaining error by about the relative discretization error of the fitted pulse grid.
 const MAX_CORRECTIONS: usize = 4;
 
-/// Optimum on the finest grid, and its extrapolation to zero step.
+/// Optimum on the finest pulse grid, and its extrapolation to zero step.
 #[derive(Clone)]
 pub struct Optimum<'a> {
-    /// Optimum of the finest grid.
+    /// Optimum on the finest pulse grid.
     pub attempt: OptimizationResult,
-    /// Objective on the finest grid.
+    /// Objective on the finest pulse grid.
     pub grid: Objective<'a>,
-    /// Values of all free parameters, extrapolated to zero step from two grids.
+    /// Values of all free parameters, extrapolated to zero step from two pulse grids.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
     pub step_converged: bool,
@@ -40,11 +41,11 @@ pub struct Optimum<'a> {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct OptimumStatistics {
-    /// Optimum of the finest grid.
+    /// Optimum on the finest pulse grid.
     pub attempt: OptimizationResult,
     /// Weights of outputs and samples at the optimum.
     pub weights: Weights,
-    /// Number of block pulses per sampling interval of the finest grid.
+    /// Number of block pulses per sampling interval of the finest pulse grid.
     pub pulses_per_sample: usize,
     /// Values of all free parameters, extrapolated to zero step, within bounds.
     pub estimate: Vec<f64>,
@@ -64,8 +65,9 @@ pub struct OptimumStatistics {
 
 /// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
 ///
-/// On a coarse grid, an optimization can follow a flat valley to the limit of its domain. From there, an optimization
-/// on a finer grid makes no progress. Then the other survivors, `others`, are optimized on the finer grid as well.
+/// On a coarse pulse grid, an optimization can follow a flat valley to the limit of its domain. From there, an
+/// optimization on a finer pulse grid makes no progress. Then the other survivors of the multistart, `others`, are
+/// optimized on the finer pulse grid as well.
 ///
 /// # Errors
 /// The error of a simulation that fails. [`Error::Beyond`] if residuals overflow. [`Error::NotFinite`] if the Jacobian
@@ -125,9 +127,10 @@ pub fn refine_step<'a>(
 
 /// Return the optimum of a long record for zero step, by deferred correction; None if this fails.
 ///
-/// At the optimum, the residuals of two finer grids are extrapolated to zero step. Their difference from the residuals
-/// of the grid hardly depends on the parameters. It is added to the samples, and the grid is fitted again until the
-/// estimate does not change (Stetter, doi:10.1007/BF01432879). The finer grids are simulated without derivatives.
+/// At the optimum, the residuals on two finer pulse grids are extrapolated to zero step. The difference of this limit
+/// from the residuals on `grid` hardly depends on the parameters. It is added to the samples, and the model is fitted
+/// again on `grid` until the estimate does not change (Stetter, doi:10.1007/BF01432879). The finer pulse grids are
+/// simulated without derivatives.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]). An error if the runs cannot be sampled at a
@@ -207,7 +210,7 @@ fn finite_squares(values: &[f64], weight: f64) -> f64 {
 }
 
 impl<'a> Optimum<'a> {
-    /// Return the optimum of a grid without step refinement.
+    /// Return a fit result as the optimum, without step refinement.
     ///
     /// # Errors
     /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]).
@@ -253,7 +256,8 @@ fn is_within_errors(time_scaling: &TimeScaling, one: &[f64], other: &[f64], (at,
     pairs.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
 }
 
-/// Extrapolate the estimates of two grids: add their difference, divided by `share`, to the estimate of the finer grid.
+/// Extrapolate the estimates of two pulse grids to zero step: add the difference `fine` − `coarse`, divided by `share`,
+/// to `fine`.
 ///
 /// The result is limited to feasible values.
 fn extrapolate(
@@ -268,7 +272,7 @@ fn extrapolate(
     Ok(time_scaling.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
 }
 
-/// Return the initial guess for half the step.
+/// Return the initial guess of the fit at half the step.
 ///
 /// The optimum is expected to move a quarter as far as at the last halving.
 fn extrapolated_start(
@@ -322,11 +326,12 @@ fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -
         .sum()
 }
 
-/// Return the extrapolated limit or the optimum of the finest grid, whichever fits better on half the step.
+/// Return the extrapolated estimate `limit` or the optimum `best` of the finest pulse grid, whichever fits better at
+/// half the step.
 ///
-/// If poorly determined parameters have a curved valley, a straight extrapolation leaves the valley. If the residuals
-/// change linearly between the optimum and the limit and the grids agree, the limit is returned without this
-/// comparison.
+/// If poorly determined parameters have a curved valley, a straight extrapolation leaves the valley. The limit is
+/// returned without this comparison if the residuals hardly change between both points. It is also returned if they
+/// change linearly and the step has converged.
 fn select_limit_or_optimum(
     best: &OptimizationResult,
     grid: &Objective<'_>,

@@ -212,7 +212,7 @@ pub struct ParametricStructure {
     pub initial: Initial,
     /// True if the initial terms represent inputs before the start of a run.
     pub history: bool,
-    /// Free parameters of inputs: delays and limits.
+    /// Free parameters of inputs: delays, saturation limits and dead-zone half-widths.
     pub inputs: Vec<Input>,
     /// Coefficient laws.
     pub laws: Vec<Law>,
@@ -223,7 +223,7 @@ pub struct ParametricStructure {
 impl ParametricStructure {
     /// Return a structure of uncoupled equations without bounds, laws or free input parameters.
     ///
-    /// A signal of another equation enters an equation with its measured values.
+    /// The output of another equation enters an equation with its measured values.
     #[must_use]
     pub fn new(signals: Vec<String>, equations: Vec<ParametricEquation>, initial: Initial) -> Self {
         Self {

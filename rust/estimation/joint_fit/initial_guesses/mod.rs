@@ -54,12 +54,13 @@ impl<'a> OrderGrids<'a> {
         Self { source, threads, memory, stop, low_passes: LowPassCache::default() }
     }
 
-    /// Return initial guesses of a parameter set, at several delays and limits if these are free.
+    /// Return initial guesses of a parameter set. If delays, saturations or dead zones are free, several values of each
+    /// are tried.
     ///
-    /// # Errors [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for
-    /// friction, and for duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints.
-    /// [`Error::Interrupted`] after a stop request. Also an error if the runs have no block-pulse records or if a grid
-    /// search fails.
+    /// # Errors
+    /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
+    /// duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints. [`Error::Interrupted`]
+    /// after a stop request. Also an error if the runs have no block-pulse records or if a grid search fails.
     pub fn candidates(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
         let frequencies = self.frequencies(free)?;
         if free.structure.inputs.is_empty() {
@@ -207,7 +208,7 @@ const MAX_LIMIT_STARTS: usize = 4;
 /// Least initial guess of a saturation or dead zone, relative to the largest input magnitude.
 const MIN_LIMIT_RATIO: f64 = 0.1;
 
-/// Return initial guesses of the free delays and limits, each with a description.
+/// Return initial guesses of the free delays and limits (saturations and dead zones), each with a description.
 ///
 /// `fastest` is the highest bandwidth \[rad/s\] of an output. From a poor guess of the delay, a fit converges to a
 /// local optimum that is shifted by one period of an oscillation. Initial guesses of a limit are below the largest
@@ -243,7 +244,7 @@ fn input_axis(item: &Input, count: usize, source: &Recordings, fastest: f64) -> 
     Ok(values)
 }
 
-/// Describe the initial guess of a delay or limit as text.
+/// Describe the initial guess of a delay, saturation or dead zone as text.
 fn describe_input(item: &Input, value: f64) -> String {
     match item.free.law {
         InputLaw::Delay => format!("delay {} ms", format_general(1e3 * value, 3)),

@@ -42,10 +42,11 @@ const MAX_SCAN_CANDIDATES: usize = 4;
 /// Difference below which two exponents of t count as equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// Return candidates from a scan over frequency and damping, at integer orders and at the best orders of the grid.
+/// Return candidates from a scan over frequency and damping, at integer orders and at the best orders of the order
+/// grid.
 ///
 /// `frequencies` are the bandwidths \[rad/s\] of the output of each equation, by run. The first of `attempts` has the
-/// best orders of the grid. The result is empty for a structure with an order law or a coefficient law.
+/// best orders of the order grid. The result is empty for a structure with an order law or a coefficient law.
 pub(super) fn scan_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,

@@ -54,9 +54,10 @@ pub(super) type Values = BTreeMap<String, f64>;
 
 /// Run the multistart of a problem with friction and return the candidates, best first.
 ///
-/// # Errors [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. Also an error
-/// if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it
-/// returns one.
+/// # Errors
+/// [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. Also an error if the
+/// runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it returns
+/// one.
 pub fn run_friction_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     if !structure.has_friction() {
@@ -208,9 +209,9 @@ pub(super) fn values_of(free: &ParameterSet, candidate: &Candidate) -> Values {
     values
 }
 
-/// Return the initial guess at values by name.
+/// Return the initial guess with the given parameter values, by name.
 ///
-/// A parameter without a value is in the middle of its bounds, or 0 if these are infinite.
+/// A parameter without a given value is in the middle of its bounds, or 0 if these are infinite.
 pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> Result<Candidate> {
     let of = |(name, (low, high)): (&String, (f64, f64))| {
         let middle = 0.5 * (low + high);
@@ -623,7 +624,7 @@ fn stribeck_guesses(
 
 /// Root-mean-square speed of an output, in its unit per second.
 ///
-/// Each speed is an average over one sampling interval of the decimated grid.
+/// Each speed is an average over one interval of the decimated samples.
 #[allow(clippy::cast_precision_loss)]
 fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     let every = grid.sampling.decimation;

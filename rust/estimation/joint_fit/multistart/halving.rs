@@ -172,7 +172,8 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut candidates: Vec<Candida
 /// Split the candidates of a short fit into those that continue and the others.
 ///
 /// A candidate continues if its budget is exhausted. `floor` is the cost per residual of the noise alone. If some
-/// candidate has converged at this noise floor, only candidates whose cost is not higher continue.
+/// candidate has converged at this noise floor, the cost of a continuing candidate must also not exceed the least
+/// converged cost.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
     candidates: Vec<Candidate>,
     floor: f64,

@@ -158,7 +158,7 @@ struct MultistartState<'a> {
     context: MultistartContext<'a>,
     executor: RungExecutor<'a>,
     coarse: Objective<'a>,
-    /// Objective on a grid with half the step; None if it was not needed.
+    /// Objective on a pulse grid with half the step; None if it was not needed.
     half: Option<Objective<'a>>,
     starts: Vec<Candidate>,
     /// Candidates of the full problem after the first budget.
@@ -197,8 +197,7 @@ fn multistart_without_history<'a>(
 
 /// Return the best candidate of each submodel of integer orders, embedded in the full problem.
 ///
-/// The submodels have the usual integer orders, those nearest to the orders of the first initial guess, and variants of
-/// both.
+/// The submodels are those of [`integer_order_problems`] near the orders of the first initial guess.
 fn integer_order_optima(
     free: &ParameterSet,
     context: MultistartContext<'_>,
@@ -248,9 +247,9 @@ fn optimize_submodel(
 impl<'a> MultistartState<'a> {
     /// Optimize all initial guesses with a step that is short enough for the best candidate.
     ///
-    /// On a coarse grid, the simulation of a stiff equation may be unstable, and the cost has spurious optima. The step
+    /// With a long step, the simulation of a stiff equation may be unstable, and the cost has spurious optima. The step
     /// is halved until this no longer changes the simulation of the best candidate significantly. Optima of integer
-    /// orders are initial guesses on each grid.
+    /// orders are initial guesses at each step.
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
@@ -298,7 +297,8 @@ impl<'a> MultistartState<'a> {
         self.candidates = sort_by_cost(std::mem::take(&mut self.candidates));
     }
 
-    /// Evaluate candidates with the full problem on the coarse grid and add them.
+    /// Evaluate candidates with the full problem on the subsampled records, and add them to the candidates of the
+    /// multistart.
     fn evaluate_and_add(&mut self, candidates: &[Candidate]) -> Result<()> {
         let evaluated = self.executor.run(self.free, &self.coarse, candidates, 1)?;
         self.add(evaluated);
@@ -392,9 +392,9 @@ impl<'a> MultistartState<'a> {
     }
 }
 
-/// Sort candidates by the larger of their costs on a grid and on the grid with half the step.
+/// Sort candidates by the larger of their costs at the step of `coarse` and at half that step.
 ///
-/// If the finer grid fails, sort them by their cost on the first grid.
+/// If they cannot be sampled at half the step, sort them by their cost on `coarse`.
 fn rank_candidates(
     coarse: &Objective<'_>,
     half: Option<Objective<'_>>,
@@ -438,7 +438,7 @@ fn multistart_with_history(free: &ParameterSet, context: MultistartContext<'_>) 
     Ok(merge_duplicates(&leaders, is_same_optimum))
 }
 
-/// Optimize candidates on coarse grids and return the best ones, best first.
+/// Optimize candidates on subsampled records and return the best ones, best first.
 ///
 /// The step is halved as long as no candidate has a finite simulation.
 ///

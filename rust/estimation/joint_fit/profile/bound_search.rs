@@ -57,7 +57,7 @@ impl Interval {
 
     /// Shift the finite bounds by `by` and limit them to the bounds of the parameter.
     ///
-    /// `by` is the estimate, extrapolated to step 0, minus the optimum on the grid of the profile.
+    /// `by` is the estimate, extrapolated to step 0, minus the optimum at the step of the profile.
     pub(super) fn shift(mut self, by: f64, (low, high): (f64, f64)) -> Self {
         for end in [&mut self.low, &mut self.high].into_iter().filter(|end| end.is_finite()) {
             *end = (*end + by).clamp(low, high);
@@ -94,7 +94,7 @@ pub struct BoundSearch {
     pub parameter: usize,
     /// −1 for the lower bound, 1 for the upper bound.
     side: f64,
-    /// Half-width of the interval, in standard deviations.
+    /// Half-width of the Wald interval, in standard errors.
     width: f64,
     /// Value of the parameter at the optimum.
     start: f64,
@@ -122,7 +122,8 @@ pub struct BoundSearch {
 }
 
 impl BoundSearch {
-    /// Return a search for the lower (`side` −1) or upper (`side` 1) bound; `width` is in standard deviations.
+    /// Return a search for the lower (`side` −1) or upper (`side` 1) bound; `width` is the half-width of the Wald
+    /// interval in standard errors.
     #[must_use]
     pub fn new(around: &ProfileLikelihood<'_>, parameter: usize, side: f64, width: f64) -> Self {
         let (start, half) = (around.values()[parameter], around.errors[parameter] * width);

@@ -14,7 +14,7 @@ use crate::signal::statistics::inner;
 
 /// Maximum number of evaluations of one refit.
 pub const MAX_REFIT_EVALUATIONS: usize = 120;
-/// Maximum shift of the optimum, in standard errors, at which the profile uses a grid twice as coarse.
+/// Maximum shift of the optimum, in standard errors, at which the profile is computed with twice the step of the fit.
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
 /// Maximum shift of the optimum, relative to the parameter. A shift within this or the previous limit is accepted.
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
@@ -35,11 +35,11 @@ const SINGULAR_VALUE_TOLERANCE: f64 = 1e-12;
 pub struct FitState {
     /// Estimates of all free parameters, extrapolated to step 0.
     pub estimate: Vec<f64>,
-    /// Values of all free parameters at the optimum of the finest grid.
+    /// Values of all free parameters at the optimum of the finest pulse grid.
     pub on_grid: Vec<f64>,
     /// Weights of outputs and samples.
     pub weights: Weights,
-    /// Number of block pulses per sampling interval of the finest grid.
+    /// Number of block pulses per sampling interval of the finest pulse grid.
     pub pulses_per_sample: usize,
     /// True if halving the step no longer changes the optimum significantly.
     pub step_converged: bool,
@@ -75,9 +75,9 @@ pub enum Refit {
 pub struct ProfileLikelihood<'a> {
     free: &'a ParameterSet,
     grid: Objective<'a>,
-    /// Optimum on the grid of the profile.
+    /// Optimum at the step of the profile.
     pub best: OptimizationResult,
-    /// Difference between the estimate, extrapolated to step 0, and the optimum on the grid, per parameter.
+    /// Estimate, extrapolated to step 0, minus the optimum at the step of the profile, per parameter.
     pub shift: Vec<f64>,
     /// Inverse of the Gauss–Newton Hessian of the cost, row-major.
     inverse_hessian: Vec<f64>,
@@ -87,7 +87,7 @@ pub struct ProfileLikelihood<'a> {
     ///
     /// This is the noise variance, widened for colored residuals.
     pub units: Vec<f64>,
-    /// Values of all free parameters of the fit on its finest grid.
+    /// Values of all free parameters of the fit on its finest pulse grid.
     on_grid: Vec<f64>,
 }
 
@@ -191,16 +191,17 @@ impl<'a> ProfileLikelihood<'a> {
         [self.errors[i], self.units[i]].into_iter().all(|v| v > 0.0 && v.is_finite())
     }
 
-    /// Square root of the rise of a sum of squares above its value at the optimum, in standard deviations of parameter
-    /// `i`.
+    /// Square root of the rise of the sum of squares `squares` above the optimum, in units of its rise at one standard
+    /// error of parameter `i`.
     #[must_use]
     pub fn rise(&self, i: usize, squares: f64) -> f64 {
         ((squares - 2.0 * self.cost()).max(0.0) / self.units[i]).sqrt()
     }
 
-    /// Return true if the optimum has a lower cost than the fit on the next finer grid as well.
+    /// Return true if the optimum has a lower cost than the fit at half the step as well.
     ///
-    /// Both points are evaluated on that grid and not refitted, because a refit could exploit its discretization error.
+    /// Both points are evaluated at half the step and not refitted, because a refit could exploit the discretization
+    /// error.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -213,7 +214,7 @@ impl<'a> ProfileLikelihood<'a> {
         Ok(finite(costs)?.is_some_and(|(after, before)| after < before))
     }
 
-    /// Relative error of the Wald interval of parameter `i` with half-width `width` in standard deviations.
+    /// Relative error of the Wald interval of parameter `i` with half-width `width` in standard errors.
     ///
     /// At each bound, the other parameters follow the linearized profile and are then adjusted by one linear step. The
     /// rise of the cost there is compared with the rise that the Wald interval implies. The error is infinite if a
@@ -343,7 +344,7 @@ pub struct CostSurface<'a> {
 }
 
 impl<'a> CostSurface<'a> {
-    /// Return the cost surface of the two parameters `pair` around the optimum of the finest grid.
+    /// Return the cost surface of the two parameters `pair` around the optimum of the finest pulse grid.
     ///
     /// If `refit` is true, all other parameters are adjusted by one linear least-squares step at each point. Otherwise
     /// they are fixed.
@@ -365,7 +366,7 @@ impl<'a> CostSurface<'a> {
 
     /// Return `points` evenly spaced values of one of the two parameters, `of` = 0 or 1.
     ///
-    /// They are within bounds and at most `half` from the optimum.
+    /// They are within bounds and differ from the optimum by at most `half`, which has the unit of the parameter.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn axis(&self, of: usize, half: f64, points: usize) -> Vec<f64> {

@@ -39,7 +39,8 @@ const MAX_LOWER_OPTIMA: usize = 5;
 pub struct ProfileSettings {
     /// Indices of the parameters to be profiled. None selects those whose Wald interval is inaccurate.
     pub parameters: Option<Vec<usize>>,
-    /// Half-width of the interval, in standard deviations.
+    /// Standard normal quantile of the confidence level, such as 1.96 for 95 %: half-width of the Wald interval in
+    /// standard errors.
     pub width: f64,
     /// Maximum number of simulations for all bounds, and minimum initial budget of each bound; None for no limit.
     pub budget: Option<(usize, usize)>,
@@ -54,7 +55,7 @@ pub struct ProfileResult {
     pub intervals: Vec<(usize, Interval)>,
     /// Parameter values of an optimum with a significantly lower cost than the fit; None if no such optimum was found.
     pub lower_optimum: Option<Vec<f64>>,
-    /// True if the lower optimum also has a lower cost than the fit on the next finer grid.
+    /// True if the lower optimum also has a lower cost than the fit at half the step.
     pub lower_on_finer_grid: bool,
     /// Indices of the parameters whose profile needed more simulations than allowed.
     pub incomplete: Vec<usize>,
