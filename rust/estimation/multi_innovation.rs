@@ -28,7 +28,8 @@ pub enum RowBasis {
 pub enum Prior {
     /// The same covariance for every coefficient.
     Absolute(f64),
-    /// Covariance of a coefficient times the sum of squares of its column. This product does not depend on units.
+    /// Product of the prior variance of a coefficient and the sum of squares of its regressor column. It does not
+    /// depend on units.
     Relative(f64),
 }
 

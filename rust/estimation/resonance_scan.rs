@@ -8,10 +8,8 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Distance of the response to an initial term from the span of the other responses, relative to its norm, at or below
-/// which it is omitted as linearly dependent.
-///
-/// The responses are those of one record to its initial terms.
+/// Largest distance of the response to an initial term from the span of the responses to the previous ones, relative to
+/// the norm of the response, at which this initial term is omitted as linearly dependent. It applies to each record.
 const RANK_TOLERANCE: f64 = 1e-12;
 /// Norm of a column after projection orthogonal to the initial terms, relative to its norm before. If this ratio of any
 /// column is at or below the limit, all coefficients are solved together with the initial terms.

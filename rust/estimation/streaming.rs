@@ -186,8 +186,9 @@ impl Streaming {
     /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. Each equation has its structure, and
     /// one entry per term: the value of a fixed coefficient, or None for a free one.
     ///
-    /// # Errors [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if an
-    /// equation does not have one such entry per term. [`Error::NotFinite`] if a fixed coefficient is not finite.
+    /// # Errors
+    /// [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if an equation does
+    /// not have one such entry per term. [`Error::NotFinite`] if a fixed coefficient is not finite.
     /// [`Error::Structure`] for an unknown signal.
     ///
     /// ```

@@ -8,7 +8,7 @@
 use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
-/// Maximum permitted number of iterations. An iteration that needs more than this usually oscillates without
+/// Maximum permitted number of iterations. If more iterations are needed, the estimates usually oscillate without
 /// converging.
 const MAX_ITERATIONS: usize = 1000;
 
