@@ -54,7 +54,7 @@ pub enum Initial {
     Caputo,
     /// Powers of t with explicit exponents.
     Powers(Vec<f64>),
-    /// A constant on the right-hand side of each equation in each record, to be estimated, in addition to other initial
+    /// Offset: an unknown constant on the right-hand side, one per record and equation, in addition to other initial
     /// conditions.
     ///
     /// Integration of an equation of order α turns a constant c into c t^α/Γ(α+1), and a ramp r t into r

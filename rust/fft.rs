@@ -129,7 +129,8 @@ impl Plans {
     }
 }
 
-/// Return the plan of a length, which all threads share. See [`fast_length`] for fast lengths.
+/// Return the plan of the real transforms of `len` points, which all threads share. See [`fast_length`] for fast
+/// lengths.
 ///
 /// Long plans that were not used recently are evicted from the cache.
 ///

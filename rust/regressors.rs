@@ -385,8 +385,8 @@ impl Record {
         }
     }
 
-    /// Return the pulse means of an initial term t^exponent as an input, not filtered. `None` for a record without
-    /// filter or if the filter response is known.
+    /// Return the pulse means of an initial term t^exponent as an input of a simulation, before the sensor filter.
+    /// `None` for a record without filter, or if the filter response is known.
     pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
         let passes = self.filter.is_some() && self.impulse_response(exponent).is_none();
         passes.then(|| power_pulses(exponent, self.m(), self.step))
@@ -432,8 +432,8 @@ impl Key {
     }
 }
 
-/// Distinct regressors of a search, in the sequence of their insertion unless sorted. All records share this index. The
-/// position of a regressor is its column in each bank.
+/// Distinct regressors of a search, in the sequence of insertion or sorted ([`Index::sort`]). All records share this
+/// index. The position of a regressor is its column in each bank.
 #[derive(Debug, Default, Clone)]
 pub struct Index {
     keys: Vec<Key>,

@@ -82,7 +82,7 @@ fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(
 /// Simulate damped equations: the power series of the system are evaluated at ρz, where z is the one-step delay and ρ =
 /// e^{−decay}. Inputs and initial terms are not damped.
 ///
-/// A large enough decay [1/pulse] makes every model stable. Damped responses serve as instruments, which need to be
+/// A large enough decay \[1/pulse\] makes every model stable. Damped responses serve as instruments, which need to be
 /// free of noise but not exact.
 ///
 /// # Errors
