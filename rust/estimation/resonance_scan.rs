@@ -8,8 +8,8 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Largest distance of the response to an initial term from the span of the responses to the previous ones, relative to
-/// the norm of the response, at which this initial term is omitted as linearly dependent. It applies to each record.
+/// An initial term is omitted as linearly dependent if its response has at most this distance from the span of the
+/// responses to the previous initial terms of the record. The distance is relative to the norm of the response.
 const RANK_TOLERANCE: f64 = 1e-12;
 /// Norm of a column after projection orthogonal to the initial terms, relative to its norm before. If this ratio of any
 /// column is at or below the limit, all coefficients are solved together with the initial terms.

@@ -183,8 +183,8 @@ pub struct Streaming {
 impl Streaming {
     /// Return a recursion on samples with the interval `step` \[s\], for at most `longest` pulses.
     ///
-    /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. Each equation has its structure, and
-    /// one entry per term: the value of a fixed coefficient, or None for a free one.
+    /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. `equations` holds the structure of
+    /// each equation, and one entry per term: the value of a fixed coefficient, or None for a free one.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if an equation does

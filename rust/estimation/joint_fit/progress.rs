@@ -18,7 +18,7 @@ pub struct FitProgress<'a> {
 }
 
 impl<'a> FitProgress<'a> {
-    /// Return a progress of 0 that is reported to a callback.
+    /// Return the progress at the start of a fit, which is reported to the callback `listener`.
     #[must_use]
     pub fn new(listener: &'a ProgressListener<'a>) -> Self {
         Self { listener, share_done: 0.0, reported_parts: None, phase_start: 0.0, last: 0.0 }

@@ -7,8 +7,8 @@ use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
 use crate::linalg::small::back_substitute;
 
-/// Relative norm of the component of a response outside the span of the other responses, below which the response
-/// counts as linearly dependent.
+/// Relative norm of the component of a response outside the span of the previous responses, at or below which the
+/// response counts as linearly dependent.
 ///
 /// The responses are those to the initial terms.
 pub(crate) const RANK_TOLERANCE: f64 = 1e-12;

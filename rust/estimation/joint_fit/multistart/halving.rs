@@ -31,8 +31,8 @@ const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
 const MAX_NOISE_COST_RATIO: f64 = 1.2;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
-/// Relative difference of each parameter below which two candidates are the same iterate, and absolute difference of
-/// each order below which two candidates can be the same optimum.
+/// Relative difference of each parameter below which two candidates are the same iterate. It is also the absolute
+/// difference of each order below which two candidates can be the same optimum.
 const SAME_PARAMETER_TOLERANCE: f64 = 0.02;
 /// Relative tolerance of the orders of the same optimum, added to the absolute tolerance.
 const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;

@@ -144,8 +144,8 @@ impl IntegerOrderProblem {
     }
 }
 
-/// Return submodels with integer orders: the orders of [`ParameterSet::integer_orders`], the integers nearest to
-/// `near`, and all variants of either set in which one order has another integer value.
+/// Return submodels with integer orders: [`ParameterSet::integer_orders`], the integers nearest to `near`, and all
+/// variants of these two sets in which one order has another integer value.
 ///
 /// An input coefficient may have opposite signs at two integer orders, and an optimization cannot pass through zero
 /// between them. The nearest integer orders therefore need not be the best. Combinations without a valid equation are

@@ -372,7 +372,7 @@ impl<'a> MultistartState<'a> {
         Ok(())
     }
 
-    /// Continue the survivors and rank them before the other candidates. Unfinished ones get the second budget.
+    /// Continue the survivors, and rank them before the other candidates. Unfinished survivors get the second budget.
     ///
     /// Return the candidates and the objective on which they were optimized.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
