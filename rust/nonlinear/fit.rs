@@ -41,7 +41,7 @@ pub struct NonlinearFit {
     pub cost: f64,
     /// Residuals with weights, run after run.
     pub residuals: Vec<f64>,
-    /// Derivatives of the residuals with respect to orders, coefficients and input parameters, one column each. The
+    /// Derivatives of the residuals with respect to orders, coefficients and input parameters, one vector each. The
     /// span of the derivatives with respect to the initial states is projected out.
     pub jacobian: Vec<Vec<f64>>,
     /// Number of residual evaluations.
@@ -321,6 +321,6 @@ pub fn fit(
     })
 }
 
-/// Distance of the response to an initial state from the span of the other responses, below which this response counts
-/// as linearly dependent. The distance is relative to the norm of the response.
+/// Distance of the response to an initial state from the span of the previous responses, at or below which this
+/// response counts as linearly dependent. The distance is relative to the norm of the response.
 const DEPENDENCE_TOLERANCE: f64 = 1e-12;

@@ -37,7 +37,8 @@ impl EndVelocityForcing {
     /// including the jump to that level. It adds c x₀ t^{η−1}/Γ(η) to the velocity. An initial velocity v₀ of the
     /// signal adds c v₀ t^η/Γ(η + 1).
     ///
-    /// # Errors [`Error::OutOfRange`] for a power whose derivative has no finite mean over the first pulse;
+    /// # Errors
+    /// [`Error::OutOfRange`] for a power whose derivative has no finite mean over the first pulse;
     /// [`Error::LeadingZero`] if the initial levels or velocities are not determined by the equations.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {

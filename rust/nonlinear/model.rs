@@ -409,7 +409,7 @@ impl NonlinearModel {
         Ok(out)
     }
 
-    /// Return the derivatives of the weighted residuals, one column for each parameter of [`Parameter::all`] with the
+    /// Return the derivatives of the weighted residuals, one vector for each parameter of [`Parameter::all`] with the
     /// same `numbers`.
     pub(super) fn jacobian(
         &self,

@@ -198,9 +198,9 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// Return true if a term in another equation's output contributes to the velocity of `equation` at the end of a
-    /// pulse by the pulse means of that output, as an input does. This applies to outputs of equations of order 1 or
-    /// less, such as actuators, because they have no velocity at the end of a pulse.
+    /// Return true if a coupling term of `equation` uses the pulse means of the output `output`, like those of an
+    /// input, for the velocity at the end of a pulse. This applies to outputs of equations of order 1 or less, such as
+    /// actuators, because they have no velocity at the end of a pulse.
     pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
         output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
