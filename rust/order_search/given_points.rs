@@ -45,7 +45,7 @@ pub struct Points {
 }
 
 impl Points {
-    /// Build the evaluator of the equation of `output` with one term on each of `signals`. `inputs\[s\]` is true if
+    /// Build the evaluator of the equation of `output` with one term on each of `signals`. `inputs[s]` is true if
     /// signal s is an input.
     ///
     /// # Errors

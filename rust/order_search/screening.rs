@@ -123,7 +123,7 @@ pub(crate) struct Screen<const L: usize> {
     open_positions: Vec<usize>,
     /// Cache of the most recent lookup of test vectors that are linearized in the orders.
     lookup: VectorLookup,
-    /// Path of the unstable-zero test that excluded the most recent candidate.
+    /// Index of the path on which the test for unstable zeros excluded the most recent candidate.
     unstable_zero_path: usize,
 }
 

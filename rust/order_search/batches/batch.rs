@@ -21,9 +21,9 @@ const CHECKPOINT_PULSES: usize = 1 << 21;
 const BOUND_CHUNK_CANDIDATES: u64 = 512;
 /// Number of candidates that one parallel task ranks by the Gram matrix alone, at about 1 ns per candidate.
 const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
-/// Number of slices on which branch and bound over boxes is tried if candidates are hard to exclude. Branch and bound
-/// is then used if boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude
-/// nothing make a search 50 % longer.
+/// Number of two-dimensional slices of the order grid on which branch and bound over boxes is tried if candidates are
+/// hard to exclude. It is used for the search if boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`]
+/// candidates of these slices. Boxes that exclude nothing make a search 50 % longer.
 const TRIAL_SLICES: u64 = 32;
 /// Maximum ratio of the number of candidates to the number of candidates that boxes exclude. At a larger ratio, boxes
 /// cost more time than they save.

@@ -25,9 +25,10 @@ const MAX_SEARCH_VECTORS: usize = 16;
 /// first. Estimates are cheap, and low scores from a large part of the grid exclude most of it.
 const RANKED_CANDIDATES: u64 = 1 << 18;
 
-/// Maximum ratio of the number of candidates in the sample to the number that the other bounds do not exclude, up to
-/// which the expensive bounds (unstable zeros and linearized test vectors) save time. Measured: 0.3 to 2 % are not
-/// excluded (9 % at twice the noise) if the grid contains a true equation, and 53 to 100 % otherwise.
+/// Ratio of the number of candidates in the sample to the number that the other bounds do not exclude. Up to this
+/// ratio, the expensive bounds (unstable zeros and linearized test vectors) save time. In measurements, 0.3 to 2 % of
+/// the candidates were not excluded (9 % at twice the noise) if the grid contained a true equation, and 53 to 100 %
+/// otherwise.
 const HARD_SEARCH_OPEN_RATIO: usize = 8;
 
 /// Best candidates of the initial sample, the selected test vectors, and whether expensive bounds save time.

@@ -266,9 +266,9 @@ impl BatchEvaluation<'_> {
     }
 
     /// Generate linearized test vectors for candidates with the same output columns `own`. The first vector is built
-    /// for the candidate at the median of the first output coefficient. The candidates on both sides are then processed
-    /// likewise. `weight` is the number of candidates of the grid per sampled candidate, `room` the maximum number of
-    /// vectors.
+    /// for the candidate at the median of the first output coefficient. The remaining candidates on each side of the
+    /// median are then processed in the same way. `weight` is the number of candidates of the grid per sampled
+    /// candidate, `room` the maximum number of vectors.
     fn generate_for_own_columns(
         &self,
         linearized_vectors: &LinearizedVectors,

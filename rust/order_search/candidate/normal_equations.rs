@@ -19,7 +19,7 @@ pub(crate) struct Normal {
     correlation: Vec<f64>,
     /// Products of the columns, scaled to unit norm, with the measured output.
     rhs: Vec<f64>,
-    /// Norm of each regressor column: square root of its Gram element plus the inverse prior covariance.
+    /// Norm of each regressor column: square root of the sum of its squared norm and the inverse prior covariance.
     size: Vec<f64>,
     /// Inverse norm of each column, 0 for a zero column.
     inverse: Vec<f64>,

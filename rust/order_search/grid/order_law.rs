@@ -35,7 +35,8 @@ pub struct OrderLawGrid {
 }
 
 impl OrderLawGrid {
-    /// Build the grid from the values of each free order and the equations. `inputs\[s\]` marks signal s as an input.
+    /// Build the grid from the values of each free order and the equations. `inputs[s]` is true if signal s is an
+    /// input.
     ///
     /// # Errors
     /// [`Error::EmptyOrderGrid`] for a free order without values. [`Error::OrderGridTooLarge`] for more than

@@ -103,13 +103,12 @@ pub struct SearchState {
     /// State of the first pass, which finds the best score of each equation: current equation, number of its candidates
     /// already requested, and smallest score / scale so far.
     pass: (usize, usize, f64),
-    /// Factor from the lower bound of a score to the limit of its next evaluation, used while the result table is not
-    /// full.
+    /// Ratio of the score limit of the next evaluation of a candidate to the lower bound of its score. It is used while
+    /// the result table is not full.
     limit_factor: f64,
     /// Candidates to evaluate next.
     pending_spans: Vec<Span>,
-    /// Ratio of the score limit of the next evaluation of a candidate to the lower bound of its score. It is used while
-    /// the result table is not full.
+    /// Total number of candidates to evaluate, as far as known.
     total: u64,
     /// Score (sum of score / scale over the equations) and index of the best combinations of free orders that are
     /// evaluated completely. Empty during the first pass.

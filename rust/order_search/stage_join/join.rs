@@ -290,8 +290,8 @@ pub(super) struct ScoreEntry {
     pub(super) class: Class,
 }
 
-/// Class of a score entry: how reliable its value is. The class of a sum is the first failure. Without a failure, it is
-/// the largest class.
+/// Class of a score entry: how reliable its value is. The class of a sum is its first failure, or without a failure the
+/// last of the classes in the sequence below.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     /// The score is exact.
