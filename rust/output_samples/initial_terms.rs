@@ -32,7 +32,8 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
     }
 }
 
-/// Add the initial terms that fit the measured samples best to the samples `driven` of a simulation from rest.
+/// Fit initial terms to the measured samples, and add their responses to the samples `driven` of a simulation from
+/// rest.
 ///
 /// `units` holds (index of the equation, exponent) of each term, and `columns` the samples of all outputs for this term
 /// with coefficient 1. With `has_level`, the level of each output is an additional term with the exponent ∞. The weight

@@ -1,10 +1,11 @@
-//! Output samples: simulation of a model on a recording, at its sample times, on one grid or in the limit of zero step.
+//! Output samples: simulation of a model on a recording, at its sample times, on one grid of block pulses or in the
+//! limit of zero step.
 //!
 //! A sample at a uniform sample time is extrapolated from the pulse means before it. Direct feedthrough uses the values
 //! of the inputs at the sample times. Initial terms are given, or fitted to the measured samples. The step is halved
 //! until Richardson extrapolation has converged. For long records, responses to single samples are superposed, and
-//! refined only where they change. Models of integer orders at uniform sample times are simulated exactly, without a
-//! grid. Initial terms that represent past inputs have a prior.
+//! refined only where they change. Models of integer orders at uniform sample times are simulated exactly, without
+//! block pulses. Initial terms that represent past inputs have a prior.
 
 mod exact;
 mod initial_terms;

@@ -44,12 +44,13 @@ struct WeightedColumns {
 impl OutputSimulation {
     /// Return the posterior mean of the initial terms that represent past inputs: (exponent, coefficient) by equation.
     ///
-    /// `exponents[i]` are the exponents of the powers of time in equation i, and `free[i]` those of them without a
-    /// prior. With `has_level`, the level of each output is a further term without a prior; it has the exponent ∞ and
-    /// belongs to the equation of the output. None if a response is not finite.
+    /// `exponents[i]` are the exponents of the powers of time in equation i, and `free[i]` are the exponents among
+    /// these whose terms have no prior. With `has_level`, the level of each output is a further term without a prior;
+    /// it has the exponent ∞ and belongs to the equation of the output. None if a response is not finite.
     ///
-    /// # Errors The errors of [`OutputSimulation::refine`]. [`Error::Length`] if `exponents` or `free` do not have one
-    /// entry per equation.
+    /// # Errors
+    /// The errors of [`OutputSimulation::refine`]. [`Error::Length`] if `exponents` or `free` do not have one entry per
+    /// equation.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};

@@ -1,5 +1,5 @@
-//! Refinement of the step until samples have converged. Long records are simulated by superposition of responses to
-//! single samples, and these responses are refined only where they change.
+//! Refinement of the step until samples have converged. Each step defines a grid of block pulses. Long records are
+//! simulated by superposition of responses to single samples, and these responses are refined only where they change.
 
 use std::sync::Arc;
 
@@ -33,10 +33,10 @@ const MAX_GROWTH_RATIO: f64 = 1e3;
 pub struct RefinedSamples {
     /// Samples and initial terms in the limit of zero step.
     pub samples: OutputSamples,
-    /// Number of pulses per sampling interval of the finest grid.
+    /// Number of pulses per sampling interval of the finest grid of block pulses.
     pub refinement: usize,
     /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
-    /// output. It is infinite with fewer than three grids.
+    /// output. It is infinite if fewer than three steps were simulated.
     pub change: Vec<f64>,
 }
 
@@ -46,7 +46,7 @@ pub struct Refinement {
     /// Tolerance for the change of each output that is expected if the step is halved again, relative to the largest
     /// magnitude of the output. The refinement ends when no expected change exceeds the tolerance.
     pub tolerance: f64,
-    /// Maximum number of pulses of a grid.
+    /// Maximum number of block pulses of a simulation.
     pub max_pulses: usize,
     /// Minimum number of sampling intervals of a record that is simulated by superposition of responses.
     pub long_record_intervals: usize,
@@ -59,8 +59,9 @@ impl OutputSimulation {
     /// or until the number of pulses reaches its maximum.
     ///
     /// # Errors
-    /// The errors of [`OutputSimulation::samples`]. Equations that are singular on one grid only are not an error.
-    /// [`Error::Memory`] if the first grid exceeds the memory limit. [`Error::Interrupted`] after a stop request.
+    /// The errors of [`OutputSimulation::samples`]. Equations that are singular at one step only are not an error.
+    /// [`Error::Memory`] if the simulation with the longest step exceeds the memory limit. [`Error::Interrupted`] after
+    /// a stop request.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};

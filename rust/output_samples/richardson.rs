@@ -1,4 +1,5 @@
-//! Richardson table: limit of samples for zero step, from grids with 1, 1/2, 1/4, … of a step.
+//! Richardson table: limit of samples for zero step, from simulations on grids of block pulses with the steps h, h/2,
+//! h/4, ….
 
 /// Samples or pulse means, one row per output.
 pub(super) type Rows = Vec<Vec<f64>>;
@@ -50,7 +51,7 @@ pub struct LimitEstimate {
     /// Samples of each output in the limit.
     pub samples: Vec<Vec<f64>>,
     /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
-    /// output. It is infinite with fewer than three grids.
+    /// output. It is infinite if fewer than three grids were added.
     pub change: Vec<f64>,
     /// Coefficients of the initial terms in the limit.
     pub terms: Vec<f64>,
@@ -197,11 +198,11 @@ fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f
     now.iter().zip(&before).map(of).collect()
 }
 
-/// Extrapolate samples and initial terms on grids with 1, 1/2, 1/4, … of a step to zero step.
+/// Extrapolate samples and initial terms, simulated with the steps h, h/2, h/4, …, to zero step.
 ///
-/// Each grid is (samples of each output, coefficients of the initial terms), and `owners` holds the output index of
-/// each initial term. The estimate is a column of the Richardson table, or its extrapolation by Aitken's method. The
-/// one with the smallest expected change if the step is halved again is returned. None without grids.
+/// `grids` holds (samples of each output, coefficients of the initial terms) for each step, and `owners` the output
+/// index of each initial term. The estimate is a column of the Richardson table, or its extrapolation by Aitken's
+/// method. The one with the smallest expected change if the step is halved again is returned. None without grids.
 ///
 /// ```
 /// use ftlm::output_samples::richardson_limit;

@@ -202,7 +202,8 @@ impl OutputSimulation {
     /// the measured position and velocity at the start of the run.
     ///
     /// # Errors
-    /// The errors of [`Recording::experiment`], for an invalid grid or too few samples, and of [`nonlinear::fit`].
+    /// The errors of [`Recording::experiment`], for an invalid number of pulses or too few samples, and of
+    /// [`nonlinear::fit`].
     ///
     /// ```
     /// use ftlm::equation::{Equation, Initial, Structure, Term};
@@ -262,8 +263,8 @@ impl OutputSimulation {
     /// not finite if the simulation diverges.
     ///
     /// # Errors
-    /// The errors of [`Recording::pulses`] for an invalid grid, of [`simulate::respond`] for linear models, and of
-    /// [`NonlinearSystem::run`] for other models.
+    /// The errors of [`Recording::pulses`] for an invalid number of pulses, of [`simulate::respond`] for linear models,
+    /// and of [`NonlinearSystem::run`] for other models.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -571,12 +572,12 @@ impl<'a> Grid<'a> {
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
     }
 
-    /// Return the part of each sample that is due to the response after the sample time, for all samples of each output
-    /// except the first and the last. A sample that is the average of the pulse means before and after it contains this
-    /// part, which must be subtracted.
+    /// Return, for each output, the part of its samples that is due to the response after the sample time. The first
+    /// and the last sample are omitted. This part must be subtracted from a sample that is the average of the pulse
+    /// means before and after it.
     ///
-    /// It is half of the response in the first pulse after a jump or a slope discontinuity of an input. At the sample
-    /// time only direct feedthrough acts, as in the joint fit.
+    /// This part is half of the response in the first pulse after a jump or a slope discontinuity of an input. At the
+    /// sample time only direct feedthrough acts, as in the joint fit.
     fn responses_after_sample(&self) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let (n, m, every) = (equations.len(), self.record.m(), self.every);
