@@ -83,8 +83,8 @@ impl Recordings {
     /// Return the experiment of each run on a grid of block pulses.
     ///
     /// # Errors
-    /// [`Error::Memory`] for a grid above the memory limit. The errors of [`Recording::experiment`] for an invalid
-    /// grid.
+    /// [`Error::Memory`] if the experiments exceed the memory limit. The errors of [`Recording::experiment`] for an
+    /// invalid sampling.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};

@@ -1,5 +1,5 @@
-//! Recording of one run that can be sampled on any grid: pulse means of its signals, and samples to compare with a
-//! simulation.
+//! Recording of one run that can be sampled on any grid of block pulses: pulse means of its signals, and samples to
+//! compare with a simulation.
 
 use std::borrow::Cow;
 
@@ -609,7 +609,8 @@ impl Recording {
         }
     }
 
-    /// Return the experiment on a grid: pulse means of the signals, and the samples to compare with a simulation.
+    /// Return the experiment with the given sampling: pulse means of the signals, and the samples to compare with a
+    /// simulation.
     ///
     /// Free delays, saturations and dead zones are not applied, because the fit determines them. Outputs have weight 1,
     /// and missing samples weight 0.
@@ -851,8 +852,8 @@ impl Recording {
         self.with_signal(signal, |line| line.jumps()).flatten()
     }
 
-    /// Return the values of a signal just after the given times \[s\], with delay and limits applied; None for a
-    /// derived signal.
+    /// Return the values of a signal just after the given times \[s\], with delay, saturation and dead zone applied;
+    /// None for a derived signal.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};

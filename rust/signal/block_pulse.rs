@@ -84,8 +84,8 @@ pub struct PulseJump {
 /// Return the means of a signal over `m` equal pulses of [0, (N−1)h], where N is the number of samples and h their
 /// interval. O(N + m).
 ///
-/// `m` is arbitrary. m = N − 1 is the grid of the samples, and a multiple of N − 1 is a finer grid. A smaller `m` gives
-/// exact means over several samples.
+/// `m` is arbitrary. With m = N − 1, a pulse is a sampling interval. With a multiple of N − 1, a sampling interval
+/// contains several pulses. With a smaller m, the means are exact averages over several sampling intervals.
 ///
 /// # Errors
 /// [`Error::Length`] for fewer than two samples. [`Error::OutOfRange`] for m = 0 or too many pulses.

@@ -66,7 +66,7 @@ pub fn root_mean_square(values: &[f64]) -> f64 {
     mean(&values.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt()
 }
 
-/// Return a robust standard deviation about 0, from the median of absolute values. It is insensitive to outliers. 0
+/// Return a robust standard deviation about 0, from the median of absolute values. It is insensitive to outliers, and 0
 /// without values.
 ///
 /// ```
@@ -166,7 +166,7 @@ fn subtract_mean(values: &[f64]) -> Vec<f64> {
 }
 
 /// Return the portmanteau statistic Σ_k (Σ_t e_t e_{t−k})² / Σ_t (e_t e_{t−k})² over `lags` lags k. If the series e is
-/// white noise, it is chi-squared with `lags` degrees of freedom.
+/// white noise, the statistic is chi-squared with `lags` degrees of freedom.
 ///
 /// The variance of the noise may change within a series, because the variance at each lag is estimated from the
 /// products themselves (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). Each series is centered on its own
@@ -287,10 +287,10 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 
 /// Return the autoregression 1, a₁, …, aₙ of a series, and the innovation variance, by Burg's method.
 ///
-/// The series is not centered. Yule–Walker estimates shift a root near 1, as of a random walk, inward, so they
-/// underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order n, at
-/// most `most`, minimizes Schwarz's criterion. NaN marks a missing sample. Pairs of samples that begin or end at it are
-/// omitted.
+/// The series is not centered. Yule–Walker estimates shift a root near 1, such as that of a random walk, inward, and
+/// thus underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order n,
+/// at most `most`, minimizes Schwarz's criterion. NaN marks a missing sample. Pairs of samples that begin or end at it
+/// are omitted.
 ///
 /// ```
 /// // The sum of ±1 is a random walk: each value predicts the next one.
