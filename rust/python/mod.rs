@@ -1,6 +1,6 @@
 //! Python bindings. Only these modules use the crates `pyo3` and `numpy`.
 //!
-//! They check arrays, and release the Python interpreter lock during every computation that takes longer than
+//! The bindings check arrays, and release the Python interpreter lock during every computation that takes longer than
 //! microseconds.
 
 mod convert;

@@ -98,7 +98,7 @@ fn channel(argument: &ChannelArg<'_>) -> PyResult<Channel> {
 /// initial state is (flag of a filter transient in each signal, initial levels, filter responses as rows or None).
 type PulsesTuple<'py> = (f64, Table<'py>, Option<Array<'py>>, (Vec<bool>, Vec<f64>, Option<Table<'py>>));
 
-/// Run that the core can sample on any grid.
+/// Run that the core can sample on any grid of block pulses.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct Recording {
     pub(super) inner: Arc<recording::Recording>,
@@ -196,7 +196,7 @@ impl Recording {
     }
 }
 
-/// Run sampled on one grid, with the samples to compare with a simulation.
+/// Run sampled on one grid of block pulses, with the samples to compare with a simulation.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct Experiment {
     pub(super) inner: output_error::Experiment,
@@ -240,8 +240,8 @@ pub fn nonuniform_means<'py>(
     Ok(PyArray1::from_vec(py, means.into_vec()))
 }
 
-/// Return the runs of a fit. Return an error unless they have these numbers of signals and free input parameters, and
-/// these outputs.
+/// Return the runs of a fit. Return an error if a run does not have the given numbers of signals and free input
+/// parameters, and the given outputs.
 pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], free: usize) -> Result<Recordings> {
     let runs = Recordings::new(runs.iter().map(|run| recording::Recording::clone(&run.get().inner)).collect())?;
     if let Some(run) = runs.runs().first() {

@@ -246,7 +246,8 @@ impl OutputSimulation {
         samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(every, &initial))?)
     }
 
-    /// Return (exact samples, initial terms) of a model with integer orders. None if the model needs a grid.
+    /// Return (exact samples, initial terms) of a model with integer orders. None if the model must be discretized by
+    /// block pulses.
     #[pyo3(signature = (terms, stop=None))]
     fn exact_samples<'py>(
         &self,
@@ -259,9 +260,9 @@ impl OutputSimulation {
         exact.map(|samples| samples_tuple(py, samples)).transpose()
     }
 
-    /// Refine the step. Return ((extrapolated samples, initial terms), pulses per sampling interval of the finest grid,
-    /// change). The change is that of each output that is expected if the step is halved again, relative to the largest
-    /// magnitude of the output.
+    /// Refine the step. Return ((extrapolated samples, initial terms), pulses per sampling interval at the shortest
+    /// step, change of each output). The change is the one expected if the step is halved again, relative to the
+    /// largest magnitude of the output.
     #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
     #[allow(clippy::too_many_arguments)]
     fn refine<'py>(
@@ -320,7 +321,7 @@ impl OutputSimulation {
     }
 }
 
-/// Extrapolate samples on grids with 1, 1/2, 1/4, … of a step to zero step. Return (samples, relative change of each
+/// Extrapolate samples, simulated with the steps h, h/2, h/4, …, to zero step. Return (samples, relative change of each
 /// output, extrapolated additional values). `owners` holds the output index of each additional value.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]

@@ -58,8 +58,8 @@ impl JointProblem {
         run_attached(|| Ok(self.inner.problem.bounds()))
     }
 
-    /// Return the last point on the line from the feasible point `at` to `towards` that satisfies the bounds and the
-    /// constraints of the orders.
+    /// Move from the feasible point `at` toward `towards`, and return the last point that satisfies the bounds and the
+    /// constraints of the orders. The move follows the constraints that are active at `at`.
     fn feasible<'py>(
         &self,
         py: Python<'py>,
@@ -73,9 +73,10 @@ impl JointProblem {
 
     /// Minimize the output error on sampled runs by the Levenberg–Marquardt method. Return the optimum as a dictionary.
     ///
-    /// `start` holds the values of the free parameters, and the initial states of runs with friction. Coordinates are
-    /// logarithmic where the initial guess allows it, unless `plain` is true. `fixed` holds the indices of fixed
-    /// parameters. With `requires_stability`, no step leads from a stable model to an unstable one.
+    /// `start` holds the values of the free parameters, and the initial states of runs with friction. The coordinate of
+    /// a nonzero coefficient is its logarithm, or the coefficient itself if `plain` is true or there are non-linear
+    /// terms. `fixed` holds the indices of fixed parameters. With `requires_stability`, no step leads from a stable
+    /// model to an unstable one.
     #[pyo3(signature = (runs, start, plain, fixed, evaluations, tolerance, requires_stability, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn minimize<'py>(

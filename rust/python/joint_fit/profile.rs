@@ -22,9 +22,9 @@ use crate::python::recording::Recording;
 type SurfaceTuple<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 
 /// State of a fit, from a dictionary with these fields as keys. `estimate` holds the parameters extrapolated to zero
-/// step, and `on_grid` the parameters on the finest grid. `weights` holds the weights of the outputs, and `shares` the
-/// robust weights of the samples by run. `every` is the number of pulses per sampling interval. `settled` is true if
-/// the step has converged. If `steady` is true, no step of an optimization leads from a stable model to an unstable
+/// step, and `on_grid` the parameters at the shortest step. `weights` holds the weights of the outputs, and `shares`
+/// the robust weights of the samples by run. `every` is the number of pulses per sampling interval. `settled` is true
+/// if the step has converged. If `steady` is true, no step of an optimization leads from a stable model to an unstable
 /// one.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
@@ -65,9 +65,9 @@ fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()
 /// Return profile-likelihood intervals of a fit as a dictionary. The item `intervals` holds (index of the parameter,
 /// lower bound, upper bound, points, evaluations) of each parameter.
 ///
-/// Without `parameters`, the parameters with an inaccurate Wald interval are profiled. `width` is the half-width in
-/// standard deviations. `budget` holds the maximum number of simulations for all bounds, and the smallest initial
-/// budget of each bound. At most `evaluations` evaluations locate the optimum before the profiles.
+/// Without `parameters`, the parameters with an inaccurate Wald interval are profiled. `width` is the half-width of the
+/// Wald interval in standard errors. `budget` holds the maximum number of simulations for all bounds, and the smallest
+/// initial budget of each bound. At most `evaluations` evaluations locate the optimum before the profiles.
 #[pyfunction]
 #[pyo3(signature = (
     problem, runs, fit, parameters, width, *, budget=None, threads=1, evaluations=120, progress=None, stop=None,

@@ -118,8 +118,8 @@ pub fn search_plan(
     })
 }
 
-/// Join the partial results of all batches, and return the result of the search as a dictionary. Return an error unless
-/// they account for all candidates. `samples` is the total number of samples of the records.
+/// Join the partial results of all batches, and return the result of the search as a dictionary. Return an error if the
+/// partial results do not account for all candidates. `samples` is the total number of samples of the records.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
@@ -221,8 +221,8 @@ impl OrderSearch {
 }
 
 /// Certify a lower bound of the equation error over a region of orders. Return the certificate as a dictionary. `alpha`
-/// is the interval of the order of the output, `terms` holds (signal, lowest order, highest order), and `memory` is in
-/// bytes.
+/// is the interval of the order α of the equation, `terms` holds (signal, lowest order, highest order), and `memory` is
+/// in bytes.
 #[pyfunction]
 #[pyo3(signature = (
     runs, *, output, alpha, terms, min_separation, tolerance, max_term_ratio, max_cells, threads, memory, progress,
