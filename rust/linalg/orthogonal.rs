@@ -115,8 +115,8 @@ pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
     dispatch_simd(Projection { basis, column, times: 1 });
 }
 
-/// Extend an orthonormal basis by a column, unless its distance from the span relative to its norm is at most
-/// `relative_tolerance`. O(k m) for k basis vectors of m values.
+/// Add a column to an orthonormal basis if its distance from the span exceeds `relative_tolerance` times its norm. O(k
+/// m) for k basis vectors of m values.
 pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, relative_tolerance: f64) {
     let norm_before = norm(&column);
     // Two passes are enough (Kahan, Parlett).

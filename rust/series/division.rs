@@ -21,7 +21,7 @@ pub use super::block_transform::BLOCK_TERMS;
 /// Number of terms whose sums stay in processor registers while products are subtracted.
 const TILE_TERMS: usize = 8;
 
-/// Subtract a product from the remaining terms: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved\[s\]`.
+/// Subtract a product from the remaining terms: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`.
 #[inline(always)]
 fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut at = TILE_TERMS;
