@@ -1,4 +1,5 @@
-//! Estimation by generalized least squares under autoregressive noise, and the likelihood ratio of two nested regressions.
+//! Estimation by generalized least squares under autoregressive noise, and the likelihood ratio of two nested
+//! regressions.
 //!
 //! Only one-step-ahead predictions are compared. The mean of a random walk is as large as the walk itself, and would
 //! look like a constant term. The prediction errors of a random walk are white.

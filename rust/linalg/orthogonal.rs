@@ -16,7 +16,7 @@ const MIN_SQUARED_NORM: f64 = 1e-280;
 const MAX_SQUARED_NORM: f64 = 1e280;
 
 /// Reduction of a triangle R with rows below it to an upper triangle, by Householder reflections. The result is false
-/// if a squared norm is out of range. It is compiled for the widest vector instructions available.
+/// if a squared norm is out of range. This task is compiled for the widest vector instructions available.
 struct Reflections<'a> {
     columns: &'a mut [Vec<f64>],
 }
@@ -85,8 +85,8 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Removal of the components along an orthonormal basis from a column, repeated `times` times. It is compiled for the
-/// widest vector instructions available.
+/// Removal of the components along an orthonormal basis from a column, repeated `times` times. This task is compiled
+/// for the widest vector instructions available.
 struct Projection<'a> {
     basis: &'a [Vec<f64>],
     column: &'a mut [f64],
@@ -174,7 +174,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, relative_tolerance: f64,
     }
 }
 
-/// Euclidean norm √Σ v² of a column. It is compiled for the widest vector instructions available.
+/// Euclidean norm √Σ v² of a column. This task is compiled for the widest vector instructions available.
 struct Norm<'a>(&'a [f64]);
 
 impl SimdKernel for Norm<'_> {

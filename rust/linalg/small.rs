@@ -66,7 +66,7 @@ pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f
 /// Maximum number of steps of an eigenvalue iteration. A polynomial of degree ten needs about thirty.
 const MAX_EIGENVALUE_STEPS: usize = 1000;
 
-/// Return the largest magnitude of the zeros of a polynomial. Its coefficients start with the constant.
+/// Return the largest magnitude of the zeros of a polynomial. `coefficients` are in ascending order of the power.
 ///
 /// `None` for a polynomial without zeros, or if the leading coefficient is 0 or too small relative to the others.
 ///
@@ -80,7 +80,8 @@ pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
     Some(roots.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !roots.is_empty())
 }
 
-/// Return the zeros of a polynomial as pairs (real part, imaginary part). Its coefficients start with the constant.
+/// Return the zeros of a polynomial as pairs (real part, imaginary part). `coefficients` are in ascending order of the
+/// power.
 ///
 /// `None` if there are no coefficients, or if the leading coefficient is 0 or too small relative to the others.
 ///

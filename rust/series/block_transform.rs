@@ -95,7 +95,8 @@ fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     from_fn(|l| [from_fn(|row| x[row][0][l]), from_fn(|row| x[row][1][l])])
 }
 
-/// Transform of a block, or of a block and the next one. It is compiled for the widest vector instructions available.
+/// Transform of a block, or of a block and the next one. This task is compiled for the widest vector instructions
+/// available.
 struct ForwardTransform<'a> {
     factors: &'a Factors,
     low: &'a [f64; BLOCK_TERMS],
@@ -143,7 +144,7 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
 }
 
 /// Inverse transform that gives the middle product (terms 64 to 127) of a block of 64 terms and a segment of 128 terms.
-/// It is compiled for the widest vector instructions available.
+/// This task is compiled for the widest vector instructions available.
 struct InverseTransform<'a> {
     factors: &'a Factors,
     tiles: &'a [Tile],

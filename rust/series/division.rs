@@ -57,8 +57,8 @@ fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], 
     remainder.copy_from_slice(&sums);
 }
 
-/// Forward substitution within a block of one unknown, in place. It is compiled for the widest vector instructions
-/// available.
+/// Forward substitution within a block of one unknown, in place. This task is compiled for the widest vector
+/// instructions available.
 struct Substitution<'a> {
     /// Divisor, a power series of at least the length of the block.
     divisor: &'a [f64],
@@ -224,7 +224,7 @@ impl LevelBuffers {
 }
 
 /// Computation of a spectrum: the contribution of the first `count` blocks of one block length to equation `i` of `n`
-/// in the next block. It is compiled for the widest vector instructions available.
+/// in the next block. This task is compiled for the widest vector instructions available.
 struct Contributions<'a> {
     n: usize,
     i: usize,

@@ -209,8 +209,8 @@ impl RunningSumSystem {
     }
 }
 
-/// Solution for one unknown and [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms. It is compiled for the
-/// widest vector instructions available.
+/// Solution for one unknown and [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms. This task is compiled for
+/// the widest vector instructions available.
 struct Block<'a, const L: usize> {
     /// Weight of the unknown in each running sum.
     own: &'a [f64; L],

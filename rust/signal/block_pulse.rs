@@ -4,8 +4,8 @@
 //! (j+1)h). A measured signal is linear between its samples. Estimates from samples in place of pulse means would be
 //! biased.
 //!
-//! Four pulse means around a sample time determine the value of a smooth signal with fourth-order accuracy. It is the
-//! slope of the quartic polynomial through the integral of the signal at the five pulse edges. After a jump of a
+//! Four pulse means around a sample time determine the value of a smooth signal with fourth-order accuracy. This value
+//! is the slope of the quartic polynomial through the integral of the signal at the five pulse edges. After a jump of a
 //! zero-order-hold input, the signal is not smooth. The fractional integral I^η of a jump of size Δ at time p is Δ (t −
 //! p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means replace the jump by a ramp within its pulse. Both
 //! responses are known exactly, so samples near a jump are corrected by their difference.

@@ -79,7 +79,7 @@ impl OutputScale {
 
     /// Return the scale of an output with the given standard deviation from its samples, one list per run.
     ///
-    /// The noise is estimated from second differences of the samples. It is at least 10⁻³ of the standard deviation.
+    /// The noise level is estimated from second differences of the samples, and is at least 10⁻³ of `deviation`.
     #[must_use]
     pub fn from_deviation(deviation: f64, runs: &[Vec<f64>]) -> Self {
         let noise = median(runs.iter().map(|samples| white_noise_deviation(samples)).collect());

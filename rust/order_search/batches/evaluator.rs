@@ -176,9 +176,9 @@ impl<'a> BatchEvaluator<'a> {
     /// generation ([`generation_ends`]).
     ///
     /// `seed` lists index and raw score (Σ|e| or Σe²) of the best rows found before the generation. `from` resumes a
-    /// checkpoint of the same range and seed. It must contain all rows found since the start of the range. The range is
-    /// restarted if the checkpoint belongs to another evaluation sequence, which may occur on another kind of
-    /// processor.
+    /// checkpoint of the same range and seed. The checkpoint must contain all rows found since the start of the range.
+    /// The range is restarted if the checkpoint belongs to another evaluation sequence, which may occur on another kind
+    /// of processor.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`] after a stop request. [`crate::error::Error::Structure`] for batches, a
@@ -324,7 +324,7 @@ const MAX_BATCH_SIZE: u64 = 1 << 22;
 /// vectors). These bounds apply only if candidates are ranked by simulation. A smaller search would end before these
 /// bounds are built.
 const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
-/// Maximum number of candidates of a search with refined coefficients that skips the initial sample. It is one batch.
+/// Maximum number of candidates, one batch, of a search with refined coefficients that skips the initial sample.
 pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
 /// Return true if a search over `candidates` candidates may use the expensive bounds (unstable zeros and linearized

@@ -508,8 +508,8 @@ impl NormAccumulator {
     }
 }
 
-/// Task that adds inner products of vectors with columns to `out`, row-major with one row per vector. It is compiled
-/// for the widest vector instructions available.
+/// Task that adds inner products of vectors with columns to `out`, row-major with one row per vector. This task is
+/// compiled for the widest vector instructions available.
 struct Products<'a> {
     vectors: &'a [Vec<f64>],
     columns: &'a [&'a [f64]],

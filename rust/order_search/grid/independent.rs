@@ -232,8 +232,8 @@ pub(crate) struct Group {
     pub(crate) terms: Vec<usize>,
     /// Candidate orders of each term, descending.
     pub(crate) axes: Vec<Vec<f64>>,
-    /// Pairs of orders that are allowed. The set `allowed[b][a][i]` contains the orders of term b that are allowed with order
-    /// number i of term a, a < b.
+    /// Pairs of orders that are allowed. The set `allowed[b][a][i]` contains the orders of term b that are allowed with
+    /// order number i of term a, a < b.
     allowed: Vec<Vec<Vec<Bits>>>,
 }
 

@@ -2,8 +2,8 @@
 //!
 //! With the measured sign of the velocity, the equation is linear. While the body sticks, the measured sign is noise.
 //! The resulting bias is acceptable for an initial guess. Further guesses combine a linear fit without friction with
-//! several assumed friction forces. If no guess leads to the noise level, the structure without friction is optimized in
-//! full, and its optima are additional initial guesses. Stribeck friction starts from the best fits with Coulomb
+//! several assumed friction forces. If no guess leads to the noise level, the structure without friction is optimized
+//! in full, and its optima are additional initial guesses. Stribeck friction starts from the best fits with Coulomb
 //! friction.
 
 use std::collections::BTreeMap;

@@ -186,10 +186,11 @@ pub(in crate::estimation::joint_fit) fn split_unfinished(
     candidates.into_iter().partition(continues)
 }
 
-/// Split candidates into those that can reach the least cost among them within `evaluations` evaluations, and the others.
+/// Split candidates into those that can reach the least cost among them within `evaluations` evaluations, and the
+/// others.
 ///
-/// A cost is extrapolated at its mean decrease per evaluation in the last optimization of the candidate. Optimizations on
-/// a plateau above the best candidate thus end. A candidate with one evaluation has no such rate and continues.
+/// A cost is extrapolated at its mean decrease per evaluation in the last optimization of the candidate. Optimizations
+/// on a plateau above the best candidate thus end. A candidate with one evaluation has no such rate and continues.
 pub(super) fn split_by_prospect(candidates: Vec<Candidate>, evaluations: usize) -> (Vec<Candidate>, Vec<Candidate>) {
     let least = candidates.iter().map(|candidate| candidate.result.cost).fold(f64::INFINITY, f64::min);
     #[allow(clippy::cast_precision_loss)]
