@@ -292,6 +292,11 @@ def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
     return tuple(f.text for f in findings)
 
 
+def on_validation(findings: Iterable[Finding], run: str) -> list[Finding]:
+    """Return copies of findings that are marked as findings on the validation run named `run`."""
+    return [msgspec.structs.replace(f, run=f.run or run, role=VALIDATION_ROLE) for f in findings]
+
+
 def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings in their sequence, without repetitions."""
     selection: list[Finding] = []

@@ -467,7 +467,7 @@ def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
     """Scores of one seed of a plant whose true structure a single standard error refused for one with three more."""
 
     def trial(*scores, bic=0.0):
-        return Trial("", ftlm.equation("D y = a y + b u"), 1, scores=scores, bic=bic)
+        return Trial("", ftlm.equation("D y = a y + b u"), 1, scores=scores, effective_bic=bic)
 
     best = trial(-3.7766, -4.4820, -4.7931, -4.8312)
     assert _predicts_equally(trial(-3.7169, -4.4811, -4.7930, -4.8305), best)
@@ -495,7 +495,7 @@ def stretches(name, fits, numbers=3):
         name,
         ftlm.equation("D y = a y + b u"),
         numbers,
-        bic=0.0,
+        effective_bic=0.0,
         validation={f"run {k}": {"y": fit} for k, fit in enumerate(fits)},
         scores=tuple(math.log(1 - max(fit, -100.0) / 100) for fit in fits),
     )

@@ -133,6 +133,7 @@ def file(item: File) -> str:
         dates=DATE_ORDERS,
         time_units=list(TIME_UNITS),
         asked=item.user_options,
+        converted={unit: si for unit, (si, factor) in SIGNAL_UNITS.items() if factor != 1.0},
     )
 
 

@@ -132,6 +132,17 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
     return {signal: SIGNAL_UNITS[str(units_by_signal.get(signal, ""))] for signal in signals}
 
 
+def conversion_notes(units: Mapping[str, str]) -> tuple[str, ...]:
+    """Return a note for the run on the signals of a file that are converted to SI units; () without such a signal.
+
+    `units` has the unit of the file by signal. Results have no other units than SI, because numbers, limits and
+    functions such as sin(y) in a structure are in SI units.
+    """
+    pairs = {name: (unit, SIGNAL_UNITS[unit]) for name, unit in units.items() if unit in SIGNAL_UNITS}
+    converted = [f"{name} from {unit} to {si}" for name, (unit, (si, factor)) in pairs.items() if factor != 1.0]
+    return (f"converted to SI units: {', '.join(converted)}",) if converted else ()
+
+
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
     """Return the unit of the coefficient of D^order signal in the equation of D^alpha output, such as ``s^-1.8 rad/A``.
 

@@ -16,7 +16,7 @@ from ftlm.data.construction import RunArguments
 from ftlm.data.export import Header
 from ftlm.data.run import Run
 from ftlm.data.sampling import MissingPolicy, check_missing_policy, check_step_agrees
-from ftlm.data.units import TIME_UNITS, split_time_header, time_unit_of
+from ftlm.data.units import TIME_UNITS, conversion_notes, split_time_header, time_unit_of
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.column_roles import ColumnSelection, add_file_units, assume_roles, has_numbers
@@ -225,7 +225,7 @@ def run_from_tables(
     facts = tuple(
         f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
     )
-    facts += (*map(str, roles), *clock.notes)
+    facts += (*map(str, roles), *clock.notes, *conversion_notes(selection.units))
     arguments = RunArguments(
         given_inputs,
         given_outputs,

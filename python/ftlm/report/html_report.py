@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from markupsafe import Markup
 
@@ -27,10 +26,10 @@ from ftlm.estimation.verdict import Verdict, saved_verdict, verdict, verdict_htm
 from ftlm.findings import (
     LEVEL_NOTE,
     MAX_SUMMARY_FINDINGS,
-    VALIDATION_ROLE,
     Finding,
     group_findings,
     make_finding,
+    on_validation,
     texts,
     unique,
 )
@@ -99,11 +98,6 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
         first.append(Markup("{}{}{}").format(group.first_finding.text, group.count, todo))
         rest += texts(group.findings[1:])
     return first, rest
-
-
-def _on_validation(findings: Iterable[Finding], run: Run) -> list[Finding]:
-    """Return copies of findings that are marked as findings on the validation run `run`."""
-    return [msgspec.structs.replace(f, run=f.run or run.name, role=VALIDATION_ROLE) for f in findings]
 
 
 def title_of(model: Model) -> str:
@@ -222,6 +216,7 @@ def identification_page(
     validation: Run | Sequence[Run] | None = None,
     force: bool = False,
     sections: Sequence[Section] = (),
+    choice_findings: Sequence[Finding] = (),
     validated: Comparison | None = None,
 ) -> Path:
     """Write the HTML report of one identification.
@@ -234,6 +229,8 @@ def identification_page(
         See :meth:`ftlm.Identification.report`.
     sections
         Sections on the structure selection, which follow the warnings.
+    choice_findings
+        Findings on the structure selection, which precede those of the result.
     validated
         Comparison with validation runs, used if `validation` is None because the runs are not available.
 
@@ -246,12 +243,12 @@ def identification_page(
     model = result.model
     others = [] if validation is None else as_runs(validation)
     comparisons = [validate(result, run) for run in others] or ([] if validated is None else [validated])
-    findings = list(result.findings)
+    findings = [*choice_findings, *result.findings]
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
         findings.append(make_finding("errors_undefined", parameter=", ".join(undefined)))
     for run, comparison in zip(others, comparisons, strict=False):
-        findings += _on_validation([*comparison.findings, *data_notes(run)], run)
+        findings += on_validation([*comparison.findings, *data_notes(run)], run.name)
     compared = [("estimation", result.comparison), *(("validation", c) for c in comparisons)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
@@ -330,7 +327,8 @@ def first_sections(
     ]
     if not validated:
         words.append("No validation run was given, so the prediction of other data is unknown.")
-    warned = unique(findings)
+    every = unique(findings)
+    warned, notes = ([f for f in every if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
     findings_shown, rest = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
@@ -353,7 +351,7 @@ def first_sections(
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint, offsets)]),
-        Section("Warnings", words[1:] if warned else words, findings_shown, more=rest),
+        Section("Warnings", [*words[bool(warned) :], *(f"{note}." for note in texts(notes))], findings_shown, more=rest),
     ]
     if figures := behavior_figures(model):
         tables = behavior_tables(model)
@@ -680,7 +678,7 @@ def model_page(
                 {n: f for n, f in estimate.fit.items() if f is not None}, comparison
             )
             findings_there += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
-        findings += _on_validation(findings_there, run)
+        findings += on_validation(findings_there, run.name)
     compared = [("validation", comparison) for comparison in validated]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(others), None, others, bands)

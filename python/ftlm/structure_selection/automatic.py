@@ -20,8 +20,8 @@ from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import (
     Trial,
+    fit_criterion,
     residual_variance_inflation,
-    schwarz_criterion,
 )
 from ftlm.structure_selection.stepwise import CandidateEvaluator
 from ftlm.validation.feedback import feedback_test
@@ -184,7 +184,7 @@ class FittedForm:
 def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
     """Return fits sorted by BIC, best first; BIC uses the smallest variance inflation among them."""
     inflation = min((f.variance_inflation for f in fits), default=1.0)
-    return sorted((replace(f, bic=schwarz_criterion(f.joint, inflation)) for f in fits), key=lambda f: f.bic)
+    return sorted((replace(f, bic=fit_criterion(f.joint, inflation)) for f in fits), key=lambda f: f.bic)
 
 
 @dataclass

@@ -26,6 +26,7 @@ from ftlm.utils.linalg import vector_norm
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import variance_inflation, white_noise
 from ftlm.validation.comparison import compare
+from ftlm.validation.information_criteria import normal_log_likelihood, schwarz_criterion
 
 #: Number of blocks of a run, and minimum number of samples of a block.
 BLOCKS_PER_RUN = 4
@@ -267,8 +268,10 @@ class Trial:
     scores
         ln(1 - fit / 100) of each output of each run or block; lower is better.
     bic
-        Schwarz's criterion of the residual sum of squares, with an effective number of samples for correlated
-        residuals. None until the autocorrelation of the best candidate's residuals is known.
+        Schwarz's criterion, as in :class:`ftlm.InformationCriteria`; None without a fit.
+    effective_bic
+        Schwarz's criterion with an effective number of samples for correlated residuals, which decides. None until the
+        autocorrelation of the best candidate's residuals is known.
     values, errors
         Estimates and standard errors from all runs, by name.
     insignificant
@@ -290,6 +293,7 @@ class Trial:
     validation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     scores: tuple[float, ...] = ()
     bic: float | None = None
+    effective_bic: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     insignificant: tuple[str, ...] = ()
@@ -519,14 +523,14 @@ def residual_variance_inflation(joint: JointFit) -> float:
     return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 
 
-def schwarz_criterion(joint: JointFit, inflation: float) -> float:
-    """Return the Schwarz criterion (BIC) of a fit; doi:10.1214/aos/1176344136.
+def fit_criterion(joint: JointFit, inflation: float = 1.0) -> float:
+    """Return the Schwarz criterion (BIC) of a fit, as :func:`ftlm.information_criteria` does from its residuals.
 
     The number of samples is divided by `inflation`, the variance inflation of correlated residuals. Initial terms and
     offsets count as parameters, because the initial term of a canceled pole and zero can model a level.
     """
-    samples = joint.samples / inflation
-    each = samples / max(len(joint.noise), 1)
-    return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + (
-        len(joint.names) + joint.initial_terms
-    ) * math.log(samples)
+    counts = {o: sum(drop_missing(part[o]).size for part in joint.residuals) for o in joint.noise}
+    # The floor keeps differences between candidates finite.
+    noise = [(counts[o] / inflation, max(v, 1e-300)) for o, v in joint.noise.items()]
+    parameters = len(joint.names) + joint.initial_terms + len(joint.noise)
+    return schwarz_criterion(normal_log_likelihood(noise), parameters, sum(counts.values()) / inflation)

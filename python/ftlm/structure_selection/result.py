@@ -10,7 +10,7 @@ from typing import Any
 
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation, Verdict
-from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, texts
+from ftlm.findings import Finding, texts
 from ftlm.model.best_identification import BestIdentification
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
@@ -47,7 +47,7 @@ class Selection(BestIdentification):
     fitted
         Total number of fitted candidates, of which only the most promising ones of each step are validated.
     findings
-        Findings on the choice.
+        Findings on the choice, and on separate validation runs.
     validated
         Comparison of the chosen model with separate validation runs; None if runs or blocks were left out in turn.
     """
@@ -166,19 +166,21 @@ class Selection(BestIdentification):
 
     def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
         """Write the choice and the model to an HTML file, as :meth:`ftlm.Identification.report` does."""
-        doubts = [f for f in self.findings if f.level in (LEVEL_WITH_CARE, LEVEL_DO_NOT_USE)]
-        facts = [f"{text}." for text in texts(f for f in self.findings if f not in doubts)]
         counts = f"Validation data: {self.validation}. {self.fitted} candidates fitted."
         choice = Section(
             "The choice",
-            paragraphs=[self.reason, *facts, counts],
-            warnings=list(texts(doubts)),
+            paragraphs=[self.reason, counts],
             tables=[self.table()],
             # Fits of different outputs are not compared.
             figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
         )
         return self.best._write_page(
-            path, sections=[choice], validation=validation, validated=self.validated, force=force
+            path,
+            sections=[choice],
+            choice_findings=self.findings,
+            validation=validation,
+            validated=self.validated,
+            force=force,
         )
 
     def to_frame(self) -> Any:

@@ -18,7 +18,7 @@ from ftlm.estimation.identify import identify, identify_pieces
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import least_squares_piece_test
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
-from ftlm.findings import Finding, make_finding
+from ftlm.findings import Finding, make_finding, on_validation
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import has_memory
 from ftlm.structure.parser import as_structure
@@ -32,7 +32,7 @@ from ftlm.structure_selection.automatic import (
 )
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
-from ftlm.structure_selection.cross_validation import Folds, Trial, residual_variance_inflation, schwarz_criterion
+from ftlm.structure_selection.cross_validation import Folds, Trial, fit_criterion, residual_variance_inflation
 from ftlm.structure_selection.result import Selection, format_fit
 from ftlm.structure_selection.stepwise import (
     MAX_SCORE_TOLERANCE,
@@ -416,7 +416,9 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     for part in choice.parts or (choice,):
         findings += _fractional_order_findings(part.winner, part.ranked, result)
-    validation_data = folds.unseen_runs
+    validated = result.validate(folds.unseen_runs) if folds.unseen_runs else None
+    if validated is not None:
+        findings += on_validation(validated.findings, ", ".join(run.name for run in folds.unseen_runs))
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),
@@ -425,19 +427,22 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         choice.reason,
         work.done_count,
         tuple(findings),
-        None if not validation_data else result.validate(validation_data),
+        validated,
     )
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with their Schwarz criteria (BIC).
+    """Return ranked trials with their Schwarz criteria (BIC), for all samples and for the effective ones.
 
     The effective number of samples follows from the autocorrelation of the residuals of the best trial. The trial with
     the whitest residuals is not suitable for this purpose, because a model of high order can fit drifts and
     disturbances and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
-    return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, inflation)) for t in ranked]
+    return [
+        t if t.joint is None else replace(t, bic=fit_criterion(t.joint), effective_bic=fit_criterion(t.joint, inflation))
+        for t in ranked
+    ]
 
 
 def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: Identification) -> list[Finding]:
@@ -578,7 +583,7 @@ def _total_integer_order(trial: Trial) -> int:
 
 
 def _bic(trial: Trial) -> float:
-    return math.inf if trial.bic is None else trial.bic
+    return math.inf if trial.effective_bic is None else trial.effective_bic
 
 
 def _with_validated_initial_conditions(trial: Trial) -> Structure:

@@ -27,8 +27,8 @@ from ftlm.structure_selection.cross_validation import (
     fit,
     fix_initial_conditions,
     parameter_count,
+    fit_criterion,
     residual_variance_inflation,
-    schwarz_criterion,
     update_trial,
     validate_fit,
     validation_score_bound,
@@ -468,7 +468,7 @@ class StepwiseSelection:
         if not fits:
             return []
         inflation = min(residual_variance_inflation(j) for _, j in fits)
-        every = [FittedVariant(c, j, schwarz_criterion(j, inflation)) for c, j in fits]
+        every = [FittedVariant(c, j, fit_criterion(j, inflation)) for c, j in fits]
         return sorted(every, key=lambda f: f.bic)
 
     def _eliminate_backward(self, best: Trial, at: FittedVariant) -> None:

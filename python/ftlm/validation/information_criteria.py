@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ftlm.data.sampling import drop_missing
@@ -80,12 +81,18 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = count + tests.initial_terms + len(tests.outputs)
-    likelihood = 0.0
-    for name, output in tests.outputs.items():
-        # A residual of exactly 0 has an infinite likelihood.
-        level = 2 * math.log(output.rms) if 0 < output.rms < math.inf else math.copysign(math.inf, output.rms - 1)
-        likelihood -= 0.5 * counts[name] * (math.log(2 * math.pi) + 1 + level)
+    likelihood = normal_log_likelihood([(counts[name], output.rms) for name, output in tests.outputs.items()])
     return criteria_of_likelihood(likelihood, k, samples)
+
+
+def normal_log_likelihood(noise: Iterable[tuple[float, float]]) -> float:
+    """Return the log likelihood of residuals as white normal noise, from (number, root mean square) of each output."""
+    likelihood = 0.0
+    for count, rms in noise:
+        # A residual of exactly 0 has an infinite likelihood.
+        level = 2 * math.log(rms) if 0 < rms < math.inf else math.copysign(math.inf, rms - 1)
+        likelihood -= 0.5 * count * (math.log(2 * math.pi) + 1 + level)
+    return likelihood
 
 
 def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int) -> InformationCriteria:
@@ -94,7 +101,12 @@ def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int)
     aic = 2 * k - 2 * log_likelihood
     degrees_of_freedom = samples - k - 1
     aicc = aic + 2 * k * (k + 1) / degrees_of_freedom if degrees_of_freedom > 0 else math.inf
-    return InformationCriteria(k, samples, log_likelihood, aic, aicc, k * math.log(samples) - 2 * log_likelihood)
+    return InformationCriteria(k, samples, log_likelihood, aic, aicc, schwarz_criterion(log_likelihood, k, samples))
+
+
+def schwarz_criterion(log_likelihood: float, parameters: int, samples: float) -> float:
+    """Return Schwarz's criterion (BIC) of a log likelihood; doi:10.1214/aos/1176344136."""
+    return parameters * math.log(samples) - 2 * log_likelihood
 
 
 def information_table(information: InformationCriteria) -> Table:
