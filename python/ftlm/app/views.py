@@ -24,7 +24,7 @@ from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import read_resource, style_sheet, templates
 from ftlm.svg.line_chart import chart_css
-from ftlm.utils.formatting import finite
+from ftlm.utils.formatting import finite, typeset
 
 #: Label of the form field for each Python argument.
 _FIELD_LABELS = {
@@ -212,11 +212,13 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
             for output, own in result.output_error.items()
         ],
         "runs": [fitted_model.run.name, None if fitted_model.other is None else fitted_model.other.name],
-        "warnings": [str(Markup("{}").format(w)) for w in warnings],
-        "more": [str(Markup("{}").format(w)) for w in rest],
+        "warnings": [str(typeset(w)) for w in warnings],
+        "more": [str(typeset(w)) for w in rest],
         "figures": figure_markup(figures),
         "tables": [str(t.to_html()) for t in tables],
-        "choice": None if choice is None else {"reason": choice.reason, "table": str(choice.table().to_html())},
+        "choice": None
+        if choice is None
+        else {"reason": str(typeset(choice.reason)), "tables": [str(t.to_html()) for t in choice.tables()]},
         "script": fitted_model.script,
     }
 
@@ -224,7 +226,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
 def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
     """Return the title, caption, and SVG markup (wide and narrow) of each of the first `MAX_FIGURES` figures."""
     return [
-        {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.note}
+        {"title": str(typeset(f.title)), "wide": str(f.svg), "narrow": str(f.narrow), "caption": str(typeset(f.note))}
         for f in figures[:MAX_FIGURES]
     ]
 

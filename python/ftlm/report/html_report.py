@@ -55,7 +55,7 @@ from ftlm.svg.figure import MAX_LINE_POINTS, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html
+from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html, typeset
 from ftlm.validation.comparison import (
     Comparison,
     errors_table,
@@ -74,11 +74,11 @@ _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"
 
 def verdict_box(judgement: Verdict, of: str = "") -> Markup:
     """Return a verdict as an HTML box for the top of a page; the prefix `of` names one of several models."""
-    remedy = Markup(' <span class="todo">→ {}</span>').format(judgement.remedy) if judgement.remedy else ""
+    remedy = Markup(' <span class="todo">→ {}</span>').format(typeset(judgement.remedy)) if judgement.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LEVEL_CSS_CLASSES[judgement.level],
         f"{of}{judgement.level}" if of else judgement.level.capitalize(),
-        judgement.reason,
+        typeset(judgement.reason),
         remedy,
     )
 
@@ -94,8 +94,8 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
         if k >= MAX_SUMMARY_FINDINGS:
             rest += texts(group.findings)
             continue
-        todo = Markup(' <span class="todo">→ {}</span>').format(group.remedy) if group.remedy else Markup("")
-        first.append(Markup("{}{}{}").format(group.first_finding.text, group.count, todo))
+        todo = Markup(' <span class="todo">→ {}</span>').format(typeset(group.remedy)) if group.remedy else Markup("")
+        first.append(Markup("{}{}{}").format(typeset(group.first_finding.text), group.count, todo))
         rest += texts(group.findings[1:])
     return first, rest
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
@@ -155,6 +154,8 @@ def _operator_math(order: Order) -> Markup:
     """Return the differential operator D of an order as MathML; empty for order 0."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return Markup("")
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 1:
+        return Markup("<mi>D</mi>")
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed_math(order.constant)
     return Markup("<msup><mi>D</mi>{}</msup>").format(value)
 
@@ -216,7 +217,8 @@ def derivative_html(order: Order, signal: str) -> Markup:
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
-    return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
+    operator = Markup("D") if text == "1" else Markup("D<sup>{}</sup>").format(text)
+    return Markup("{} {}").format(operator, symbol_html(signal))
 
 
 def parameter_table(
@@ -255,7 +257,7 @@ def parameter_table(
         ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
         if name in profiles:
             ends = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
-        return [symbol_html(name), value, error, *ends, reference_value, unit_html(units.get(name, "")), place]
+        return [symbol_html(name), value, error, *ends, reference_value, units.get(name, ""), place]
 
     rows = [row(n, v if has_errors else Exact(v), None, "free order") for n, v in model.orders.items()]
     names = set(model.orders)
@@ -299,7 +301,7 @@ def parameter_table(
         has_error = not math.isnan(p.standard_error)
         cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
         kind = OFFSET_PLACES[name.partition("_")[0]]
-        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), f"{kind}, for this run only"])
+        rows.append([symbol_html(name), p.value, *cells, None, p.unit, f"{kind}, for this run only"])
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if has_errors:
         note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."
@@ -316,16 +318,6 @@ def parameter_table(
     return Table(
         "Orders and coefficients", tuple(columns[i] for i in columns_kept), shown_rows, groups=groups, note=note
     )
-
-
-def unit_html(unit: str) -> Markup:
-    """Return a unit as HTML, with exponents as superscripts."""
-    parts = re.split(r"\^(-?[\d.]+)", unit)
-    raised = (
-        Markup("<sup>{}</sup>").format(p.replace("-", "−")) if k % 2 else Markup("{}").format(p)
-        for k, p in enumerate(parts)
-    )
-    return Markup("").join(raised)
 
 
 def model_html(model: Model) -> str:

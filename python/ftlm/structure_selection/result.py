@@ -19,7 +19,7 @@ from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.html_page import Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, attributes, json_value
+from ftlm.utils.formatting import Cell, Exact, attributes, json_value
 
 #: Maximum number of printed rows, and lower limit of printed fits [%].
 MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0
@@ -101,46 +101,38 @@ class Selection(BestIdentification):
         """Structure that was chosen, with the initial conditions of its validation."""
         return self.winner.structure if self.best.task is None else self.best.task.structure
 
-    def _rows(self) -> list[list[Cell]]:
-        out: list[list[Cell]] = []
-        for place, trial in enumerate(self.trials):
-            mark = "chosen: " if place == self.chosen else ""
-            if trial.failed is not None:
-                out.append([f"{trial.name}: {trial.failed}", trial.parameters, None, None, None, None, ""])
-                continue
-            name = mark + trial.name + (UNSTABLE_NOTE if trial.unstable else "")
-            out.append(
-                [
-                    name,
-                    trial.parameters,
-                    trial.estimation_fit,
-                    trial.validation_fit,
-                    trial.worst_fold,
-                    trial.bic,
-                    ", ".join(trial.insignificant),
-                ]
-            )
-        return out
-
-    def table(self) -> Table:
-        """Return a table of the candidates, for an HTML page."""
-        columns = (
-            "structure",
-            "parameters",
-            "estimation fit %",
-            "validation fit %",
-            "worst fold %",
-            "BIC",
-            "insignificant",
-        )
-        return Table(
+    def tables(self) -> list[Table]:
+        """Return a table of the candidates for an HTML page, and one of candidates without a fit if there are any."""
+        least = min((t.effective_bic for t in self.trials if t.effective_bic is not None), default=0.0)
+        rows: list[list[Cell]] = [
+            [
+                ("chosen: " if trial is self.winner else "") + trial.name + (UNSTABLE_NOTE if trial.unstable else ""),
+                trial.parameters,
+                trial.estimation_fit,
+                trial.validation_fit,
+                trial.worst_fold,
+                None if trial.bic is None else Exact(round(trial.bic, 1)),
+                None if trial.effective_bic is None else Exact(round(trial.effective_bic - least, 1)),
+                ", ".join(trial.insignificant),
+            ]
+            for trial in self.trials
+            if trial.failed is None
+        ]
+        columns = ("structure", "param.", "estimation", "validation", "worst fold", "all", "effective", "insignificant")
+        candidates = Table(
             "Candidates, best prediction first",
             columns,
-            self._rows(),
+            rows,
+            groups=(("", 2), ("fit %", 3), ("BIC, samples", 2), ("", 1)),
             wrap=True,
-            note="Fits are means over runs and outputs; the worst fold is the worst run or block left out. BIC "
-            "counts effective samples, from the autocorrelation of the best residuals.",
+            note="Fits are means over runs and outputs; the worst fold is the worst run or block left out. BIC of all "
+            "samples is that of the residuals. The choice uses BIC of effective samples, from the autocorrelation of "
+            "the best residuals; the table has its excess over the lowest.",
         )
+        failed: list[list[Cell]] = [[t.name, t.failed] for t in self.trials if t.failed is not None]
+        if not failed:
+            return [candidates]
+        return [candidates, Table("Candidates without a fit", ("structure", "reason"), failed, wrap=True, stacked=True)]
 
     def figure(self) -> LineChart:
         """Return a chart of the best fit over the number of parameters."""
@@ -170,7 +162,7 @@ class Selection(BestIdentification):
         choice = Section(
             "The choice",
             paragraphs=[self.reason, counts],
-            tables=[self.table()],
+            tables=self.tables(),
             # Fits of different outputs are not compared.
             figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
         )

@@ -182,7 +182,11 @@ function slider(svg, charts) {
     parts.unshift([told.name, words(time(k), told.unit)]);
     said.replaceChildren(...parts.map(([what, text]) => {
       const part = document.createElement("span"), strong = document.createElement("b");
-      strong.textContent = text;
+      text.split(/\^(-?[\w.]+)/).forEach((piece, i) => {
+        const raised = document.createElement(i % 2 ? "sup" : "span");
+        raised.textContent = piece.replace("-", "\u2212");
+        strong.append(raised);
+      });
       part.append(`${what} `, strong);
       return part;
     }));

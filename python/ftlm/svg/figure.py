@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, truncate_text
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, split_exponents, truncate_text, typeset
 from ftlm.utils.validation import Floats, as_floats
 
 #: Width of the drawing for narrow screens, in which text has the same size as in the wide drawing.
@@ -57,7 +57,8 @@ class Figure(ABC):
         return self.caption
 
     def _repr_html_(self) -> str:
-        return str(Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.note))
+        words = typeset(self.title), typeset(self.note)
+        return str(Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, *words))
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,16 @@ def svg(
 
 
 def svg_text(x: float, y: float, text: str, anchor: str, **attributes: str) -> Markup:
-    """Return text as SVG markup; `anchor` is the part of the text ("start", "middle", "end") at the point (x, y)."""
-    return element("text", [text], x=float(x), y=float(y), text_anchor=anchor, **attributes)
+    """Return text as SVG markup; `anchor` is the part of the text ("start", "middle", "end") at the point (x, y).
+
+    Exponents such as that of ``s^-0.9`` are superscripts.
+    """
+    parts: list[str] = []
+    for k, part in enumerate(split_exponents(text)):
+        # The attribute baseline-shift is not known to all browsers; the text after a superscript moves down again.
+        shifts = {"dy": "-5", "font_size": "9"} if k % 2 else {"dy": "5"} if k else None
+        parts += [part if shifts is None else element("tspan", [part], **shifts)] if part else []
+    return element("text", parts, x=float(x), y=float(y), text_anchor=anchor, **attributes)
 
 
 def text_group(texts: Iterable[Markup]) -> Markup:

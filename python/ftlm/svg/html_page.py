@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from ftlm._core import __version__
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.files import check_ending, write_atomically
-from ftlm.utils.formatting import Cell, number
+from ftlm.utils.formatting import Cell, number, typeset
 
 #: Minimum number of columns of a table that is set in small type. A table of the paper has fifteen columns, which must
 #: fit a laptop screen.
@@ -37,7 +37,7 @@ def cell_html(value: Cell) -> Markup:
     if value is None:
         return Markup(NOT_IN_MODEL)
     if isinstance(value, str):
-        return escape(value)
+        return typeset(value)
     return Markup('<data value="{}">{}</data>').format(repr(float(value)), number(value))
 
 
@@ -52,7 +52,7 @@ class Table:
     columns
         Column headers. The first column has the names of the rows.
     rows
-        Cells of each row: text (escaped unless it is ``Markup``), numbers (shown with five significant digits, stored
+        Cells of each row: text (escaped, with exponents as superscripts, unless it is ``Markup``), numbers (shown with five significant digits, stored
         in full), or None for values that a model does not have.
     groups
         (text, number of columns) of each header over a group of columns, from left to right. Empty text gives no
@@ -129,7 +129,7 @@ class Section:
     heading
         Heading of the section.
     paragraphs
-        Paragraphs of text, escaped unless they are ``Markup``.
+        Paragraphs of text, typeset as cells of a table.
     warnings
         Warnings that are shown in a box at the top.
     tables, figures
@@ -168,7 +168,7 @@ class Section:
 def templates(package: str) -> Environment:
     """Return the Jinja environment with the HTML templates of a package.
 
-    Inserted text is escaped unless it is ``Markup``.
+    Inserted text is escaped unless it is ``Markup``. The filter ``typeset`` also turns exponents into superscripts.
     """
     environment = Environment(
         autoescape=True,
@@ -177,7 +177,7 @@ def templates(package: str) -> Environment:
         lstrip_blocks=True,
         loader=FunctionLoader(lambda name: read_resource(name, package)),
     )
-    environment.filters |= {"cell": cell_html, "number": number}
+    environment.filters |= {"cell": cell_html, "number": number, "typeset": typeset}
     return environment
 
 

@@ -54,6 +54,25 @@ def symbol_html(name: str) -> Markup:
     return stem + Markup("<sub>{}</sub>").format(match[2]) if match[2] else stem
 
 
+#: A derivative of order 1, whose order is not shown; and an exponent: an expression in parentheses, a number or a name.
+_FIRST_DERIVATIVE_PATTERN = re.compile(r"\bD\^1(?![\w.])")
+_EXPONENT_PATTERN = re.compile(r"\^(?:\(([^()]*)\)|(-?\d+(?:\.\d+)?|-?[^\W\d]\w*))")
+
+
+def split_exponents(text: str) -> list[str]:
+    """Return the parts of a text such as ``D^1.5 y``: text and exponents in turn, and D for ``D^1``."""
+    parts = [part for part in _EXPONENT_PATTERN.split(_FIRST_DERIVATIVE_PATTERN.sub("D", text)) if part is not None]
+    return [symbol(part).replace("-", "−") if k % 2 else part for k, part in enumerate(parts)]
+
+
+def typeset(text: str) -> Markup:
+    """Return a text as HTML with exponents such as that of ``s^-0.9`` as superscripts; markup is returned unchanged."""
+    if isinstance(text, Markup):
+        return text
+    parts = split_exponents(text)
+    return Markup("").join(Markup("<sup>{}</sup>" if k % 2 else "{}").format(part) for k, part in enumerate(parts))
+
+
 class Exact(float):
     """Number that is not an estimate, such as an order on a grid, and is printed with up to ten digits."""
 
