@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 import friction
 import ftlm
 from ftlm.cli.main import app
+from ftlm.utils.formatting import typeset
 
 
 def record(
@@ -353,3 +355,28 @@ def test_the_fit_of_a_candidate_is_that_of_its_optimum(seed):
     assert len(fits) >= 3
     for estimation, expected in fits:
         assert estimation == pytest.approx(expected, abs=0.2)
+
+
+def test_the_report_of_an_automatic_structure_has_the_choice(tmp_path):
+    for seed, name in ((1, "one"), (2, "two")):
+        run, _ = record([12.0, 40.0], [1.0, 3.0, 40.0], seed=seed, hold=20)
+        table = np.column_stack([run.time, run["u"], run["y"]])
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header="t,u,y", comments="")
+    words = ["identify", str(tmp_path / "one.csv"), "-u", "u", "-y", "y", "--structure", "auto"]
+    page_file = str(tmp_path / "page.html")
+    done = CliRunner().invoke(app, [*words, "--validation", str(tmp_path / "two.csv"), "--report", page_file, "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)["selection"]
+    page = (tmp_path / "page.html").read_text("utf-8")
+    heads = ["Equations</h2>", "Warnings</h2>", "The choice</h2>", "Residuals</h2>"]
+    places = [page.index(head) for head in heads]
+    assert places == sorted(places)
+    part = page[places[2] : places[3]]
+    assert typeset(found["reason"]) in part
+    assert f"{found['fitted']} candidates fitted." in part
+    assert f"chosen: {typeset(found['chosen'])}</th>" in part
+    for candidate in found["candidates"]:
+        row = part[part.index(f"{typeset(candidate['structure'])}") :]
+        assert candidate["failed"] or f'<data value="{candidate["parameters"]}.0">' in row
+    assert "Fit by number of parameters" in part
+    assert all(typeset(text) in page for text in found["warnings"])

@@ -1,6 +1,5 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
-import html
 import json
 import math
 import threading
@@ -36,7 +35,7 @@ from ftlm.structure_selection.stepwise import (
     format_duration,
     prescreen,
 )
-from ftlm.utils.formatting import number
+from ftlm.utils.formatting import Exact, number, typeset
 from ftlm.utils.resources import stop_flag
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
@@ -566,6 +565,11 @@ def test_the_page_and_the_figures(chosen, tmp_path):
         if not parameter.fixed:
             assert number(parameter.standard_error) in page, name
     part = page[page.index("The choice</h2>") : page.index("Residuals</h2>")]
+    # The report has the findings of the terminal and of Python.
+    assert chosen.findings
+    warnings = page[page.index("Warnings</h2>") : page.index("The choice</h2>")]
+    assert all(typeset(f.text) in warnings and f.text in str(chosen) for f in chosen.findings)
+    assert "No check raised a warning" not in page
     # One model has one criterion: that of the residuals.
     assert chosen.winner.bic == pytest.approx(chosen.best.information.bic, rel=1e-9)
     bic = number(Exact(round(chosen.best.information.bic, 1)))
