@@ -63,10 +63,14 @@ class Topic:
     has_rule: bool = False
 
 
-#: (text for Python, text for the command line) by name, for templates.
+#: (text for Python, text for the command line, text for a page) by name, for templates.
 INTERFACE_TEXTS = {
-    "validate": ("validate(run)", "--validation FILE"),
-    "validate response": ("validate(load_frequency(file))", "--validation FILE"),
+    "validate": ("validate(run)", "--validation FILE", "validate the model on another run"),
+    "validate response": (
+        "validate(load_frequency(file))",
+        "--validation FILE",
+        "validate the model on another measured response",
+    ),
 }
 #: Value of `FindingKind.reason` if the whole sentence of the finding is the reason of the verdict.
 SAME_REASON = "{sentence}"
@@ -139,7 +143,7 @@ def finding_catalogue() -> Catalogue:
 class _Reference:
     """Object ``ask`` in templates, which replaces ``{ask[offset]}`` or ``{ask[offset is none]}`` by parameter text.
 
-    The text is that of :func:`ftlm.utils.parameters.parameter`, for Python or for the command line.
+    The text is that of :func:`ftlm.utils.parameters.parameter`.
     """
 
     def __getitem__(self, key: str) -> str:
@@ -148,7 +152,7 @@ class _Reference:
 
 
 class _Choice:
-    """Object ``choose`` in templates, which replaces ``{choose[validate]}`` by text for Python or the command line."""
+    """Object ``choose`` in templates, which replaces ``{choose[validate]}`` by text for the interface."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])

@@ -12,6 +12,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,15 @@ from ftlm.app.web_application import CLIENT_TIMEOUT_S, TimedConnection, WebAppli
 from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.svg.html_page import read_resource
+from ftlm.utils.parameters import (
+    FIELD_BY_PARAMETER,
+    NAMED_COLUMNS,
+    Placeholder,
+    choose_text,
+    layout_parameter,
+    parameter,
+    use_interface,
+)
 from ftlm.utils.resources import python_child
 
 TOKEN, HOST = "0123456789abcdef", "127.0.0.1:8347"
@@ -640,7 +650,7 @@ def test_what_is_asked_wrongly_is_said_in_ftlm_s_words(used, wanted, words):
     else:
         with pytest.raises(ModelError) as error:
             ftlm.equation(wanted["structure"][0])
-        assert error_message(text) == view.page_words(str(error.value))
+        assert error_message(text) == str(error.value)
     assert len(used.desk.models) == 1
 
 
@@ -949,20 +959,29 @@ def test_a_process_that_works_ends_and_the_page_goes_on(page, how):
 
 
 @pytest.mark.parametrize(
-    ("words", "shown"),
+    ("message", "shown"),
     [
-        ("name it with time=COLUMN", "name it with the role “time”"),
-        ("put it on one with resample=STEP", "put it on one with the field “Put on the step”"),
-        ("resample=0.01 leaves 2 rows", "the field “Put on the step” 0.01 leaves 2 rows"),
-        ("hold them with missing='hold'", "hold them with the field “Gaps” hold"),
-        ("say which with layout=dict(sheet=NAME)", "say which with the field “Sheet”"),
-        ("name them with inputs={name: column} and outputs={name: column}", "name them with the roles below"),
-        ("give it, or in a file for columns=; there are", "give it; there are"),
-        ("being zeroed; use window=(1.004, None)", "being zeroed; use the field “From” and “To”"),
+        (lambda: parameter("time", Placeholder("COLUMN")), "the role “time”"),
+        (lambda: parameter("resample", Placeholder("STEP")), "the field “Put on the step”"),
+        (lambda: f"{parameter('resample', 0.01)} leaves 2 rows", "the field “Put on the step” = 0.01 leaves 2 rows"),
+        (lambda: parameter("missing", "hold"), "the field “Gaps” = hold"),
+        (lambda: layout_parameter(sheet=Placeholder("NAME")), "the field “Sheet”"),
+        (lambda: parameter("inputs", NAMED_COLUMNS), "the role “input”"),
+        (lambda: parameter("window", (1.004, None)), "the fields “From” and “To” = 1.004 to none"),
+        (lambda: parameter("reference"), "the option reference of Python"),
+        (lambda: choose_text("validate(run)", "--validation FILE"), "validate(run)"),
     ],
 )
-def test_errors_speak_of_what_the_page_has(words, shown):
-    assert view.page_words(words) == shown
+def test_errors_speak_of_what_the_page_has(message, shown):
+    with use_interface("app"):
+        assert message() == shown
+
+
+def test_the_form_has_the_fields_that_messages_name():
+    forms = (files("ftlm.app") / "file.html.j2").read_text() + (files("ftlm.app") / "page.html.j2").read_text()
+    for place in FIELD_BY_PARAMETER.values():
+        for label in re.findall("“(.*?)”", place):
+            assert label in forms, place
 
 
 def test_progress_is_told_in_shares_and_words():

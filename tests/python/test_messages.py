@@ -6,6 +6,7 @@ import ast
 import inspect
 import itertools
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from ftlm.report.typesetting import equation_html
 from ftlm.structure.equation import format_equation
 from ftlm.utils.parameters import (
     NAMED_COLUMNS,
+    Note,
     Placeholder,
     current_interface,
     layout_fields,
@@ -296,6 +298,25 @@ def test_a_parameter_is_shown_as_who_reads_it_gives_it(message, python, command)
             assert message().endswith(python)
         assert current_interface() == "command line"
     assert current_interface() == "python"
+
+
+def test_a_report_names_no_option_as_it_is_typed(saved, tmp_path):
+    """Who reads a page is at no command line: neither the command that wrote it nor Python gives its words."""
+    path, folder = tmp_path / "page.html", ["--report", tmp_path / "page.html"]
+    done = run_command("identify", saved, "--structure", WORDS, "--method", "least-squares", *folder)
+    assert done.exit_code == 0, done.output
+    page = path.read_text("utf-8")
+    assert "validate the model on another run" in page
+    assert "--validation FILE" in done.output
+    body = re.sub(r"<(style|script)>.*?</\1>", "", page, flags=re.DOTALL)
+    assert re.findall(r"(?<![\w-])--?[a-z][a-z-]+\b|\b\w+='", re.sub(r"<[^<>]*>", " ", body)) == []
+    with use_interface("report"):
+        assert parameter("offset", "auto") == "the option offset = auto"
+        assert parameter("friction", False) == "no option friction"
+        assert parameter("intersample", {"u": "foh"}) == "the option intersample: u = foh"
+    # A note on an assumption has the option that replaces it only where it is typed.
+    note = pickle.loads(pickle.dumps(Note("decimal commas", "--decimal point")))
+    assert (note, note.fact) == ("decimal commas; otherwise --decimal point", "decimal commas")
 
 
 def test_a_command_leaves_the_interface_as_it_was(saved, tmp_path):

@@ -100,8 +100,7 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     sock, note = open_socket(port)
     if note:
         print(f"ftlm: {note}", file=sys.stderr)
-    # Messages name Python parameters, which the page replaces by labels of its form fields.
-    with sock, use_interface("python"), contextlib.suppress(KeyboardInterrupt):
+    with sock, use_interface("app"), contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(sock, paths, browser))
     print("\nftlm app has ended; its files are removed", file=sys.stderr)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -26,44 +25,13 @@ from ftlm.svg.html_page import read_resource, style_sheet, templates
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.formatting import finite, typeset
 
-#: Label of the form field for each Python argument.
-_FIELD_LABELS = {
-    "step": "Step",
-    "resample": "Put on the step",
-    "time_unit": "Unit of time",
-    "missing": "Gaps",
-    "separator": "Between cells",
-    "decimal": "Decimals",
-    "thousands": "Between thousands",
-    "skip": "Lines above the table",
-    "header": "Lines of header",
-    "dates": "Dates",
-    "encoding": "Encoding",
-    "sheet": "Sheet",
-    "window": "From” and “To",
-}
-#: Pattern of a Python argument in a message, with its value or a placeholder in capitals.
-_ARGUMENT_PATTERN = re.compile(
-    r"\b(resample|time_unit|missing|step|time|window)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b|\([^()]*\))?|layout=dict\((\w+)=[^)]*\)"
-)
-_PHRASE_REPLACEMENTS = (
-    (re.compile(r", or in a file for columns="), ""),
-    (re.compile(r"inputs=\{name: column\} and outputs=\{name: column\}"), "the roles below"),
-)
 _VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}
-
-
-def _field_label(match: re.Match[str]) -> str:
-    """Return the label of the form field for an argument that `_ARGUMENT_PATTERN` matched, with its value."""
-    name, value = match[1] or match[4], match[2] or match[3]
-    label = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
-    return f"{label} {value}" if value else label
 
 
 @cache
 def _templates() -> Environment:
     environment = templates("ftlm.app")
-    environment.filters |= {"page_words": page_words, "safe_markup": Markup}
+    environment.filters |= {"safe_markup": Markup}
     return environment
 
 
@@ -81,13 +49,6 @@ def script() -> str:
 def style() -> str:
     """Return the CSS style sheet of the page, which includes that of reports."""
     return f"{style_sheet()}\n{chart_css()}\n{read_resource('app.css', 'ftlm.app')}"
-
-
-def page_words(text: str) -> str:
-    """Return an error message in which Python arguments are replaced by the labels of form fields."""
-    for pattern, words in _PHRASE_REPLACEMENTS:
-        text = pattern.sub(words, text)
-    return _ARGUMENT_PATTERN.sub(_field_label, text)
 
 
 def page(session: Session) -> str:

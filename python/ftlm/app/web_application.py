@@ -157,7 +157,7 @@ class WebApplication:
         await answer(scope, receive, send_secured)
 
     def _words(self, error: FtlmError) -> str:
-        return view.page_words(self._session.without_paths(str(error)))
+        return self._session.without_paths(str(error))
 
     def _check_head(self, scope: Scope) -> str:
         """Check host, origin, token and query of a request, and return its path without the token.

@@ -27,6 +27,7 @@ from ftlm.errors import FtlmError
 from ftlm.io.binary_reader import limit_resources
 from ftlm.io.preview import OpenedFile, open_file
 from ftlm.progress import Progress
+from ftlm.utils.parameters import use_interface
 
 #: Memory limit of the process [bytes], and minimum time between two progress reports.
 MEMORY_LIMIT = 6 << 30
@@ -73,7 +74,8 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     limit_resources(MEMORY_LIMIT)
     try:
-        answer = describe_file(task) if task["do"] == "open" else make_model(task, reports)
+        with use_interface("app"):
+            answer = describe_file(task) if task["do"] == "open" else make_model(task, reports)
     except FtlmError as error:
         reports.send(error=str(error))
     except MemoryError:

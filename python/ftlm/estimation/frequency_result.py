@@ -28,12 +28,12 @@ from ftlm.structure.circuit import Circuit
 from ftlm.structure.order import MAX_IMPROPER_ORDER
 from ftlm.svg.charts import PlaneChart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
-from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.html_page import Page, Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
-from ftlm.utils.parameters import choose_text, parameter
+from ftlm.utils.parameters import choose_text, parameter, use_interface
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 from ftlm.validation.information_criteria import InformationCriteria, information_table
@@ -527,6 +527,12 @@ class FrequencyIdentification:
         DataError
             If the file exists and ``force`` is False, or it cannot be written.
         """
+        with use_interface("report"):
+            page = self._page(validation)
+        return page.write(path, force=force)
+
+    def _page(self, validation: FrequencyValidation | None) -> Page:
+        """Return the content of the report."""
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
 
         first, more = first_findings(self.findings)
@@ -562,12 +568,11 @@ class FrequencyIdentification:
             small=True,
             collapsed=bool(new),
         )
-        return write_page(
-            path,
-            title=f"Impedance of {source}" if isinstance(source, Circuit) else title_of(source),
-            sections=[charts, about, residuals],
-            force=force,
-            verdict=verdict_box(self.verdict if validation is None else validation.verdict),
+        return Page(
+            f"Impedance of {source}" if isinstance(source, Circuit) else title_of(source),
+            [charts, about, residuals],
+            "",
+            verdict_box(self.verdict if validation is None else validation.verdict),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -601,14 +606,14 @@ class FrequencyIdentification:
 
     def _parameter_table(self) -> Table:
         """Return the table of the parameters with their intervals."""
-        from ftlm.report.typesetting import parameter_table, unit_html
+        from ftlm.report.typesetting import parameter_table
 
         if isinstance(self.system, Model):
             return parameter_table(self.system)
         rows: list[list[Cell]] = []
         for p in self.parameters.values():
             numbers = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
-            rows.append([p.name, p.value, *numbers, unit_html(p.unit)])
+            rows.append([p.name, p.value, *numbers, p.unit])
         return Table("Parameters", ("name", "value", "standard error", "95 % from", "to", "unit"), rows)
 
 

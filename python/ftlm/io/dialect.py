@@ -20,7 +20,7 @@ from ftlm.io.cell_parsing import (
     unit_of,
 )
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.parameters import Placeholder, layout_fields, layout_parameter, parameter, type_name
+from ftlm.utils.parameters import Note, Placeholder, layout_fields, layout_parameter, parameter, type_name
 from ftlm.utils.validation import join_names, nearest, whole_number
 
 #: Cell separators by name; None means any white space.
@@ -171,7 +171,12 @@ class Assumption:
     counts: bool = True
 
     def __str__(self) -> str:
-        return f"{self.words}; otherwise {self.otherwise}" if self.otherwise else self.words
+        return str(self.note)
+
+    @property
+    def note(self) -> Note:
+        """Note on the assumption for the run."""
+        return Note(self.words, self.otherwise)
 
 
 def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:

@@ -26,7 +26,7 @@ from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
 from ftlm.io.table import Column, ColumnTable, FileTable, date_order_assumption
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER, nearest_file_hint, read_toml
-from ftlm.utils.parameters import NAMED_COLUMNS, parameter, type_name
+from ftlm.utils.parameters import NAMED_COLUMNS, Note, choose_text, parameter, type_name
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -195,10 +195,12 @@ def run_from_tables(
     if not selection.outputs:
         # A column that contains text does not become a signal by its name.
         words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
+        in_a_file = f", or in a file for {parameter('columns')}"
+        in_a_file = choose_text(in_a_file, in_a_file, "")
         raise DataError(
             "no output is named, and the roles of the columns are not clear from their names; name the signals with "
-            f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
-            f"{parameter('columns')}; {pool.describe()}{words}"
+            f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}{in_a_file}; "
+            f"{pool.describe()}{words}"
         )
     if header is None:
         add_file_units(selection, pool)
@@ -222,10 +224,13 @@ def run_from_tables(
         stem = base_name(tables[0].path)
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
     several = len(tables) > 1
-    facts = tuple(
-        f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
+    facts: tuple[str, ...] = tuple(
+        Note(f"{table.path.name}: {a.words}", a.otherwise) if several else a.note
+        for table in tables
+        for a in table.assumed
+        if a.counts
     )
-    facts += (*map(str, roles), *clock.notes, *conversion_notes(selection.units))
+    facts += (*(a.note for a in roles), *clock.notes, *conversion_notes(selection.units))
     arguments = RunArguments(
         given_inputs,
         given_outputs,

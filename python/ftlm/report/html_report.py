@@ -52,10 +52,11 @@ from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.svg.charts import CorrelationMap
 from ftlm.svg.figure import MAX_LINE_POINTS, Figure
-from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.html_page import Page, Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html, typeset
+from ftlm.utils.parameters import use_interface
 from ftlm.validation.comparison import (
     Comparison,
     errors_table,
@@ -240,9 +241,25 @@ def identification_page(
         The file that was written.
     """
     check_free(path, force=force)
-    model = result.model
     others = [] if validation is None else as_runs(validation)
     comparisons = [validate(result, run) for run in others] or ([] if validated is None else [validated])
+    pooled = validate(result, others) if len(others) > 1 else comparisons[0] if comparisons else None
+    # Findings name options in the words of a page. Errors, above and in writing, are for the caller.
+    with use_interface("report"):
+        page = _identification_content(result, others, comparisons, pooled, sections, choice_findings)
+    return page.write(path, force=force)
+
+
+def _identification_content(
+    result: Identification,
+    others: Sequence[Run],
+    comparisons: Sequence[Comparison],
+    pooled: Comparison | None,
+    sections: Sequence[Section],
+    choice_findings: Sequence[Finding],
+) -> Page:
+    """Return the page of an identification with `comparisons` on validation runs, and with one on all of them."""
+    model = result.model
     findings = [*choice_findings, *result.findings]
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
@@ -252,7 +269,6 @@ def identification_page(
     compared = [("estimation", result.comparison), *(("validation", c) for c in comparisons)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
-    pooled = validate(result, others) if len(others) > 1 else comparisons[0] if comparisons else None
     judgement = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
@@ -269,25 +285,22 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return _write_model_page(path, model, judgement, compared, first, details, force=force)
+    return _content(model, judgement, compared, first, details)
 
 
-def _write_model_page(
-    path: str | os.PathLike[str],
+def _content(
     model: Model,
     judgement: Verdict,
     compared: Sequence[tuple[str, Comparison]],
     sections: Sequence[Section],
     details: Sequence[Section],
-    *,
-    force: bool,
-) -> Path:
-    """Write a page with a verdict, `sections` and collapsed `details`, and return its path.
+) -> Page:
+    """Return a page with a verdict, `sections` and collapsed `details`.
 
     `compared` has (role of the data, comparison) pairs, whose fits are summarized below the title.
     """
-    every, box = [*sections, *(replace(section, collapsed=True) for section in details)], verdict_box(judgement)
-    return write_page(path, title=title_of(model), sections=every, lead=lead_of(compared), force=force, verdict=box)
+    every = [*sections, *(replace(section, collapsed=True) for section in details)]
+    return Page(title_of(model), every, lead_of(compared), verdict_box(judgement))
 
 
 def first_sections(
@@ -330,6 +343,7 @@ def first_sections(
     every = unique(findings)
     warned, notes = ([f for f in every if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
     findings_shown, rest = first_findings(warned)
+    words += [f"{note}." for note in texts(notes)]
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
@@ -351,7 +365,7 @@ def first_sections(
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint, offsets)]),
-        Section("Warnings", [*words[bool(warned) :], *(f"{note}." for note in texts(notes))], findings_shown, more=rest),
+        Section("Warnings", words[bool(warned) :], findings_shown, more=rest),
     ]
     if figures := behavior_figures(model):
         tables = behavior_tables(model)
@@ -668,9 +682,16 @@ def model_page(
     """
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
+    validated = [validate_model(model, run) for run in others]
+    with use_interface("report"):
+        page = _model_content(model, others, validated)
+    return page.write(path, force=force)
+
+
+def _model_content(model: Model, others: Sequence[Run], validated: Sequence[Comparison]) -> Page:
+    """Return the page of a saved model with its comparisons with validation runs (`others`)."""
     estimate = model.estimate
     findings = [] if estimate is None else list(estimate.findings)
-    validated = [validate_model(model, run) for run in others]
     for run, comparison in zip(others, validated, strict=True):
         findings_there = [*comparison.findings, *data_notes(run)]
         if estimate is not None:
@@ -697,4 +718,4 @@ def model_page(
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     details.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
     judgement = saved_verdict(model, validated)
-    return _write_model_page(path, model, judgement, compared, sections, details, force=force)
+    return _content(model, judgement, compared, sections, details)

@@ -212,7 +212,8 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
     column = Placeholder("column")
     options = [
         choose_text(
-            parameter(role, dict.fromkeys(names, column)), " ".join(parameter(role, {n: column}) for n in names)
+            parameter(role, dict.fromkeys(names, column)),
+            " ".join(parameter(role, {n: column}) for n in names),
         )
         for role, names in roles.items()
         if names
@@ -220,13 +221,13 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
     lines = [
         f"{', '.join(f'{n} = {QUOTED_COLUMN}' for n in names)} under [{role}]" for role, names in roles.items() if names
     ]
+    in_a_file = f", or in a file for {parameter('columns')} with {' and '.join(lines)}"
     what = f"signal {lacking[0]!r}{nearest(lacking[0], run.signals)}"
     if len(lacking) > 1:
         what = f"signals {', '.join(map(repr, lacking))}"
     return (
         f"run {run.name!r} has no {what}, which the model needs; it has {', '.join(run.signals)}: name the columns "
-        f"with {choose_text(' and ', ' ').join(options)}, or in a file for {parameter('columns')} with "
-        f"{' and '.join(lines)}"
+        f"with {choose_text(' and ', ' ').join(options)}{choose_text(in_a_file, in_a_file, '')}"
     )
 
 

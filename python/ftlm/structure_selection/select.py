@@ -439,9 +439,10 @@ def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
     disturbances and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
+    fitted = [(t, t.joint) for t in ranked]
     return [
-        t if t.joint is None else replace(t, bic=fit_criterion(t.joint), effective_bic=fit_criterion(t.joint, inflation))
-        for t in ranked
+        t if joint is None else replace(t, bic=fit_criterion(joint), effective_bic=fit_criterion(joint, inflation))
+        for t, joint in fitted
     ]
 
 

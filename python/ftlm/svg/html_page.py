@@ -22,6 +22,7 @@ from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.files import check_ending, write_atomically
 from ftlm.utils.formatting import Cell, number, typeset
+from ftlm.utils.parameters import use_interface
 
 #: Minimum number of columns of a table that is set in small type. A table of the paper has fifteen columns, which must
 #: fit a laptop screen.
@@ -52,8 +53,8 @@ class Table:
     columns
         Column headers. The first column has the names of the rows.
     rows
-        Cells of each row: text (escaped, with exponents as superscripts, unless it is ``Markup``), numbers (shown with five significant digits, stored
-        in full), or None for values that a model does not have.
+        Cells of each row: text (escaped, with exponents as superscripts, unless it is ``Markup``), numbers (shown with
+        five significant digits, stored in full), or None for values that a model does not have.
     groups
         (text, number of columns) of each header over a group of columns, from left to right. Empty text gives no
         header.
@@ -261,11 +262,18 @@ def write_page(
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a report page: title, sections, and summary below the title (`lead`)."""
+    """Content of a report page: title, sections, summary below the title (`lead`), and verdict at the top."""
 
     title: str
     sections: Sequence[Section]
     lead: str
+    verdict: str = ""
+
+    def write(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write the page to an HTML file, and return its path; see :func:`write_page`."""
+        return write_page(
+            path, title=self.title, sections=self.sections, lead=self.lead, force=force, verdict=self.verdict
+        )
 
 
 class ReportMixin(ABC):
@@ -280,5 +288,6 @@ class ReportMixin(ABC):
 
         Arguments and errors are those of :meth:`ftlm.Identification.report`.
         """
-        page = self._page()
-        return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)
+        with use_interface("report"):
+            page = self._page()
+        return page.write(path, force=force)

@@ -1,6 +1,6 @@
-"""References to parameters in messages, in the syntax of Python or of the command line.
+"""References to parameters in messages, in the words of Python, of the command line, of a report or of the web app.
 
-The interface (Python or command line) is the same for the whole process, so all threads format messages in the same
+The interface is the same for the whole process, so all threads format messages in the same
 way. A parent process passes :func:`current_interface` to its child processes.
 """
 
@@ -11,15 +11,62 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-Interface = Literal["python", "command line"]
+Interface = Literal["python", "command line", "report", "app"]
 #: Flags that are not "--" and the name of the parameter with dashes. Two flags set an order grid.
 FLAG_BY_PARAMETER = {"inputs": "-u", "outputs": "-y", "order_grid": "--order-grid or --increment"}
+#: Places of the web app for the parameters that its forms have.
+FIELD_BY_PARAMETER = {
+    "step": "the field “Step”",
+    "resample": "the field “Put on the step”",
+    "time_unit": "the field “Unit of time”",
+    "missing": "the field “Gaps”",
+    "window": "the fields “From” and “To”",
+    "separator": "the field “Between cells”",
+    "decimal": "the field “Decimals”",
+    "thousands": "the field “Between thousands”",
+    "skip": "the field “Lines above the table”",
+    "header": "the field “Lines of header”",
+    "dates": "the field “Dates”",
+    "encoding": "the field “Encoding”",
+    "sheet": "the field “Sheet”",
+    "time": "the role “time”",
+    "inputs": "the role “input”",
+    "outputs": "the role “output”",
+    "units": "the column “unit”",
+    "method": "the field “Method”",
+    "offset": "the field “Offset”",
+    "loss": "the field “Loss”",
+}
 
 
 class _Current:
     """Global variable for the interface whose syntax messages use."""
 
     interface: Interface = "python"
+
+
+class Note(str):
+    """Note on an assumption: a text that ends with the parameter that replaces the assumption.
+
+    Parameters
+    ----------
+    fact
+        Text without the parameter, for readers to whom its syntax means nothing.
+    otherwise
+        Reference to the parameter; empty if there is none.
+    """
+
+    fact: str
+    otherwise: str
+
+    def __new__(cls, fact: str, otherwise: str = "") -> Note:
+        """Create the note from its parts."""
+        note = super().__new__(cls, f"{fact}; otherwise {otherwise}" if otherwise else fact)
+        note.fact, note.otherwise = fact, otherwise
+        return note
+
+    def __reduce__(self) -> tuple[type[Note], tuple[str, str]]:
+        return Note, (self.fact, self.otherwise)
 
 
 class Placeholder(str):
@@ -71,7 +118,8 @@ def parameter(name: str, value: object = None) -> str:
         Name of the parameter in Python.
     value
         Value; None for the parameter alone. A :class:`Placeholder` is shown without quotes. A mapping is shown as
-        ``NAME=VALUE`` on the command line, a pair as ``FROM:TO``.
+        ``NAME=VALUE`` on the command line, a pair as ``FROM:TO``. A report and the app have no syntax: they name the
+        option, or the field of the app.
 
     Examples
     --------
@@ -85,6 +133,8 @@ def parameter(name: str, value: object = None) -> str:
     """
     if _Current.interface == "python":
         return f"{name}=" if value is None else f"{name}={value!r}"
+    if _Current.interface != "command line":
+        return _option_in_words(name, value)
     flag = flag_of(name)
     if value is None or value is True:
         return flag
@@ -93,17 +143,39 @@ def parameter(name: str, value: object = None) -> str:
     return f"{flag} {_flag_value(value)}"
 
 
+def _option_in_words(name: str, value: object) -> str:
+    """Return a reference to a parameter for a reader who types no options, such as ``the option offset = auto``."""
+    field = FIELD_BY_PARAMETER.get(name) if _Current.interface == "app" else None
+    option = field or f"the option {name}{' of Python' if _Current.interface == 'app' else ''}"
+    # A placeholder tells how an option is typed.
+    is_placeholder = isinstance(value, Placeholder) or (
+        isinstance(value, Mapping) and any(isinstance(item, Placeholder) for item in value.values())
+    )
+    if value is None or value is True or is_placeholder:
+        return option
+    if value is False:
+        return f"no {option.removeprefix('the ')}"
+    if isinstance(value, Mapping):
+        return f"{option}: {', '.join(f'{key} = {item}' for key, item in value.items())}"
+    if isinstance(value, (tuple, list)) and len(value) == 2:
+        low, high = ("none" if end is None else f"{end}" for end in value)
+        return f"{option} = {low} to {high}"
+    return f"{option} = {value}"
+
+
 def setting(name: str) -> str:
     """Return the start of a message on the value of a parameter, such as ``top =`` or ``--top``.
 
     A name that is not an identifier, such as "delay of u", is a quantity and always followed by ``=``.
     """
-    return f"{name} =" if _Current.interface == "python" or not name.isidentifier() else parameter(name)
+    return parameter(name) if _Current.interface == "command line" and name.isidentifier() else f"{name} ="
 
 
-def choose_text(python: str, command_line: str) -> str:
-    """Return the first text if the interface is Python, the second if it is the command line."""
-    return python if _Current.interface == "python" else command_line
+def choose_text(python: str, command_line: str, page: str | None = None) -> str:
+    """Return the text for the interface; a report and the app have the text of Python if there is none for a page."""
+    if _Current.interface == "command line":
+        return command_line
+    return python if page is None or _Current.interface == "python" else page
 
 
 def layout_parameter(**values: object) -> str:
@@ -113,7 +185,8 @@ def layout_parameter(**values: object) -> str:
     """
     if _Current.interface == "python":
         return f"layout=dict({', '.join(f'{name}={value!r}' for name, value in values.items())})"
-    return " ".join(parameter(name, value) for name, value in values.items())
+    between = " " if _Current.interface == "command line" else " and "
+    return between.join(parameter(name, value) for name, value in values.items())
 
 
 def layout_fields(*names: str) -> str:

@@ -582,7 +582,7 @@ def inspect_run(run: Run) -> Inspection:
 
 def data_notes(run: Run) -> list[Finding]:
     """Return notes, as findings, on how a run was read and processed, and on whether the rig stopped it."""
-    notes = [make_finding("data_note", run=run.name, text=text) for text in run.warnings]
+    notes = [make_finding("data_note", run=run.name, text=getattr(text, "fact", text)) for text in run.warnings]
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):
         return notes
