@@ -65,6 +65,7 @@ class Topic:
 
 #: (text for Python, text for the command line, text for a page) by name, for templates.
 INTERFACE_TEXTS = {
+    "select": ("select(runs, structures)", "ftlm select", "a structure selection"),
     "validate": ("validate(run)", "--validation FILE", "validate the model on another run"),
     "validate response": (
         "validate(load_frequency(file))",

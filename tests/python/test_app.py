@@ -554,7 +554,7 @@ def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, conte
     assert model.state == "made", model.error
     assert page.desk.files[key].preview["length"] == 300
     assert model.description["fits"][0]["validation"] > 95
-    assert "Candidates" in model.description["choice"]["table"]
+    assert "Candidates" in model.description["choice"]["tables"][0]
     printed = scripted(page, model.key, content, tmp_path)
     assert printed.splitlines()[0] == model.description["choice"]["reason"]
 

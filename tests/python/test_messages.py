@@ -303,7 +303,7 @@ def test_a_parameter_is_shown_as_who_reads_it_gives_it(message, python, command)
 def test_a_report_names_no_option_as_it_is_typed(saved, tmp_path):
     """Who reads a page is at no command line: neither the command that wrote it nor Python gives its words."""
     path, folder = tmp_path / "page.html", ["--report", tmp_path / "page.html"]
-    done = run_command("identify", saved, "--structure", WORDS, "--method", "least-squares", *folder)
+    done = run_command("identify", saved, "--structure", WORDS, *folder)
     assert done.exit_code == 0, done.output
     page = path.read_text("utf-8")
     assert "validate the model on another run" in page
