@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from ftlm.errors import ModelError
-from ftlm.utils.parameters import choose_text, parameter
+from ftlm.utils.parameters import TYPED_INTERFACES, choose_text, current_interface, parameter
 from ftlm.utils.validation import short_repr
 
 #: Severity levels. The model must not be used; it must be used with care; it has a noteworthy property; or there is a
@@ -252,7 +252,10 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     def _render(self, template: str) -> str:
         words: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
-        words |= {**self.numbers, "ask": _Reference(), "choose": _Choice()}
+        # An option in the words of the one who loaded the run means nothing to the reader of a page.
+        otherwise = self.numbers.get("otherwise", "") if current_interface() in TYPED_INTERFACES else ""
+        otherwise = f"; otherwise {otherwise}" if otherwise else ""
+        words |= {**self.numbers, "otherwise": otherwise, "ask": _Reference(), "choose": _Choice()}
         try:
             if "{remedy}" in template:
                 words["remedy"] = self.remedy

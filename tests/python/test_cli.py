@@ -742,3 +742,34 @@ def test_a_score_profile_has_the_scores_of_the_search_along_one_order(tmp_path: 
 def test_equations_are_coupled_as_in_python():
     words = "D x = -a x + b y; D y = -c y + d u"
     assert StructureOptions().structure(words).coupling == ftlm.equation(words).coupling == "measured"
+
+
+def test_tables_fit_a_terminal_of_80_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Columns without room follow in a second table, and long structures and reasons take several lines."""
+    monkeypatch.setenv("COLUMNS", "80")
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], 40), 10)
+    y = np.convolve(u, 0.02 * 0.98 ** np.arange(400))[:400] + 0.001 * rng.standard_normal(400)
+    np.savetxt(
+        tmp_path / "a.csv", np.column_stack([0.02 * np.arange(400), u, y]), header="t,u,y", comments="", delimiter=","
+    )
+    run = ftlm.load(tmp_path / "a.csv")
+    inspected = str(run.inspect()).splitlines()
+    assert [line.split()[3:] for line in inspected if line.startswith("signal")] == [
+        ["first", "low", "high", "mean", "sd"],
+        ["noise", "quantum"],
+    ]
+    long = "D y = a y + b u + c u*u + d u*u*u + e y*u + f y*y*u + g abs(y)*u"
+    choice = ftlm.select(run, [ftlm.equation(text) for text in ("D y = a y + b u", long, "D y = k exp(1e7*y) + b u")])
+    failed = [trial for trial in choice.trials if trial.failed]
+    assert failed
+    lines = choice.ranking_text().splitlines()
+    table = lines[1 : next(k for k, line in enumerate(lines) if line.startswith("Chosen"))]
+    assert max(map(len, table)) <= 80
+    words = " ".join(" ".join(line.split()) for line in table)
+    assert all(trial.name in words for trial in choice.trials)
+    assert failed[0].failed in words
+    table_of_orders = ftlm.search_orders(
+        run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(alpha=[0.9, 1.0, 1.1])
+    )
+    assert max(map(len, str(table_of_orders).partition("next: ")[2].splitlines())) <= 80

@@ -317,6 +317,10 @@ def test_a_report_names_no_option_as_it_is_typed(saved, tmp_path):
     # A note on an assumption has the option that replaces it only where it is typed.
     note = pickle.loads(pickle.dumps(Note("decimal commas", "--decimal point")))
     assert (note, note.fact) == ("decimal commas; otherwise --decimal point", "decimal commas")
+    finding = ftlm.Finding("data_note", numbers={"text": note.fact, "otherwise": note.otherwise})
+    assert finding.text == note
+    with use_interface("report"):
+        assert finding.text == note.fact
 
 
 def test_a_command_leaves_the_interface_as_it_was(saved, tmp_path):

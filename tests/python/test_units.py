@@ -115,3 +115,13 @@ def test_laws_between_coefficients_are_the_same_in_any_unit():
         }
         back = {n: v / units[n] for n, v in there.coefficients.items()}
         assert back == pytest.approx(here.coefficients, rel=1e-3)
+
+
+def test_a_file_in_other_units_says_that_results_are_in_si_units(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("time [ms],i [mA],y [mm],v [V]\n" + "".join(f"{10 * k},{k % 7},{k % 5},1\n" for k in range(20)))
+    run = ftlm.load(path, inputs={"i": "i [mA]", "v": "v [V]"}, outputs={"y": "y [mm]"})
+    assert run.units == {"i": "A", "v": "V", "y": "m"}
+    assert [w for w in run.warnings if "SI" in w] == ["converted to SI units: i from mA to A, y from mm to m"]
+    plain = ftlm.load(path, inputs={"v": "v [V]"}, outputs={"y": "y [mm]"}, units={"y": ""})
+    assert not any("SI" in w for w in plain.warnings)

@@ -13,7 +13,7 @@ from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates
 from ftlm.svg.html_page import Table
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, attributes, number, symbol, symbol_html
+from ftlm.utils.formatting import Cell, Exact, attributes, number, symbol, symbol_html, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
 
 if TYPE_CHECKING:
@@ -336,7 +336,7 @@ class SearchResult(BestIdentification):
         of_table = [f for f in self.findings if f.kind.topic == "order_table"]
         of_model = [f for f in self.findings if f.level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) and f not in of_table]
         lines += [f"! {g.first_finding}{g.count}" for g in group_findings(of_model)] + [f"! {f}" for f in of_table]
-        return "\n".join([*lines, f"next: {self.next_step}"])
+        return "\n".join([*lines, *wrap_text(self.next_step, "next: ")])
 
     @property
     def next_step(self) -> str:

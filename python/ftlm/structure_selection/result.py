@@ -19,7 +19,7 @@ from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.html_page import Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, Exact, attributes, json_value
+from ftlm.utils.formatting import Cell, Exact, attributes, json_value, wrap_text
 
 #: Maximum number of printed rows, and lower limit of printed fits [%].
 MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0
@@ -224,21 +224,21 @@ class Selection(BestIdentification):
         lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
         for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
             mark = "> " if place == self.chosen else "  "
-            lines.append(mark + _row(trial))
+            lines += _row_lines(mark, trial)
         if self.chosen >= MAX_PRINTED_ROWS:
-            lines.append("> " + _row(self.winner))
+            lines += _row_lines("> ", self.winner)
         if len(self.trials) > MAX_PRINTED_ROWS:
             lines.append(f"  … and {len(self.trials) - MAX_PRINTED_ROWS} more")
         return "\n".join([*lines, self.reason, *(f"warning: {w}" for w in self.warnings)])
 
 
-def _row(trial: Trial) -> str:
-    """Return the text line of a candidate in the ranking."""
-    if trial.failed is not None:
-        return f"{'-':>9}{'-':>9}{'-':>10}{trial.parameters:>9}  {trial.name}: {trial.failed}"
-    label = trial.name + (UNSTABLE_NOTE if trial.unstable else "")
-    validation, worst = format_fit(trial.validation_fit), format_fit(trial.worst_fold)
-    return f"{validation:>9}{worst:>9}{format_fit(trial.estimation_fit):>10}{trial.parameters:>9}  {label}"
+def _row_lines(mark: str, trial: Trial) -> list[str]:
+    """Return the text lines of a candidate in the ranking: its fits, and its structure in as many lines as it takes."""
+    fits = trial.validation_fit, trial.worst_fold, trial.estimation_fit
+    validation, worst, estimation = ("-" if trial.failed is not None else format_fit(fit) for fit in fits)
+    lead = f"{mark}{validation:>9}{worst:>9}{estimation:>10}{trial.parameters:>9}  "
+    lines = wrap_text(trial.name + (UNSTABLE_NOTE if trial.unstable else ""), lead, " " * len(lead))
+    return lines if trial.failed is None else lines + wrap_text(trial.failed, " " * len(lead))
 
 
 def format_fit(fit: float) -> str:

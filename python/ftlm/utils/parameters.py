@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from typing import Literal
 
 Interface = Literal["python", "command line", "report", "app"]
+#: Interfaces whose users type parameters.
+TYPED_INTERFACES = ("python", "command line")
 #: Flags that are not "--" and the name of the parameter with dashes. Two flags set an order grid.
 FLAG_BY_PARAMETER = {"inputs": "-u", "outputs": "-y", "order_grid": "--order-grid or --increment"}
 #: Places of the web app for the parameters that its forms have.

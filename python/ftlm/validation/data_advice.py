@@ -19,9 +19,9 @@ from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import attributes
+from ftlm.utils.formatting import attributes, columns, wrap_text
 from ftlm.utils.linalg import orthonormal
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import Note, parameter
 from ftlm.utils.statistics import estimate_noise, is_rest, quantization_step
 from ftlm.utils.validation import Floats
 from ftlm.validation.feedback import feedback_test
@@ -427,14 +427,14 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
     first = {n: pulse_means(np.full(run.length, float(run[n][0])), m, hold=True) for n in inputs}
     times = np.geomspace(2 * step, run.duration / 8, DRIFT_LAGS)
     series = [_core.filter_series([(1.0, 0.0)], [(float(t), 1.0), (1.0, 0.0)], m, step) for t in times]
-    columns = [_core.series_multiply(s, means[n] + first[n], m) for n in inputs for s in series]
-    columns += [means[n] + first[n] for n in inputs]
-    columns += [np.cumsum(means[n] + first[n]) for n in inputs]
+    regressors = [_core.series_multiply(s, means[n] + first[n], m) for n in inputs for s in series]
+    regressors += [means[n] + first[n] for n in inputs]
+    regressors += [np.cumsum(means[n] + first[n]) for n in inputs]
     t = np.linspace(-0.5, 0.5, m)
     for name in outputs:
         y = means[name]
         free = [] if is_rest(run[name]) else [np.exp(-(t + 0.5) * run.duration / tau) for tau in times]
-        basis = np.stack([np.ones(m), *columns, *free])
+        basis = np.stack([np.ones(m), *regressors, *free])
         scale = np.linalg.norm(basis, axis=1)
         basis = basis[scale > 0] / scale[scale > 0][:, None]
         # The part of trend and output that the regressors explain does not count as drift, so it is removed.
@@ -545,16 +545,19 @@ class Inspection:
     def __str__(self) -> str:
         width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2
         heads = ("first", "low", "high", "mean", "sd", "noise", "quantum")
-        lines = [
-            f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; "
-            f"carries up to {self.rows - 1} block pulses",
-            f"{'signal':<{width}}{'role':<8}{'unit':<8}" + "".join(f"{h:>11}" for h in heads),
-        ]
+        table: list[tuple[str, tuple[str, ...]]] = [(f"{'signal':<{width}}{'role':<8}{'unit':<8}", heads)]
         for s in self.signals:
             figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise)
-            quantum = f"{s.quantum:.4g}" if s.quantum else "-"
-            cells = "".join(f"{v:>11.4g}" for v in figures) + f"{quantum:>11}"
-            lines.append(f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}{cells}")
+            cells = (*(f"{v:.4g}" for v in figures), f"{s.quantum:.4g}" if s.quantum else "-")
+            table.append((f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}", cells))
+        lines = wrap_text(
+            f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; "
+            f"carries up to {self.rows - 1} block pulses"
+        )
+        # Columns for which a narrow terminal has no room follow in a second table.
+        room = max((columns() - width - 16) // 11, 1)
+        for start in range(0, len(heads), room):
+            lines += [lead + "".join(f"{cell:>11}" for cell in cells[start : start + room]) for lead, cells in table]
         minor = (LEVEL_FACT, LEVEL_NOTE)
         return "\n".join(lines + [f"{'note' if f.level in minor else 'warning'}: {f.sentence}" for f in self.findings])
 
@@ -582,7 +585,10 @@ def inspect_run(run: Run) -> Inspection:
 
 def data_notes(run: Run) -> list[Finding]:
     """Return notes, as findings, on how a run was read and processed, and on whether the rig stopped it."""
-    notes = [make_finding("data_note", run=run.name, text=getattr(text, "fact", text)) for text in run.warnings]
+    notes = []
+    for note in run.warnings:
+        parts = {"text": note.fact, "otherwise": note.otherwise} if isinstance(note, Note) else {"text": note}
+        notes.append(make_finding("data_note", run=run.name, **parts))
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):
         return notes
