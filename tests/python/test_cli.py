@@ -770,6 +770,6 @@ def test_tables_fit_a_terminal_of_80_columns(tmp_path: Path, monkeypatch: pytest
     assert all(trial.name in words for trial in choice.trials)
     assert failed[0].failed in words
     table_of_orders = ftlm.search_orders(
-        run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(alpha=[0.9, 1.0, 1.1])
+        run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(0.1, alpha=(0.9, 1.1))
     )
     assert max(map(len, str(table_of_orders).partition("next: ")[2].splitlines())) <= 80

@@ -859,3 +859,19 @@ def test_coefficients_have_units_and_an_offset_its_number():
 def test_a_result_without_a_page_cannot_be_made():
     with pytest.raises(TypeError, match=r"abstract method '?_page"):
         type("Bare", (ReportMixin,), {})()
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_time_axes_above_one_another_are_aligned_and_exponents_raised(narrow):
+    t = np.linspace(0.0, 8.0, 50)
+    outputs = LineChart(
+        t, [("measured", np.sin(t)), ("simulated", np.cos(t))], title="y", x_label="time [s]", y_label="y [m]"
+    )
+    inputs = LineChart(t, [("", 0.05 * np.sign(np.sin(t)))], title="u", x_label="time [s]", y_label="u [A s^-0.9]")
+    places = []
+    for drawing in (outputs.draw(narrow=narrow), inputs.draw(narrow=narrow)):
+        left, _, width, _ = map(float, re.search(r'data-plot="([^"]*)"', drawing)[1].split())
+        places.append((left, width))
+    assert places[0] == places[1]
+    raised = inputs.draw(narrow=narrow)
+    assert '>u [A s<tspan dy="-5" font-size="9">−0.9</tspan><tspan dy="5">]</tspan></text>' in raised

@@ -167,6 +167,13 @@ function slider(svg, charts) {
   range.type = "range";
   range.id = `slide-${++sliders}`;
   Object.assign(range, { min: 0, max: times.length - 1, step: 1, value: told.begin });
+  // The track lies below the horizontal axis; its ends extend it by half the thumb.
+  figure.querySelectorAll("svg[data-plot]").forEach((drawing) => {
+    const [left, , width] = drawing.dataset.plot.split(" ").map(Number), kind = drawing === svg ? "wide" : "narrow";
+    const share = (v) => `${(100 * v) / drawing.viewBox.baseVal.width}%`;
+    row.style.setProperty(`--left-${kind}`, share(left));
+    row.style.setProperty(`--span-${kind}`, share(width));
+  });
   label.htmlFor = range.id;
   label.textContent = told.name;
   range.setAttribute("aria-label", `${told.name}, ${name}`);

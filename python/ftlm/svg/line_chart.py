@@ -20,6 +20,7 @@ from ftlm.svg.figure import (
     MAX_LINE_POINTS,
     MAX_STRAY_HEIGHTS,
     NARROW_WIDTH_PX,
+    SMALL_WIDTH_PX,
     TENTHS_PER_PIXEL,
     Figure,
     PlotArea,
@@ -113,6 +114,8 @@ def _scaled_integers(values: Floats) -> list[object]:
 
 #: Maximum magnitude of a drawn value. Larger values are drawn as gaps, because their differences overflow.
 MAX_DRAWN_VALUE = 1e300
+#: Minimum space on the left of a plot [px]: that of tick labels of six characters.
+MIN_LEFT_MARGIN_PX = 52.0
 #: Diameter of a dot [px].
 DOT_DIAMETER_PX = 4.6
 #: Maximum length of a label beside a line [characters]; the legend of a narrow chart allows twice this length.
@@ -317,10 +320,12 @@ class LineChart(Figure):
         x_ticks, y_ticks = self.ticks(narrow=narrow)
         named = [line for line in lines if line.name]
         legend = _legend(named, width) if narrow else []
-        left = max(30.0, 10 + max(map(text_width, y_ticks.labels)))
-        # The space on the right of the lines contains a gap, a line sample and the label.
-        side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
-        right = 14.0 if narrow or not named else 34 + side
+        left = max(MIN_LEFT_MARGIN_PX, 10 + max(map(text_width, y_ticks.labels)))
+        # The space on the right of the lines contains a gap, a line sample and the label. Wide charts without labels
+        # have the space, too, so that the horizontal axes of charts above one another are aligned.
+        names = [truncate_text(line.name, MAX_LABEL_CHARACTERS) for line in named]
+        names += ["simulated"] if self.width > SMALL_WIDTH_PX else []
+        right = 14.0 if narrow or not names else 34 + max(map(text_width, names))
         top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
         if narrow:
             height += int(top - 26)

@@ -56,7 +56,7 @@ def symbol_html(name: str) -> Markup:
 
 #: A derivative of order 1, whose order is not shown; and an exponent: an expression in parentheses, a number or a name.
 _FIRST_DERIVATIVE_PATTERN = re.compile(r"\bD\^1(?![\w.])")
-_EXPONENT_PATTERN = re.compile(r"\^(?:\(([^()]*)\)|(-?\d+(?:\.\d+)?|-?[^\W\d]\w*))")
+_EXPONENT_PATTERN = re.compile(r"\^(?:\(([^()]*)\)|([-−]?\d+(?:\.\d+)?|[-−]?[^\W\d]\w*))")
 
 
 def split_exponents(text: str) -> list[str]:
