@@ -579,7 +579,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
     assert bic in part
     assert bic in page[page.index("Residuals</h2>") :]
     # Exponents are raised, and the first derivative has none.
-    assert "D<sup>2</sup> y = d D y + a y + b u" in part
+    assert "D<sup>2</sup> y = d D y + a y + b0 u" in part
     assert "^" not in part
     with pytest.raises(ftlm.DataError, match="exists"):
         chosen.report(tmp_path / "choice.html")
