@@ -179,7 +179,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
         "tables": [str(t.to_html()) for t in tables],
         "choice": None
         if choice is None
-        else {"reason": str(typeset(choice.reason)), "tables": [str(t.to_html()) for t in choice.tables()]},
+        else {"reason": choice.reason, "tables": [str(t.to_html()) for t in choice.tables()]},
         "script": fitted_model.script,
     }
 
