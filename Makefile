@@ -136,4 +136,4 @@ sdist-test: $(VENV)/.tools
 	rm -rf $(VENV)-sdist sdist
 
 clean:
-	rm -rf $(VENV) $(VENV)-wheel $(VENV)-floors $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures
+	rm -rf $(VENV) $(VENV)-wheel $(VENV)-floors $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures docs/_reference

@@ -1,4 +1,4 @@
-"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors, no network, pictures from the build."""
+"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors, no network, pictures and reference generated."""
 
 import sys
 from pathlib import Path
@@ -19,6 +19,8 @@ source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 root_doc = "index"
 myst_heading_anchors = 3
 myst_enable_extensions = ["deflist", "colon_fence", "dollarmath"]
+# Quotation marks are part of arguments and equations, which readers copy.
+smartquotes = False
 html_math_renderer = "drawn"
 # Pages link to files of the repository, which are no pages.
 suppress_warnings = ["myst.xref_missing"]
@@ -44,7 +46,9 @@ html_theme_options = {
 
 
 def setup(app: object) -> None:
-    """Draw the pictures before the pages that show them are read."""
+    """Draw the pictures and write the pages of the reference before Sphinx reads the pages."""
     from pictures import draw  # noqa: PLC0415 — the folder is on the path only now
+    from reference import write  # noqa: PLC0415
 
     draw(HERE / "_pictures")
+    write(HERE / "_reference")

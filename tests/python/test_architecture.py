@@ -492,17 +492,14 @@ def test_every_public_member_has_a_docstring(name):
 
 
 def in_the_reference():
-    """What docs/api.md shows: functions, classes and the members of these that it names, or all."""
-    found, holder = {}, ""
-    for line in (ROOT / "docs" / "api.md").read_text(encoding="utf-8").splitlines():
-        if shown := re.match(r"\.\. auto(?:function|class):: ([\w.]+)", line):
-            holder = shown[1]
-            found[holder] = pydoc.locate(holder)
-        elif members := re.match(r"   :members:(.*)", line):
-            known = [n.strip() for n in members[1].split(",") if n.strip()] or [
-                n for n, value in vars(found[holder]).items() if not n.startswith("_") and inspect.getdoc(value)
-            ]
-            found |= {f"{holder}.{n}": inspect.getattr_static(found[holder], n, None) for n in known}
+    """What docs/reference.toml shows: functions, classes and the members of these that it names, or all."""
+    topics = tomllib.loads((ROOT / "docs" / "reference.toml").read_text(encoding="utf-8"))
+    found = {}
+    for holder, members in (row for topic in topics.values() for row in topic["names"].items()):
+        found[holder] = value = pydoc.locate(holder)
+        public = [n for n, v in vars(value).items() if not n.startswith("_") and inspect.getdoc(v)] if members else []
+        known = public if members == ["*"] else members
+        found |= {f"{holder}.{n}": inspect.getattr_static(value, n, None) for n in known}
     return {n: v.__func__ if isinstance(v, (classmethod, staticmethod)) else v for n, v in found.items()}
 
 

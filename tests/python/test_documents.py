@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pytest
 
 import ftlm
 from command_line import run_command
+from ftlm.findings import finding_catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
@@ -165,6 +167,20 @@ def test_notebooks_are_kept_without_output() -> None:
         assert all(not c.get("outputs") and c.get("execution_count") is None for c in cells), notebook.name
 
 
+def test_the_changelog_is_short_and_has_the_sections_of_keep_a_changelog() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 1000
+    entries = [line.removeprefix("- ") for line in text.splitlines() if line.startswith("- ")]
+    assert len(entries) > 40
+    assert [line for line in entries if len(line.split()) > 20] == []
+    sections = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+    assert set(re.findall(r"^### (.*)$", text, flags=re.MULTILINE)) <= sections
+    # Codes of findings exist.
+    codes = set(re.findall(r"^- `(\w+)`: ", text, flags=re.MULTILINE)) - set(ftlm.__all__)
+    assert {"validation_follows_input", "delay_differs", "color_undecided", "cpe_is_capacitor"} <= codes
+    assert codes <= set(finding_catalogue().kinds)
+
+
 def test_every_page_is_in_the_contents() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     listed = re.findall(r"```\{toctree\}\n:hidden:\n:caption: .*?\n\n(.*?)```", index, re.DOTALL)
@@ -188,17 +204,30 @@ def test_every_formula_of_the_pages_is_drawn(monkeypatch: pytest.MonkeyPatch) ->
             assert len(found) > 100
 
 
-def issubclass_of_error(value: object) -> bool:
-    return isinstance(value, type) and issubclass(value, Exception)
-
-
 def test_the_reference_names_every_public_name() -> None:
-    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    topics = tomllib.loads((ROOT / "docs" / "reference.toml").read_text(encoding="utf-8"))
+    listed = [name for topic in topics.values() for name in topic["names"]]
+    assert len(listed) == len(set(listed))
     for name in ftlm.__all__:
-        value = getattr(ftlm, name)
-        if name in ("PARAMETER_SETS", "__version__") or inspect.ismodule(value) or issubclass_of_error(value):
-            continue
-        assert re.search(rf"ftlm\.{name}\b", text), f"{name} is not in docs/api.md"
+        if name not in ("PARAMETER_SETS", "__version__") and not inspect.ismodule(getattr(ftlm, name)):
+            assert f"ftlm.{name}" in listed, f"{name} is not in docs/reference.toml"
+
+
+def test_the_reference_has_a_page_per_topic_and_a_line_per_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import reference
+
+    (tmp_path / "former.rst").write_text("", encoding="utf-8")
+    reference.write(tmp_path)
+    topics = reference.topics()
+    assert {p.name for p in tmp_path.iterdir()} == {"index.txt", *(f"{page}.rst" for page in topics)}
+    index = (tmp_path / "index.txt").read_text(encoding="utf-8")
+    for page, topic in topics.items():
+        text = (tmp_path / f"{page}.rst").read_text(encoding="utf-8")
+        assert re.findall(r"^\.\. auto\w+:: (.*)$", text, flags=re.MULTILINE) == list(topic.names)
+        for name in topic.names:
+            ((line),) = re.findall(rf"`{re.escape(name)} <.*>`\n     - (.*)$", index, flags=re.MULTILINE)
+            assert 10 < len(line) <= 120, name
 
 
 def test_the_map_names_only_what_exists() -> None:

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -39,7 +39,7 @@ from ftlm.reproduction.report import (
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage import GRID_ALPHA, Candidate, Preset, Stage, StageWork
 from ftlm.reproduction.workload import TotalProgress, WorkerProgress, seconds_of
-from ftlm.svg.figure import Figure
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
@@ -230,7 +230,7 @@ def demo_details(demo: Demo) -> str:
 def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the demonstration as one HTML page, and return its path.
 
-    The page has verdicts, charts of the validation run and of fits, and a section with the tables of each joint. Raise
+    The page has charts of the validation run, verdicts, fits, and a section with the tables of each joint. Raise
     DataError if the file exists and `force` is False, or it cannot be written.
     """
     boxes = Markup("").join(
@@ -240,27 +240,28 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
     )
     runs = {"square, fitted to": "estimation", "sine, not seen": "validation"}
     bars = [
-        chart
+        replace(chart, width=SMALL_WIDTH_PX, caption="")
         for stage in demo.stages.values()
         for chart in compared_bars(
             [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in stage.candidates.items()],
             title="Fit of the simulation",
         )
     ]
-    predictions = [
-        chart
+    # Four charts fit a laptop screen without their sliders, which the sections of the stages have.
+    simulations = [
+        replace(chart, width=SMALL_WIDTH_PX, height=200, slider=False)
         for stage, checked in demo.validations.items()
         for chart in comparison_charts(checked, units=demo.results[stage]["output error"].model.units)
     ]
     sections = [
-        Section("Validation: measured and simulated", figures=predictions),
-        Section("Which model predicts", figures=bars, small=True),
+        Section("Measured and simulated: the sine run", figures=simulations, small=True),
+        Section("Verdicts", verdict=boxes),
+        Section("Fit of every model", page_text("demo_models"), figures=bars, small=True),
         *(_stage_section(demo, stage) for stage in demo.results),
         Section("Fits", tables=[fits_table(stage) for stage in demo.stages.values()]),
     ]
-    return write_page(
-        path, title="ftlm demo", sections=sections, lead=page_text("demo_lead"), force=force, verdict=boxes
-    )
+    title = "A flexible arm, identified from one run"
+    return write_page(path, title=title, sections=sections, lead=page_text("demo_lead"), force=force)
 
 
 def _stage_section(demo: Demo, stage: int) -> Section:
@@ -289,7 +290,7 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),
-            paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current"),
+            *paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current").split(9),
             search_summary(searches),
         ],
         figures=[*charts, derivative_chart(demo.stages[stage].derived)],

@@ -7,7 +7,7 @@ import hashlib
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from itertools import accumulate
@@ -27,6 +27,8 @@ from ftlm.utils.parameters import use_interface
 #: Minimum number of columns of a table that is set in small type. A table of the paper has fifteen columns, which must
 #: fit a laptop screen.
 DENSE_MIN_COLUMNS = 12
+#: Minimum number of columns of a table whose rows become blocks on narrow screens. Four columns of numbers fit a phone.
+STACKED_MIN_COLUMNS = 5
 NOT_IN_MODEL = "–"
 
 
@@ -65,7 +67,7 @@ class Table:
     wrap
         Whether text in cells is wrapped; otherwise every row has one line.
     stacked
-        Whether the cells of a row are placed below each other on narrow screens.
+        Whether each row becomes a block of cells with their heads on narrow screens, also with few columns.
     """
 
     title: str
@@ -110,13 +112,43 @@ class Table:
             at += width
         return starts
 
+    @property
+    def is_stacked(self) -> bool:
+        """Whether each row becomes a block of cells with their heads on narrow screens."""
+        return self.stacked or len(self.columns) >= STACKED_MIN_COLUMNS
+
+    @property
+    def heads(self) -> list[str]:
+        """Plain column headers, after the header of their group."""
+        groups = [text for text, width in self.groups for _ in range(width)] or [""] * len(self.columns)
+        pairs = zip(groups, self.columns, strict=True)
+        return [" ".join(Markup(part).striptags() for part in pair if part) for pair in pairs]
+
+    def split(self, column: int) -> tuple[Table, Table]:
+        """Return the columns before index `column` and those from it on as two tables, both with the names of rows."""
+        ends = list(accumulate(width for _, width in self.groups))
+        at = ends.index(column) + 1 if ends else 0
+        left = replace(
+            self,
+            columns=self.columns[:column],
+            rows=[row[:column] for row in self.rows],
+            groups=self.groups[:at],
+        )
+        right = replace(
+            self,
+            columns=[self.columns[0], *self.columns[column:]],
+            rows=[[row[0], *row[column:]] for row in self.rows],
+            groups=[("", 1), *self.groups[at:]] if ends else (),
+        )
+        return left, right
+
     def to_html(self) -> Markup:
         """Return the table as HTML, in a container that scrolls horizontally on narrow screens."""
         pairs = zip(self.is_numeric, self.starts_group, strict=True)
         words = [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
         classes = [Markup(' class="{}"').format(w) if w else "" for w in words]
         kind = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
-        kind += " stacked" if self.stacked else ""
+        kind += " stacked" if self.is_stacked else ""
         template = templates("ftlm.svg").get_template("table.html.j2")
         return Markup(template.render(table=self, classes=classes, kind=kind))  # safe: the template escapes all text
 
@@ -139,6 +171,8 @@ class Section:
         Whether two figures are placed side by side on wide screens.
     more
         Further warnings in a collapsed list.
+    verdict
+        Verdicts below the heading, escaped unless they are ``Markup``.
     fold
         Title of a collapsed part of the section, which is expanded in print.
     folded_tables
@@ -154,6 +188,7 @@ class Section:
     figures: Sequence[Figure] = ()
     small: bool = False
     more: Sequence[str] = ()
+    verdict: str = ""
     fold: str = "Numbers"
     folded_tables: Sequence[Table] = ()
     collapsed: bool = False
