@@ -307,6 +307,28 @@ def test_no_width_makes_a_page_scroll_sideways(browser, at, name, width):
         assert page.locator(".zoom:visible").count() == page.locator("svg.chart[data-frame]:visible").count()
 
 
+@pytest.mark.parametrize("name", ALL)
+def test_charts_have_the_size_of_their_text(browser, at, name):
+    widest = "Math.max(...all.map((e) => e.getBoundingClientRect().width / e.getAttribute('width')))"
+    for width, most in ((1280, 1.001), (600, 1.201)):
+        with Opened(browser, at(name), viewport={"width": width, "height": 900}) as opened:
+            opened.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+            assert 0 < opened.page.locator("svg.chart").evaluate_all(f"(all) => {widest}") <= most
+
+
+@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("width", [360, 1280])
+def test_no_table_is_cut(browser, at, name, width):
+    with Opened(browser, at(name), viewport={"width": width, "height": 900}) as opened:
+        opened.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+        cut = "(all) => all.filter((e) => e.scrollWidth > e.clientWidth + 1).map((e) => e.ariaLabel)"
+        assert opened.page.locator(".scroll").evaluate_all(cut) == []
+        heads = opened.page.locator(".stacked td[data-head]")
+        # The heads of the columns stand in the cells where the row of heads is not shown.
+        shown = "(all) => all.map((e) => getComputedStyle(e, '::before').content)"
+        assert all((text != "none") == (width < 620) for text in heads.evaluate_all(shown))
+
+
 def test_paper_has_no_buttons_and_equations_are_typeset(browser, folder):
     with Opened(browser, folder / "fit.html") as opened:
         page = opened.page

@@ -7,7 +7,7 @@ from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 
 
 @pytest.mark.slow
-def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, monkeypatch):
+def test_the_demo_is_one_screen_and_its_page_leads_with_measured_and_simulated(tmp_path, monkeypatch):
     told, named = [], []
     demo = run_demo(
         tmp_path,
@@ -36,7 +36,7 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, m
     assert all(w in demo_details(demo) for w in said)
     page = demo_page(demo, tmp_path / "demo.html").read_text("utf-8")
     assert page.index("Stage 1, output error: trust") < page.index("Stage 2, output error: trust")
-    order = ["Stage 2, output error: trust", "measured and simulated</h2>", "Which model predicts</h2>", "Stage 1</h2>"]
+    order = ["The models then simulate", "Measured and simulated", "Verdicts</h2>", "Fit of every model</h2>", "Stage 1</h2>"]
     assert [page.index(text) for text in order] == sorted(page.index(text) for text in order)
     # One course over the whole, which never goes back.
     shares = [done / total for done, total in told]

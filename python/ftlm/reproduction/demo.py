@@ -258,7 +258,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         Section("Verdicts", verdict=boxes),
         Section("Fit of every model", page_text("demo_models"), figures=bars, small=True),
         *(_stage_section(demo, stage) for stage in demo.results),
-        Section("Fits", tables=[fits_table(stage) for stage in demo.stages.values()]),
+        Section("Fits in numbers", collapsed=True, tables=[fits_table(stage) for stage in demo.stages.values()]),
     ]
     title = "A flexible arm, identified from one run"
     return write_page(path, title=title, sections=sections, lead=page_text("demo_lead"), force=force)
@@ -290,6 +290,9 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),
+        ],
+        fold="All models",
+        folded_tables=[
             *paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current").split(9),
             search_summary(searches),
         ],
