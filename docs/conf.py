@@ -1,4 +1,4 @@
-"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors, no network, pictures and reference generated."""
+"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors; reference and pictures are generated."""
 
 import sys
 from pathlib import Path
@@ -13,7 +13,7 @@ author = "the ftlm authors"
 copyright = "the ftlm authors, MIT license"
 version = release = ftlm.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas", "signs"]
 exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 root_doc = "index"

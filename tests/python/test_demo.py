@@ -36,7 +36,13 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_measured_and_simulated(t
     assert all(w in demo_details(demo) for w in said)
     page = demo_page(demo, tmp_path / "demo.html").read_text("utf-8")
     assert page.index("Stage 1, output error: trust") < page.index("Stage 2, output error: trust")
-    order = ["The models then simulate", "Measured and simulated", "Verdicts</h2>", "Fit of every model</h2>", "Stage 1</h2>"]
+    order = [
+        "The models then simulate",
+        "Measured and simulated",
+        "Verdicts</h2>",
+        "Fit of every model</h2>",
+        "Stage 1</h2>",
+    ]
     assert [page.index(text) for text in order] == sorted(page.index(text) for text in order)
     # One course over the whole, which never goes back.
     shares = [done / total for done, total in told]

@@ -189,6 +189,17 @@ def test_every_page_is_in_the_contents() -> None:
     assert sorted(" ".join(listed).split()) == sorted(there - {"index"})
 
 
+def test_negative_numbers_have_minus_signs_in_prose_and_hyphens_in_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    core = pytest.importorskip("docutils.core")
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from signs import MinusSigns
+
+    document = core.publish_doctree("Between -1 and -0.5, ``a = -1``, one-sided, p -q.\n\n::\n\n  b = -2\n")
+    MinusSigns(document).apply()
+    assert document.astext() == "Between −1 and −0.5, a = -1, one-sided, p -q.\n\nb = -2"
+
+
 def test_every_formula_of_the_pages_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     from formulas import draw
@@ -213,7 +224,9 @@ def test_the_reference_names_every_public_name() -> None:
             assert f"ftlm.{name}" in listed, f"{name} is not in docs/reference.toml"
 
 
-def test_the_reference_has_a_page_per_topic_and_a_line_per_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_reference_has_a_page_per_topic_and_a_line_per_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     import reference
 

@@ -875,3 +875,24 @@ def test_time_axes_above_one_another_are_aligned_and_exponents_raised(narrow):
     assert places[0] == places[1]
     raised = inputs.draw(narrow=narrow)
     assert '>u [A s<tspan dy="-5" font-size="9">−0.9</tspan><tspan dy="5">]</tspan></text>' in raised
+
+
+def test_pages_show_minus_signs_and_keep_code(tmp_path):
+    words = "correlation -0.75 at lag 3 (bound -.5), try --delay u=-0.01:0.1, p-1, 3 - 2"
+    table = report.Table("estimates", ("name", "gain"), [["y", "order -1.05"]])
+    section = report.Section("-2", [words], warnings=[words], more=[words], tables=[table])
+    page = report.write_page(tmp_path / "page.html", title="t", sections=[section], lead=words).read_text("utf-8")
+    assert page.count("correlation −0.75 at lag 3 (bound −.5), try --delay u=-0.01:0.1, p-1, 3 - 2") == 4
+    assert "order −1.05" in page
+
+
+def test_a_split_table_repeats_the_names_of_its_rows():
+    groups = [("", 1), ("first", 2), ("second", 1)]
+    table = report.Table("t", ("name", "a", "b", "c"), [["x", 1.0, 2.0, 3.0]], groups=groups, headings={0: "of x"})
+    left, right = table.split(3)
+    assert (left.columns, left.rows, left.groups) == (("name", "a", "b"), [["x", 1.0, 2.0]], groups[:2])
+    assert (right.columns, right.rows, right.groups) == (["name", "c"], [["x", 3.0]], [("", 1), ("second", 1)])
+    assert table.heads == ["name", "first a", "first b", "second c"]
+    assert right.headings == {0: "of x"}
+    assert 'data-head="second c"' in table.to_html()
+    assert "data-head" not in right.to_html()

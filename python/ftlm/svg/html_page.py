@@ -27,8 +27,8 @@ from ftlm.utils.parameters import use_interface
 #: Minimum number of columns of a table that is set in small type. A table of the paper has fifteen columns, which must
 #: fit a laptop screen.
 DENSE_MIN_COLUMNS = 12
-#: Minimum number of columns of a table whose rows become blocks on narrow screens. Four columns of numbers fit a phone.
-STACKED_MIN_COLUMNS = 5
+#: Minimum number of columns of a table whose rows become blocks on narrow screens. Three columns fit a phone.
+STACKED_MIN_COLUMNS = 4
 NOT_IN_MODEL = "–"
 
 

@@ -66,10 +66,13 @@ def split_exponents(text: str) -> list[str]:
 
 
 def typeset(text: str) -> Markup:
-    """Return a text as HTML with exponents such as that of ``s^-0.9`` as superscripts; markup is returned unchanged."""
+    """Return a text as HTML, with superscripts for exponents such as that of ``s^-0.9``, and with minus signs.
+
+    ``Markup`` is returned unchanged.
+    """
     if isinstance(text, Markup):
         return text
-    parts = split_exponents(text)
+    parts = split_exponents(with_minus_signs(text))
     return Markup("").join(Markup("<sup>{}</sup>" if k % 2 else "{}").format(part) for k, part in enumerate(parts))
 
 
@@ -99,6 +102,15 @@ def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
 def format_bound(value: float, spec: str = ".3g") -> str:
     """Return a standard error or an interval bound as text in the format `spec`; infinity is "∞"."""
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
+
+
+#: Hyphen before a number, at the start of a word; options such as ``--bounds a=-1:1`` have none.
+_HYPHEN_OF_NUMBER = re.compile(r"(?<![^\s(\[±])-(?=\.?\d)")
+
+
+def with_minus_signs(text: str) -> str:
+    """Return a text with minus signs before negative numbers, for pages."""
+    return _HYPHEN_OF_NUMBER.sub("−", text)
 
 
 def plural(count: int, noun: str, verb: str = "") -> str:
