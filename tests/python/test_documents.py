@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import json
+import pydoc
 import re
 import shlex
 import subprocess
@@ -253,6 +254,20 @@ def test_the_map_names_only_what_exists() -> None:
             assert path.exists(), f"the map names {name}"
 
 
+def test_the_map_names_parts_and_steps_that_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    for first, contents in re.findall(r"^\| `([^`]+)`.*? \| (.*) \|$", text, flags=re.MULTILINE):
+        for name in re.findall(r"`([\w./]+(?:/|\.(?:rs|py|toml)))`", contents):
+            top = ROOT / ("rust" if first.startswith("rust") else "python/ftlm")
+            assert any(top.rglob(name.rstrip("/"))), f"the map names {name}"
+    steps = re.findall(r"^\d+\. .*: `([\w.]+)`\.$", text, flags=re.MULTILINE)
+    assert len(steps) == 10
+    for step in steps:
+        assert callable(pydoc.locate(f"ftlm.{step}")), step
+    for name in re.findall(r"`((?:tests|docs|benches|examples)/[\w./]*)`", text):
+        assert (ROOT / name).exists(), name
+
+
 def test_every_module_stands_on_the_map() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     for file in sorted((ROOT / "python/ftlm").glob("*.py")):
@@ -261,6 +276,11 @@ def test_every_module_stands_on_the_map() -> None:
     for file in sorted((ROOT / "rust").glob("*.rs")):
         if file.stem not in ("lib", "error"):
             assert f"{file.name}`" in text, f"{file.name} is not on the map"
+    for folder in ("python/ftlm", "rust"):
+        for file in sorted((ROOT / folder).glob("*/*")):
+            inside = file.parent.relative_to(ROOT).as_posix()
+            if file.suffix in (".py", ".rs"):
+                assert f"`{inside}/`" in text, f"{inside} is not on the map"
 
 
 def test_the_catalogue_of_findings_is_the_packages_own():
