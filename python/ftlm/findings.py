@@ -137,8 +137,13 @@ class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def finding_catalogue() -> Catalogue:
-    """Return the catalogue of findings; the file findings.toml is read at the first call only."""
+    """Return the catalogue of findings; the file findings.toml is read once, when this module is imported."""
     return msgspec.toml.decode(resources.files("ftlm").joinpath("findings.toml").read_bytes(), type=Catalogue)
+
+
+# msgspec inspects a class without a lock: first calls on two threads at once can crash the interpreter. The lock of the
+# import admits one thread.
+finding_catalogue()
 
 
 class _Reference:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -183,3 +185,10 @@ def test_a_multistart_is_ended_from_another_thread(friction: float) -> None:
     with pytest.raises(KeyboardInterrupt):
         _core.joint_multistart(problem.core, [recording(run, problem.structure)], (1, 1 << 30), report, flag)
     assert reports
+
+
+def test_the_catalogue_of_findings_is_read_before_threads_can_ask_for_it():
+    # Two first calls at once crashed the interpreter in one of eight selections.
+    code = "from ftlm.findings import finding_catalogue as f; print(f.cache_info().currsize)"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout == "1\n"
