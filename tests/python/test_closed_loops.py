@@ -410,3 +410,26 @@ def test_instrumental_variables_count_the_error_of_their_orders():
         )
         assert found.standard_errors["a"] > at_order.standard_errors["a"]
     assert np.mean(held) >= 0.9
+
+
+@pytest.mark.parametrize("color", [0.3, 0.9])
+def test_a_controller_that_acts_in_the_same_row_is_no_missing_dynamics(color):
+    """A PI controller that reads a sample and acts at once puts the noise of this sample into the input."""
+    step, rate, gain, samples = 0.02, 1 / 0.6, 2.0, 600
+    decay = np.exp(-rate * step)
+    for seed in range(3):
+        g = np.random.default_rng(seed)
+        noise = 0.05 * lfilter([np.sqrt(1 - color**2)], [1, -color], g.standard_normal(samples + 200))[200:]
+        u, y, state, integral = np.empty(samples), np.empty(samples), 0.0, 0.0
+        for k in range(samples):
+            y[k] = state + noise[k]
+            error = (k >= 40) - y[k]
+            integral += step * error / 0.42
+            u[k] = 1.5 * (error + integral)
+            state = decay * state + gain * (1 - decay) * u[k]
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y})
+        found = ftlm.identify(run, ftlm.equation("D y = -a y + b u"))
+        assert found.parameters["b"].value == pytest.approx(gain * rate, rel=0.2)
+        codes = {f.code for f in found.findings}
+        assert "moves_within_row" in codes
+        assert not codes & {"dynamics_missing", "zero_fits", "residuals_not_white", "delay_fits", "lag_fits"}

@@ -172,6 +172,9 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
 
     Residuals at the level of rounding and discretization errors are not tested.
 
+    An input that a controller computes from the same sample of the output contains the noise of this sample. Every
+    extension by which the input acts earlier would predict this noise, so the dynamics of such an input are not tested.
+
     Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
     with a coefficient law are tested only for a constant, a drift and intersample behavior. Structures with other
     non-linear terms are tested only for intersample behavior.
@@ -183,7 +186,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     if joint is None or not joint.names or not colored or is_excluded:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
-    names = _inputs_of_single_equation(structure, runs)
+    fed_back = _inputs_fed_back_within_row(fit.model, tests)
+    names = [n for n in _inputs_of_single_equation(structure, runs) if n not in fed_back]
     about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
     try:
         joint, runs = _first_samples(joint, structure, runs)
@@ -192,7 +196,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         fit_each = partial(_fit_extensions, runs=runs, own_criterion=own)
         fits = fit_each(_offset_extensions(structure, joint, runs, is_poor=is_poor))
         offset_fits = sorted((f.fit for f in fits), key=lambda fit: max(fit.noise.values()))
-        fits += fit_each(_intersample_extensions(structure, joint, runs))
+        fits += fit_each([e for e in _intersample_extensions(structure, joint, runs) if not fed_back & {*e.inputs}])
         if names:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint, runs))
@@ -259,6 +263,17 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
     if len(structure.equations) > 1 or structure.coefficient_law or not structure.is_linear:
         return ()
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
+
+
+def _inputs_fed_back_within_row(model: Model, tests: Residuals) -> set[str]:
+    """Return the inputs that depend on an output without delay; an empty set for a model with a non-linear term."""
+    loops = {(output, name): t for output, r in tests.outputs.items() for name, t in r.feedback_tests.items()}
+    states = steady_states(model) if model.structure.is_linear else ()
+    return {
+        s.input
+        for s in states
+        if (s.output, s.input) in loops and loops[s.output, s.input].is_feedback_within_row(s.rate)
+    }
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:

@@ -281,7 +281,7 @@ class AutomaticSelection:
             values = signals[name]
             test = feedback_test(residuals, values, [v for n, v in signals.items() if n != name])
             gain = -coefficients.get(f"a0{end}", -1.0) * coefficients[f"b{number}0{end}"]
-            if test.has_feedback or (test.state == "undecided" and test.same_row * math.copysign(1.0, gain) < -1.0):
+            if test.has_feedback or test.is_feedback_within_row(gain):
                 names.append(name)
         return tuple(names)
 

@@ -109,6 +109,13 @@ class FeedbackTest:
         """Whether the test found that the input depends on past outputs."""
         return self.state == "found"
 
+    def is_feedback_within_row(self, gain: float) -> bool:
+        """Whether input and output are correlated in the same sample only, as negative feedback without delay does it.
+
+        The correlation then has the sign opposite to that of the static `gain`. Direct feedthrough has the same sign.
+        """
+        return self.state == "undecided" and self.same_row * math.copysign(1.0, gain) < -1.0
+
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         return attributes(self, ("state", "reason", "has_feedback", "ratio", "share", "rows", "bias"))
