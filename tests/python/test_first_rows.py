@@ -405,6 +405,25 @@ def test_quiet_rows_of_a_slow_motion_are_refuted():
     assert "rests_at_level" in codes(wrong)
 
 
+@pytest.mark.parametrize(("share", "color"), [(0.05, 0.0), (0.1, 0.0), (0.05, 0.6)])
+def test_a_staircase_with_an_offset_of_its_input_sensor(share, color):
+    """The plant rests until row 100, but its recorded input is 0.7 there: from rest, no model explains the record."""
+    u = np.repeat(np.arange(6.0), 100)
+    y = plant([2.0], [0.192, 1.04, 1.0], u, 0.02)
+    for seed in range(2):
+        g = np.random.default_rng(seed)
+        noise = lfilter([np.sqrt(1 - color**2)], [1, -color], g.standard_normal(800))[200:]
+        run = run_of(u + 0.7, y + share * np.std(y) * noise, 0.02)
+        found = ftlm.identify(run, ftlm.equation("D^2 y = -p D y - q y + b u"))
+        assert found.settings["offset"] == "level"
+        for name, truth in {"p": 1.04 / 0.192, "q": 1 / 0.192, "b": 2 / 0.192}.items():
+            low, high = found.parameters[name].interval
+            assert low <= truth <= high
+            assert found.parameters[name].value == pytest.approx(truth, rel=0.4)
+        assert found.comparison.offsets[0]["y"]["level"] == pytest.approx(-1.4, abs=0.2)
+        assert "level_estimated" in codes(found)
+
+
 def test_a_mode_with_few_samples_a_period_is_named():
     g = np.random.default_rng(1)
     u = np.repeat(g.choice([-1.0, 1.0], 200), 3)

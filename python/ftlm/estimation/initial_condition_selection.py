@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -18,9 +19,11 @@ from ftlm.estimation.nuisance_parameters import (
     OffsetTest,
     constant_input,
     fit_score,
+    fit_score_gain,
     fit_without_history,
     fits_better,
     has_colored_residuals,
+    has_independent_residuals,
     has_white_residuals,
     offset_test,
     refit_after_screening,
@@ -114,11 +117,13 @@ class InitialConditionFits:
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
         """Return a fit of a structure whose initial conditions differ from those of `fit`; None if not accepted.
 
-        The new fit starts from the optimum of `fit` if `fit` has a joint fit and :attr:`complete` is given, otherwise
-        from automatic initial guesses. The function `accepts` decides from the new joint fit whether it is accepted.
+        The new fit starts from the optimum of `fit` if `fit` has a joint fit, :attr:`complete` is given, and an order
+        is free or fractional. Otherwise it starts from automatic initial guesses: with integer orders they cost little,
+        and the optimum of `fit` may be far from the new one. The function `accepts` decides from the new joint fit
+        whether it is accepted.
         """
         joint, runs = fit.joint, fit.task.runs
-        if joint is None or self.complete is None:
+        if joint is None or self.complete is None or not has_memory(structure):
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
@@ -191,7 +196,10 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     """Return a fit with nonzero initial conditions or a level if residuals contradict a start from rest, else None.
 
     A few quiet samples do not distinguish slow motion from rest. With white residuals, rest is kept. If the
-    residuals are not white but have no slow component, those of the new fit must be white.
+    residuals are not white but have no slow component, those of the new fit must be white. The information criteria
+    use the noise color of the fit from rest, because its residuals may be due to dynamics that the structure lacks. If
+    the residuals of the new fit are independent of the inputs, it lacks no dynamics, and its noise color is used.
+    Quiet samples before a step show a level, whereas residuals then say little about dynamics.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.is_linear
@@ -204,17 +212,19 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     if any(item is not None and item.rows == 0 for item in evidence):
         # A constant input gives no evidence of rest.
         return None
-    least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
+    is_quiet, least, candidate = _has_quiet_samples(fit), math.inf, None
     starts: list[tuple[Initial, Offset]] = [("caputo", structure.offset)]
     if structure.offset == "none" and fits.may_add_offset:
         starts.append(("caputo", "level"))
-        if not _has_quiet_samples(fit):
+        if not is_quiet:
             starts.insert(0, ("rest", "level"))
     for initial, offset in starts:
         request = replace(structure, initial=initial, offset=offset)
 
-        def is_better(candidate: JointFit, *, most: float = least) -> bool:
-            return fit_score(candidate, joint) < most
+        def is_better(candidate: JointFit, *, least: float = least) -> bool:
+            is_complete = not is_quiet and has_independent_residuals(candidate, runs, structure)
+            gain = fit_score_gain(candidate, joint, candidate if is_complete else joint)
+            return gain > START_SETTINGS.history_margin and fit_score(candidate, joint) < least
 
         try:
             other = fits.refit(request, fit, is_better)
@@ -233,8 +243,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
     Both information criteria that are compared use the noise spectrum of the fit with the larger residuals. If
-    `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used. They are also used for
-    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level.
+    `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used, otherwise those of
+    :meth:`InitialConditionFits.refit`.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -249,8 +259,7 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" else None]:
         request = replace(structure, initial=initial, offset="level")
         try:
-            # With integer orders, automatic guesses cost little and lead to the best optimum.
-            fresh = candidate is None and (is_suggested or not has_memory(structure))
+            fresh = candidate is None and is_suggested
             previous_fit = fit if candidate is None else candidate[1]
             level = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import MAX_SAMPLE_VALUE, drop_missing
+from ftlm.data.sampling import MAX_SAMPLE_VALUE, drop_missing, interpolate_gaps
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
@@ -25,6 +25,7 @@ from ftlm.estimation.output_error import (
 )
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
+from ftlm.simulation.discretization import compared_values
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
     common_initial_conditions,
@@ -58,7 +59,7 @@ from ftlm.utils.statistics import (
     variance_inflation,
 )
 from ftlm.utils.validation import Floats
-from ftlm.validation.residual_tests import DEFAULT_LAGS
+from ftlm.validation.residual_tests import DEFAULT_LAGS, is_independent
 
 #: Number of block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
@@ -450,13 +451,18 @@ def fit_score(joint: JointFit, reference: JointFit) -> float:
     return start_score(own, joint.initial_terms, others)
 
 
+def fit_score_gain(joint: JointFit, other: JointFit, reference: JointFit) -> float:
+    """Return by how much the criterion of `joint` is below that of `other`, with the noise color of `reference`."""
+    return fit_score(other, reference) - fit_score(joint, reference)
+
+
 def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
     """Whether the criterion of a fit is below the other fit's criterion plus `margin`, which may be negative.
 
     Both criteria use the noise color of the fit with the larger residuals.
     """
     worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
-    return fit_score(joint, worse) < fit_score(other, worse) + margin
+    return fit_score_gain(joint, other, worse) > -margin
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
@@ -471,6 +477,18 @@ def has_white_residuals(joint: JointFit) -> bool:
     Unlike :func:`has_colored_residuals`, this test detects oscillating residuals.
     """
     return all(is_white(drop_missing(series)) for series in _pooled_residuals(joint))
+
+
+def has_independent_residuals(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+    """Whether the residuals of every output are independent of all inputs, so that the structure lacks no dynamics.
+
+    False if a run is too short for the test, or an input is constant.
+    """
+    names = [n for n in structure.signals if n in runs[0].inputs]
+    # Residuals exclude the first and the last sample.
+    inputs = [[interpolate_gaps(compared_values(run, structure, n)[1:-1]) for run in runs] for n in names]
+    series = [[part[o] for part in joint.residuals] for o in joint.noise]
+    return all(is_independent(one, inputs) for one in series)
 
 
 def _pooled_residuals(joint: JointFit) -> list[Floats]:

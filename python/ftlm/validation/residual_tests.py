@@ -588,6 +588,16 @@ def _independence(
     return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
 
 
+def is_independent(series: list[Floats], signals: Sequence[list[Floats]], lags: int = DEFAULT_LAGS) -> bool:
+    """Whether the residuals `series`, one array per run, are independent of past values of all `signals`.
+
+    False if a run is too short for the test, or a signal is constant.
+    """
+    if min(e.size for e in series) < 2 * lags + 1:
+        return False
+    return all(_independence(series, s, NoiseModel.fit(series, s, lags), lags, first=0).passed for s in signals)
+
+
 def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
     """Return the variance of a cross-correlation: the normalized mean product of the squared signals at lags >= 0."""
     powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
