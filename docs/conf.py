@@ -1,4 +1,4 @@
-"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors; the reference is generated."""
+"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors, reference and pictures generated."""
 
 import sys
 from pathlib import Path
