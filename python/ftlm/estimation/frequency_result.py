@@ -479,7 +479,7 @@ class FrequencyIdentification:
             [
                 *lines,
                 *(f"note: {w}" for r in self.data for w in r.warnings),
-                *finding_lines(self.findings, choose_text("result.warnings", "--verbose shows all")),
+                *finding_lines(self.findings, choose_text("result.warnings", "--report FILE shows all")),
             ]
         )
 

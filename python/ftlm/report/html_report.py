@@ -577,8 +577,8 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
 
 
-def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
-    """Return sentences on the findings of several results, each with the labels of the results that have it.
+def grouped_findings(results: Mapping[str, Identification | None]) -> list[tuple[str, str]]:
+    """Return the findings of several results, as pairs of the labels of the results that have it and its sentence.
 
     Findings that differ only in numbers are merged; the sentence then has the numbers of the first one.
     """
@@ -589,7 +589,7 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
             key = (item.code, item.run, item.output, item.input, item.parameter, note)
             groups.setdefault(key, (item, []))[1].append(label)
     return [
-        f"{', '.join(dict.fromkeys(labels))}: {item}{'' if len(labels) == 1 else ' (numbers of the first)'}"
+        (", ".join(dict.fromkeys(labels)), f"{item}{'' if len(labels) == 1 else ' (numbers of the first)'}")
         for item, labels in groups.values()
     ]
 

@@ -97,7 +97,8 @@ def parameter_lines(result: Identification) -> list[str]:
     lines = [f"  {n:<{a}}  {v:>{b}} {s:<{c}}  {f'{u:<{d}}  ' if d else ''}{tail}".rstrip() for n, v, s, u, tail in rows]
     note = "± is one standard error; 95 % intervals are ± 1.96 of these"
     note += ", in brackets by profile likelihood" if result.profiles else ""
-    return [*lines, f"  ({note})"] if any(row[2].startswith("±") for row in rows) else lines
+    has_errors = any(not math.isnan(p.standard_error) for p in result.parameters.values())
+    return [*lines, f"  ({note})"] if has_errors else lines
 
 
 def behavior_lines(model: Model) -> list[str]:
@@ -207,7 +208,7 @@ def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[s
             lines += wrap_text(group.remedy, "  -> ")
     more = hidden_findings_text(groups)
     return (
-        [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--verbose shows all')})"]
+        [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--report FILE shows all')})"]
         if more
         else lines
     )

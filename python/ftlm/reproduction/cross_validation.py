@@ -519,7 +519,7 @@ def _deflection_section(full: Deflection) -> Section:
             f"With integer orders and with both free, fitted to {run}:",
             *(equation_html(e) for e in dict.fromkeys(e for m in models for e in m.equations)),
         ],
-        warnings=[*failed, *grouped_findings(results)],
+        warnings=[*failed, *(f"{models}: {sentence}" for models, sentence in grouped_findings(results))],
         tables=[estimates_table(d, suffix) for suffix, d in parts],
     )
 

@@ -286,7 +286,7 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         f"Stage {stage}",
         [*joint_equations(best.model), page_text("demo_tables")],
         warnings=first,
-        more=[*rest, *others],
+        more=[*rest, *(f"{models}: {sentence}" for models, sentence in others)],
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),

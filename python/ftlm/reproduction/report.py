@@ -193,8 +193,8 @@ def _fits_chart(
     present = [(label, c) for label, c in compared.items() if c is not None]
     if not present:
         return []
-    fits = ", ".join(f"{label} {c.output_error[output].fit:.4g} %" for label, c in present)
-    caption = f"Fit: {fits.replace('inf', '∞').replace('-', '−')}."
+    fits = ", ".join(f"{label} {format_bound(c.output_error[output].fit, '.4g')} %" for label, c in present)
+    caption = f"Fit: {fits}."
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
         caption += f" {page_text('filtered_rows')}"
     title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
@@ -555,10 +555,10 @@ def case_tables(reproduction: Reproduction) -> list[Table]:
     return [make_table("trials", rows.values(), weak_prior=WEAK_PRIOR), make_table("order_comparisons", orders)]
 
 
-def typeset(words: str) -> str:
-    """Return a text with typeset powers of ten, minus signs and K₀ in place of e-notation, hyphens and K0."""
-    powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPT_DIGITS)}", words)
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", powers).replace("K0", "K₀")
+def with_powers_of_ten(text: str) -> str:
+    """Return a text with powers of ten and K₀ in place of e-notation and K0."""
+    powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPT_DIGITS)}", text)
+    return powers.replace("K0", "K₀")
 
 
 def joint_equations(model: Model) -> list[str]:
@@ -573,14 +573,15 @@ def _verdict_section(reproduction: Reproduction) -> Section:
     """Return the section with one table row per checked claim, and with numbers and cases in a collapsed part."""
     rows: list[list[Cell]] = [
         [
-            typeset(c.claim),
-            Markup("<strong>{}</strong>").format(typeset(c.verdict)),
+            with_powers_of_ten(c.claim),
+            Markup("<strong>{}</strong>").format(with_powers_of_ten(c.verdict)),
             share_picture(c.ruling),
-            typeset(c.brief),
+            with_powers_of_ten(c.brief),
         ]
         for c in reproduction.checks
     ]
-    numbers = ([typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in reproduction.checks)
+    claims = ((c.claim, c.computed, c.printed, c.rule) for c in reproduction.checks)
+    numbers = ([*map(with_powers_of_ten, texts)] for texts in claims)
     return make_section(
         "verdicts",
         tables=[make_table("verdicts", rows)],
@@ -592,9 +593,9 @@ def _verdict_section(reproduction: Reproduction) -> Section:
 def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
     number, joint = stage.number, stage.candidates["output error"]
     tables = [model_table(stage), estimates_table(joint.result, reproduction.truth.get(number, {})), fits_table(stage)]
-    warned = [w.partition(": ") for w in grouped_findings({label: c.result for label, c in stage.candidates.items()})]
+    warned = grouped_findings({label: c.result for label, c in stage.candidates.items()})
     if warned:
-        rows = ([Markup("{}").format(models), typeset(words)] for models, _, words in warned)
+        rows = ([models, with_powers_of_ten(sentence)] for models, sentence in warned)
         tables.append(make_table("warnings", rows, stage=number))
     return make_section(
         "stage",
@@ -691,7 +692,7 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
     names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
     origin = page_text("simulated_origin") if reproduction.simulated else f"the runs {names},"
     strongest = page_text("strongest", brief=reproduction.checks[0].brief) if reproduction.ran else ""
-    lead = page_text("lead", origin=origin, strongest=typeset(strongest))
+    lead = page_text("lead", origin=origin, strongest=with_powers_of_ten(strongest))
     return write_page(path, title="The paper reproduced", sections=_sections(reproduction), lead=lead, force=force)
 
 

@@ -229,6 +229,7 @@ class ControllerSource:
         try:
             answer = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
         except Exception as error:
+            self._since = None
             self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {error_text(error)})", error)
         except BaseException:
             with contextlib.suppress(Exception):
@@ -249,7 +250,7 @@ class ControllerSource:
     def explain_fault(self, fault: str) -> str:
         """Return a fault message; add the computing time if the controller took over one sample or did not return."""
         where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
-        if self._since is not None and fault.startswith("stopped by"):
+        if self._since is not None:
             return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
         if self._took * self.rate > 1.0:
             return f"{fault}; the controller took {self._took:.3g} s to answer to {where}"

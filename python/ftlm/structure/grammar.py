@@ -464,11 +464,10 @@ class EquationParser(TokenReader):
             reason = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
             friction = "; friction is '- fc*sign(D y)', and drag '- w abs(D y)*D y'" if name == "sign" else ""
             raise self._error(f"{name}(…) at character {at + 1}: {reason}{friction}")
+        argument = self._group()
         try:
-            return apply(name, self._group())
+            return apply(name, argument)
         except ModelError as error:
-            if str(error).startswith("equation "):
-                raise
             raise self._error(f"at character {at + 1}: {error}") from error
 
     # ------------------------------------------------------------------------------------ derivatives and signals
