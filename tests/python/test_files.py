@@ -722,9 +722,10 @@ def test_measured_csv_and_mat_agree():
         outputs={angle: f"data_th{angle[-2:]}.3" for angle in ANGLES},
         units={**dict.fromkeys(ANGLES, "deg"), "I1": "A", "I2": "A"},
     )
+    converted = ", ".join(f"{angle} from deg to rad" for angle in ANGLES)
     for run in (from_csv, from_mat):
         assert (run.length, run.step, run.start, run.duration) == (9820, 0.002, 0.0, 19.638)
-        assert run.warnings == ()
+        assert run.warnings == (f"converted to SI units: {converted}",)
         run.require_outputs(ANGLES)
     for name in from_csv.signals:
         np.testing.assert_allclose(from_csv[name], from_mat[name], rtol=0, atol=1e-6)

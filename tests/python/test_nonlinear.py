@@ -291,4 +291,4 @@ def test_unit_of_the_coefficient_of_a_nonlinear_term(term, unit):
 def test_equation_of_a_page():
     model = ftlm.Model(ftlm.equation("D^1.5 y = -2 y^3 + 0.5 D^0.25 (abs(D y)*y - sqrt(y + 1)) - 3 cos(2 y)"))
     shown = re.sub(r"<[^>]+>|\s", "", str(equations_html(model)[0]))
-    assert shown == "D1.5y=−2.0000y3+0.50000D0.25(|D1y|y−y+1)−3.0000cos(2y)"
+    assert shown == "D1.5y=−2.0000y3+0.50000D0.25(|Dy|y−y+1)−3.0000cos(2y)"

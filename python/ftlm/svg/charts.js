@@ -190,9 +190,9 @@ function slider(svg, charts) {
     said.replaceChildren(...parts.map(([what, text]) => {
       const part = document.createElement("span"), strong = document.createElement("b");
       text.split(/\^(-?[\w.]+)/).forEach((piece, i) => {
-        const raised = document.createElement(i % 2 ? "sup" : "span");
-        raised.textContent = piece.replace("-", "\u2212");
-        strong.append(raised);
+        const raised = i % 2 ? document.createElement("sup") : strong;
+        raised.append(piece.replace("-", "\u2212"));
+        if (i % 2) strong.append(raised);
       });
       part.append(`${what} `, strong);
       return part;
