@@ -168,7 +168,7 @@ def test_dry_friction_is_named_and_its_term_finds_it(kind, friction):
 
 
 def test_a_drag_that_drives_near_standstill_is_no_friction():
-    for seed in range(3):
+    for seed in range(2):
         g = np.random.default_rng(seed)
         u = np.repeat(g.uniform(-1, 1, 500), g.integers(4, 60, 500))[:500]
         y = np.zeros(500)
