@@ -63,8 +63,8 @@ impl Control {
 pub struct BatchPosition {
     /// Number of the batch. Earlier batches of the range are complete.
     pub batch: u64,
-    /// Number of candidates of the batch evaluated so far. They come first in the evaluation sequence of the candidates
-    /// that no bound excluded.
+    /// Number of evaluated candidates of the batch. The candidates that no bound excluded are evaluated in a fixed
+    /// sequence.
     pub evaluated_count: u64,
     /// End of the current chunk of candidates in the evaluation sequence, 0 if the batch has not been screened.
     pub end: u64,

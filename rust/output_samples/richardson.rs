@@ -110,10 +110,11 @@ impl RichardsonTable {
         }
     }
 
-    /// Return the estimate with the smallest expected change if the step is halved again; None without grids.
+    /// Return the estimate with the smallest expected change if the step is halved again; None before the first
+    /// simulation.
     ///
-    /// `owners` holds the output index of each initial term. If no output of the best column changes by more than
-    /// `enough`, no other estimate is tried.
+    /// `owners` holds the output index of each initial term. `measure` gives the change of each output between two
+    /// estimates. An estimate by which no output is expected to change by more than `enough` is returned at once.
     pub(super) fn estimate(&self, owners: &[usize], enough: f64, measure: Measure<'_>) -> Option<LimitEstimate> {
         let grid = self.grids.last()?;
         let (column, change) = self.best_column(grid);

@@ -42,8 +42,8 @@ pub enum InitialTerms {
         /// True if each output also has an unknown level.
         has_level: bool,
     },
-    /// Separate responses instead of their sum: the outputs from rest are followed by the outputs per unit of each term,
-    /// without inputs.
+    /// Separate responses instead of their sum: first the outputs from rest, then, for each initial term, the outputs
+    /// without inputs if this term is 1 and all others are 0.
     UnitResponses {
         /// Exponents by equation.
         exponents: Vec<Vec<f64>>,

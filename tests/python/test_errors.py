@@ -349,7 +349,7 @@ BAD = {
     ),
     "trace of free orders": (
         MODEL,
-        "a trace needs one equation whose orders are numbers",
+        "a convergence trace needs one equation whose orders are numbers",
         lambda: ftlm.multi_innovation_trace(run(), ftlm.equation(WORDS)),
     ),
     "unknown stage": (MODEL, "stage = 3 is not known", lambda: ftlm.flexible_link(form="published", stage=3)),

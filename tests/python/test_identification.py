@@ -482,8 +482,8 @@ def test_a_trace_that_diverges_is_infinite_there():
 @pytest.mark.parametrize(
     ("words", "options", "message"),
     [
-        ("D^alpha y = a y + b u", {}, "a trace needs one equation whose orders are numbers"),
-        ("D y = a y; D z = b z", {}, "a trace needs one equation whose orders are numbers"),
+        ("D^alpha y = a y + b u", {}, "a convergence trace needs one equation whose orders are numbers"),
+        ("D y = a y; D z = b z", {}, "a convergence trace needs one equation whose orders are numbers"),
         (WORDS, {"every": 0}, "every = 0 is not a whole number of at least 1"),
         (WORDS, {"every": "x"}, "every = 'x' is not a whole number of at least 1"),
         (WORDS, {"innovation_length": 0}, "innovation_length = 0"),

@@ -644,7 +644,7 @@ def test_warnings_that_differ_in_numbers_alone_stand_together(reproduction):
     edge = make_finding("order_on_edge", parameter="alpha1", value=1.05)
     one, two = replace(result, findings=(little[0], edge)), replace(result, findings=tuple(little[1:]))
     assert grouped_findings({"a": one, "b": two, "c": None}) == [
-        ("a, b", "y1: the simulation explains little of the output (NR 0.6) (numbers of the first)"),
+        ("a, b", "y1: the simulation explains little of the output (normalized residual 0.6) (numbers of the first)"),
         ("a", "order alpha1 = 1.05 is on the edge of its interval; widen it"),
-        ("b", "y2: the simulation explains little of the output (NR 0.6)"),
+        ("b", "y2: the simulation explains little of the output (normalized residual 0.6)"),
     ]

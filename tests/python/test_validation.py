@@ -241,8 +241,8 @@ def figures(nr):
             "the normalized residual (NR) of its simulation is nan, that of the equation error 0.001",
         ),
         ((1.0,), 0.01, 0.4, None),
-        ((1.0,), 0.01, 0.6, "the simulation (NR 0.6) is far worse than the equation error (0.01)"),
-        ((1.0,), 0.4, 0.6, "the simulation explains little of the output (NR 0.6)"),
+        ((1.0,), 0.01, 0.6, "the simulation (normalized residual 0.6) is far worse than the equation error (0.01)"),
+        ((1.0,), 0.4, 0.6, "the simulation explains little of the output (normalized residual 0.6)"),
         ((1.0,), np.nan, np.nan, "is far worse than the equation error"),
     ],
 )

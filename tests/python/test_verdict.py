@@ -331,7 +331,7 @@ def test_findings_survive_a_file(found, tmp_path):
     kept = replace_estimate(found.model, findings=(infinite.to_file(), BOUND.to_file()))
     read = ftlm.load_model(kept.save(tmp_path / "m.json")).estimate.findings
     assert [f.text for f in read] == [infinite.text, BOUND.text]
-    assert read[0].text == "y: the simulation explains little of the output (NR inf)"
+    assert read[0].text == "y: the simulation explains little of the output (normalized residual inf)"
     assert read[0].to_dict()["level"] == "do not use"
 
 

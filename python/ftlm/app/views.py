@@ -104,7 +104,7 @@ def model(item: Model) -> str:
 
 
 def comparison(session: Session) -> str:
-    """Return an HTML table of all finished models, sorted by verdict and then by worst fit, best first."""
+    """Return an HTML table of all finished models, by verdict and then by the smallest fit of an output, best first."""
     models = [m for m in session.models.values() if m.state == STATE_MADE and m.description is not None]
     models.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
     outputs = list(dict.fromkeys(f["output"] for m in models for f in (m.description or {})["fits"]))

@@ -268,10 +268,13 @@ def multi_innovation_trace(
         innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
     )
     if len(equation.equations) != 1 or equation.order_names:
-        raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
+        raise ModelError(
+            "a convergence trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)"
+        )
     if equation.offset != "none":
         raise ModelError(
-            f"a trace cannot estimate an offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
+            f"a convergence trace cannot estimate an offset, and offset = {equation.offset!r}; use "
+            f"{parameter('offset', 'none')}"
         )
     stride = check_integer("every", every, 1)
     rest = replace(equation, initial="rest")

@@ -231,7 +231,7 @@ def saved_findings(estimate: Estimate) -> list[Finding]:
 
 
 def result_findings(result: Identification) -> Iterator[Finding]:
-    """Yield the findings about a result without validation, most serious first within each level."""
+    """Yield the findings that lower the verdict on a result that is not validated, most important first."""
     for item in _against_result(result):
         yield replace(item, method=result.method)
 

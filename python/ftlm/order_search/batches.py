@@ -142,7 +142,8 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
 
     `axes` are the grid values of each free order. `laws` and `fixed` have one entry per equation. An entry of `laws` is
     (output index, law of alpha, terms), and a term is (signal index, law of its order). A law is (constant, weight of
-    each free order). `scales` are the numbers by which the scores of the equations are divided.
+    each free order). An entry of `fixed` is a list with the given coefficient of each term, None for an estimated one.
+    `scales` are the numbers by which the scores of the equations are divided.
     """
 
     axes: list[list[float]]

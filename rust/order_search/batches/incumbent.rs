@@ -45,9 +45,10 @@ pub(super) struct InitialIncumbent {
 }
 
 impl BatchEvaluation<'_> {
-    /// Find an initial incumbent and select test vectors. If `thorough` is true, the neighbors of the best rows are
-    /// also evaluated. If `closely` is true, also decide whether the expensive bounds (unstable zeros and linearized
-    /// test vectors) save time.
+    /// Find an initial incumbent, and select the test vectors of the lower bounds that save time.
+    ///
+    /// If `thorough` is true, the neighbors of the best candidates are also evaluated. If `closely` is true, also decide
+    /// whether the expensive bounds (by unstable zeros and by linearized test vectors) save time.
     pub(super) fn find_incumbent(&mut self, thorough: bool, closely: bool) -> Result<InitialIncumbent> {
         let candidate_index = self.candidate_index;
         let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);

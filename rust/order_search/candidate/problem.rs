@@ -336,7 +336,7 @@ impl Problem {
         })
     }
 
-    /// Return an empty set of linearized test vectors.
+    /// Return a set of linearized test vectors, by which lower bounds of the error are computed, without any vector.
     pub(crate) fn empty_linearized_vectors(&self) -> LinearizedVectors {
         LinearizedVectors::new(&self.banks, &self.targets, self.options.norm)
     }

@@ -76,7 +76,7 @@ impl Interval {
 
 /// Result of a search for a bound.
 pub enum BoundOutcome {
-    /// Interval with the bound on this side of the optimum.
+    /// Interval of which the bound that was searched for is known; the other bound is not.
     Found(Interval),
     /// The budget is exhausted, or the search was canceled.
     Paused,
