@@ -292,7 +292,13 @@ def rubbing_mass(
     return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + 0.02 * y.std() * g.standard_normal(rows)})
 
 
-@pytest.mark.parametrize(("spring", "own"), [(1.0, {"a0": -1.0, "a1": -0.8}), (0.0, {"a1": -0.8})])
+@pytest.mark.parametrize(
+    ("spring", "own"),
+    [
+        pytest.param(1.0, {"a0": -1.0, "a1": -0.8}, marks=pytest.mark.slow),
+        (0.0, {"a1": -0.8}),
+    ],
+)
 def test_auto_finds_dry_friction_rather_than_higher_orders(spring: float, own: dict[str, float]) -> None:
     run = rubbing_mass(1, spring, 0.25)
     found = ftlm.select(run, "auto", threads=1).best
@@ -340,7 +346,7 @@ def test_blocks_in_which_the_output_rests_are_fitted_too(seed):
     assert found.winner.validation_fit > 80
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_fit_of_a_candidate_is_that_of_its_optimum(seed):
     """An integrator with a lag that rests at a level in colored noise: offsets of comparisons are those of the fits."""
     g = np.random.default_rng(seed)

@@ -102,7 +102,9 @@ def test_a_given_delay_that_is_wrong_is_named_beside_the_right_one(rows, given):
 
 
 @pytest.mark.parametrize(
-    "noise", [[1.0], [1.0, -0.95], [1.0, -1.92 * np.cos(0.2), 0.9216]], ids=["white", "AR1", "AR2"]
+    "noise",
+    [[1.0], [1.0, -0.95], pytest.param([1.0, -1.92 * np.cos(0.2), 0.9216], marks=pytest.mark.slow)],
+    ids=["white", "AR1", "AR2"],
 )
 def test_colored_noise_is_no_missing_dynamics(noise):
     right = [codes_of(record([1.0], [1 / RATE, 1.0], 0, seed, noise)) & CODES for seed in range(30)]
@@ -167,6 +169,7 @@ def test_dry_friction_is_named_and_its_term_finds_it(kind, friction):
         assert not {f.code for f in better.findings} & CODES
 
 
+@pytest.mark.slow
 def test_a_drag_that_drives_near_standstill_is_no_friction():
     for seed in range(2):
         g = np.random.default_rng(seed)

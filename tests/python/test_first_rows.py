@@ -584,6 +584,7 @@ def test_a_nonlinear_plant_with_an_offset_of_its_input_agrees_with_its_different
     assert result.comparison.offsets[0]["y"]["constant"] == pytest.approx(-0.5, abs=0.02)
 
 
+@pytest.mark.slow
 def test_colored_noise_of_an_integrator_is_rarely_taken_for_an_offset():
     estimated = []
     for seed in range(20):
@@ -676,7 +677,7 @@ def test_runs_in_motion_at_a_level_have_the_gain_of_the_plant(mean):
     ("name", "stage", "text"),
     [
         ("lqr", 1, "D^2 y = d D y + a y + b D^2 u"),
-        ("psf", 2, "D^2 y = d D^mu y + a y + b D^gamma u"),
+        pytest.param("psf", 2, "D^2 y = d D^mu y + a y + b D^gamma u", marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_begins_slowly_is_compared_as_it_was_fitted(name, stage, text):

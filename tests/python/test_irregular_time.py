@@ -80,6 +80,7 @@ def coverage(jitter: float) -> tuple[dict[str, int], list[list[float]]]:
     return covered, errors
 
 
+@pytest.mark.slow
 def test_regular_times_leave_intervals_that_cover() -> None:
     covered, _ = coverage(0.0)
     assert min(covered.values()) >= 27, covered

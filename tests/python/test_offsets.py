@@ -374,7 +374,7 @@ def test_auto_leaves_a_record_without_an_offset_as_it_was():
     assert found.standard_errors == plain.standard_errors
 
 
-@pytest.mark.parametrize("kind", ["motor", "coloured"])
+@pytest.mark.parametrize("kind", ["motor", pytest.param("coloured", marks=pytest.mark.slow)])
 def test_the_test_for_an_offset_keeps_its_level(kind):
     # At the true numbers, 60 seeds: 1 % is 0.6; at most 4 with a probability of 99.9 %. Chi-squared of one degree has
     # the mean 1 and the deviation 1.4.

@@ -70,7 +70,7 @@ def test_a_start_that_is_given_is_kept_and_the_way_is_named(initial):
     assert "output-error" not in default.verdict.remedy
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_structure_of_an_unstable_plant_is_found(seed):
     """Inverted pendulum D^2 y = w^2 (y + u) under proportional-derivative control, noise in the measurement."""
     g, rate, step = np.random.default_rng(seed), 0.4, 0.12
