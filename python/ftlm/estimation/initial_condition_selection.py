@@ -117,13 +117,11 @@ class InitialConditionFits:
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
         """Return a fit of a structure whose initial conditions differ from those of `fit`; None if not accepted.
 
-        The new fit starts from the optimum of `fit` if `fit` has a joint fit, :attr:`complete` is given, and an order
-        is free or fractional. Otherwise it starts from automatic initial guesses: with integer orders they cost little,
-        and the optimum of `fit` may be far from the new one. The function `accepts` decides from the new joint fit
-        whether it is accepted.
+        The new fit starts from the optimum of `fit` if `fit` has a joint fit and :attr:`complete` is given, otherwise
+        from automatic initial guesses. The function `accepts` decides from the new joint fit whether it is accepted.
         """
         joint, runs = fit.joint, fit.task.runs
-        if joint is None or self.complete is None or not has_memory(structure):
+        if joint is None or self.complete is None:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
@@ -215,10 +213,10 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     is_quiet, least, candidate = _has_quiet_samples(fit), math.inf, None
     starts: list[tuple[Initial, Offset]] = [("caputo", structure.offset)]
     if structure.offset == "none" and fits.may_add_offset:
-        starts.append(("caputo", "level"))
+        starts.insert(0, ("caputo", "level"))
         if not is_quiet:
-            starts.insert(0, ("rest", "level"))
-    for initial, offset in starts:
+            starts.append(("rest", "level"))
+    for k, (initial, offset) in enumerate(starts):
         request = replace(structure, initial=initial, offset=offset)
 
         def is_better(candidate: JointFit, *, least: float = least) -> bool:
@@ -226,11 +224,17 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
             gain = fit_score_gain(candidate, joint, candidate if is_complete else joint)
             return gain > START_SETTINGS.history_margin and fit_score(candidate, joint) < least
 
+        # The optimum from rest may be far from that of the most general start. With integer orders, automatic guesses
+        # cost little.
+        fresh = k == 0 and not has_memory(structure)
+        previous_fit = fit if candidate is None else candidate[1]
         try:
-            other = fits.refit(request, fit, is_better)
+            other = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_better)
         except FtlmError:
             continue
         if other is None or other.joint is None or other.joint.unstable_optimum is not None:
+            continue
+        if not is_better(other.joint):
             continue
         if slow or has_white_residuals(other.joint):
             least, candidate = fit_score(other.joint, joint), (request, other)
@@ -243,8 +247,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
     Both information criteria that are compared use the noise spectrum of the fit with the larger residuals. If
-    `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used, otherwise those of
-    :meth:`InitialConditionFits.refit`.
+    `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used. They are also used for
+    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -259,7 +263,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" else None]:
         request = replace(structure, initial=initial, offset="level")
         try:
-            fresh = candidate is None and is_suggested
+            # With integer orders, automatic guesses cost little and lead to the best optimum.
+            fresh = candidate is None and (is_suggested or not has_memory(structure))
             previous_fit = fit if candidate is None else candidate[1]
             level = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
