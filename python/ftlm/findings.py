@@ -306,7 +306,7 @@ def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
 
 
 def on_validation(findings: Iterable[Finding], run: str) -> list[Finding]:
-    """Return copies of findings that are marked as findings on the validation run named `run`."""
+    """Return copies of findings, marked as coming from the validation run with the name `run`."""
     return [msgspec.structs.replace(f, run=f.run or run, role=VALIDATION_ROLE) for f in findings]
 
 

@@ -133,10 +133,10 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
 
 
 def conversion_notes(units: Mapping[str, str]) -> tuple[str, ...]:
-    """Return a note for the run on the signals of a file that are converted to SI units; () without such a signal.
+    """Return a tuple with a note that names the signals of a file that are converted to SI units; () without any.
 
-    `units` has the unit of the file by signal. Results have no other units than SI, because numbers, limits and
-    functions such as sin(y) in a structure are in SI units.
+    `units` has the unit in the file by signal. Results are in SI units, because numbers, limits and functions such as
+    sin(y) in a structure are.
     """
     pairs = {name: (unit, SIGNAL_UNITS[unit]) for name, unit in units.items() if unit in SIGNAL_UNITS}
     converted = [f"{name} from {unit} to {si}" for name, (unit, (si, factor)) in pairs.items() if factor != 1.0]

@@ -172,8 +172,9 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
 
     Residuals at the level of rounding and discretization errors are not tested.
 
-    An input that a controller computes from the same sample of the output contains the noise of this sample. Every
-    extension by which the input acts earlier would predict this noise, so the dynamics of such an input are not tested.
+    If a controller computes an input from the output of the same row, the input contains the noise of this row. An
+    extension by which the input acts sooner would seem to improve the fit, because it reproduces this noise. Extensions
+    of the dynamics of such inputs are therefore not tested.
 
     Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
     with a coefficient law are tested only for a constant, a drift and intersample behavior. Structures with other
@@ -266,7 +267,10 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _inputs_fed_back_within_row(model: Model, tests: Residuals) -> set[str]:
-    """Return the inputs that depend on an output without delay; an empty set for a model with a non-linear term."""
+    """Return the inputs that, by the feedback tests, depend on an output of the same row.
+
+    The result is empty for a non-linear model, which has no static gain.
+    """
     loops = {(output, name): t for output, r in tests.outputs.items() for name, t in r.feedback_tests.items()}
     states = steady_states(model) if model.structure.is_linear else ()
     return {

@@ -193,11 +193,13 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
 def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
     """Return a fit with nonzero initial conditions or a level if residuals contradict a start from rest, else None.
 
-    A few quiet samples do not distinguish slow motion from rest. With white residuals, rest is kept. If the
-    residuals are not white but have no slow component, those of the new fit must be white. The information criteria
-    use the noise color of the fit from rest, because its residuals may be due to dynamics that the structure lacks. If
-    the residuals of the new fit are independent of the inputs, it lacks no dynamics, and its noise color is used.
-    Quiet samples before a step show a level, whereas residuals then say little about dynamics.
+    A level is a constant that is added to the output. Rest is kept if the residuals are white. If they are colored
+    without a slow component, the new fit is accepted only if its own residuals are white.
+
+    Both fits are compared by an information criterion with one noise color. It is that of the new fit if its residuals
+    are independent of the inputs, because no dynamics are missing then. Otherwise it is that of the fit from rest:
+    residuals due to missing dynamics then count as noise, which initial conditions are not meant to explain. It is also
+    that of the fit from rest if a run has constant samples before its first input change, in which a level is visible.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.is_linear

@@ -452,7 +452,7 @@ def fit_score(joint: JointFit, reference: JointFit) -> float:
 
 
 def fit_score_gain(joint: JointFit, other: JointFit, reference: JointFit) -> float:
-    """Return by how much the criterion of `joint` is below that of `other`, with the noise color of `reference`."""
+    """Return the decrease of :func:`fit_score` from `other` to `joint`, both with the noise color of `reference`."""
     return fit_score(other, reference) - fit_score(joint, reference)
 
 
@@ -480,9 +480,9 @@ def has_white_residuals(joint: JointFit) -> bool:
 
 
 def has_independent_residuals(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether the residuals of every output are independent of all inputs, so that the structure lacks no dynamics.
+    """Whether the residuals of every output are independent of present and past inputs: no dynamics are missing.
 
-    False if a run is too short for the test, or an input is constant.
+    Also False if a run is too short for the test, or an input is constant.
     """
     names = [n for n in structure.signals if n in runs[0].inputs]
     # Residuals exclude the first and the last sample.

@@ -125,7 +125,7 @@ class Table:
         return [" ".join(Markup(part).striptags() for part in pair if part) for pair in pairs]
 
     def split(self, column: int) -> tuple[Table, Table]:
-        """Return the columns before index `column` and those from it on as two tables, both with the names of rows."""
+        """Return two tables, split before the column with index `column`; both have the names of the rows."""
         ends = list(accumulate(width for _, width in self.groups))
         at = ends.index(column) + 1 if ends else 0
         left = replace(

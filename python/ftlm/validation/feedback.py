@@ -110,9 +110,10 @@ class FeedbackTest:
         return self.state == "found"
 
     def is_feedback_within_row(self, gain: float) -> bool:
-        """Whether input and output are correlated in the same sample only, as negative feedback without delay does it.
+        """Whether the input is correlated with the output innovation in the same row only, as by immediate feedback.
 
-        The correlation then has the sign opposite to that of the static `gain`. Direct feedthrough has the same sign.
+        The sign of the correlation is opposite to that of the static `gain` of the plant. A missing direct feedthrough
+        gives the same sign.
         """
         return self.state == "undecided" and self.same_row * math.copysign(1.0, gain) < -1.0
 

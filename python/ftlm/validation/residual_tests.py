@@ -589,9 +589,9 @@ def _independence(
 
 
 def is_independent(series: list[Floats], signals: Sequence[list[Floats]], lags: int = DEFAULT_LAGS) -> bool:
-    """Whether the residuals `series`, one array per run, are independent of past values of all `signals`.
+    """Whether residuals (`series`, one array per run) are uncorrelated with all `signals` at delays up to `lags` rows.
 
-    False if a run is too short for the test, or a signal is constant.
+    Also False if a run is too short for the test, or a signal is constant.
     """
     if min(e.size for e in series) < 2 * lags + 1:
         return False
