@@ -25,7 +25,7 @@ from ftlm.estimation.output_error import (
 )
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import compared_values
+from ftlm.simulation.discretization import values_at_residuals
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
     common_initial_conditions,
@@ -485,8 +485,7 @@ def has_independent_residuals(joint: JointFit, runs: Sequence[Run], structure: S
     Also False if a run is too short for the test, or an input is constant.
     """
     names = [n for n in structure.signals if n in runs[0].inputs]
-    # Residuals exclude the first and the last sample.
-    inputs = [[interpolate_gaps(compared_values(run, structure, n)[1:-1]) for run in runs] for n in names]
+    inputs = [[interpolate_gaps(values_at_residuals(run, structure, n)) for run in runs] for n in names]
     series = [[part[o] for part in joint.residuals] for o in joint.noise]
     return all(is_independent(one, inputs) for one in series)
 

@@ -16,7 +16,7 @@ from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem, describe_collinear_inputs
 from ftlm.estimation.objective import Iterate, propagated_errors
 from ftlm.model.model import FitParameters, Model
-from ftlm.simulation.discretization import compared_values, recording
+from ftlm.simulation.discretization import recording, values_at_residuals
 from ftlm.structure.input_nonlinearity import input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Initial, Structure
@@ -274,13 +274,12 @@ def run_multistart(
 def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProblem:
     """Return the estimation problem of a structure; raise DataError if the runs have too few samples."""
     problem = FreeProblem.of(structure)
-    values = [compared_values(run, structure, output) for run in runs for output in structure.outputs]
-    samples = sum(max(drop_missing(samples_of_output).size - 2, 0) for samples_of_output in values)
+    values = [values_at_residuals(run, structure, output) for run in runs for output in structure.outputs]
+    samples = sum(drop_missing(samples_of_output).size for samples_of_output in values)
     if samples <= len(problem.names):
         raise DataError(
-            f"{samples} samples between the first and the last do not determine {len(problem.names)} free "
-            f"parameters; use "
-            "longer runs, or fix orders or coefficients"
+            f"{samples} samples that are compared with the simulation do not determine {len(problem.names)} free "
+            "parameters; use longer runs, or fix orders or coefficients"
         )
     return problem
 

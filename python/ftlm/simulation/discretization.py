@@ -620,3 +620,14 @@ def compared_values(run: Run, structure: Structure, name: str) -> Floats:
     if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run[name]
     return run.sample_times.data[name][run.sample_times.indices_within(run.duration)]
+
+
+def values_at_residuals(run: Run, structure: Structure, name: str) -> Floats:
+    """Return the measured values of a signal at the times of a fit's residuals; NaN for missing samples.
+
+    A fit compares all nonuniform samples after t = 0, and all uniform samples except the first and the last.
+    """
+    values = compared_values(run, structure, name)
+    if has_nonuniform_samples(run, structure):
+        return values[compared_times(run, structure) > 0.0]
+    return values[1:-1]

@@ -14,7 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import longest_delay
 from ftlm.estimation.nuisance_parameters import has_white_residuals
 from ftlm.estimation.output_error import JointFit
-from ftlm.simulation.discretization import compared_values
+from ftlm.simulation.discretization import values_at_residuals
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
@@ -273,8 +273,7 @@ class AutomaticSelection:
         best = fits[0]
         problem, end = self.problem, self.problem.suffix
         residuals = [part[problem.output] for part in best.joint.residuals]
-        # Residuals exclude the first and the last sample.
-        signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in problem.runs] for n in problem.drivers}
+        signals = {n: [values_at_residuals(r, best.structure, n) for r in problem.runs] for n in problem.drivers}
         coefficients = best.joint.coefficients
         names = []
         for number, name in problem.numbered_drivers:
