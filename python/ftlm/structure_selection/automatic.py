@@ -10,8 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from ftlm.data.run import Run
+from ftlm.data.runs import as_runs
 from ftlm.data.sampling import longest_delay
+from ftlm.errors import FtlmError
+from ftlm.estimation.closed_loop import run_with_inputs
+from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.nuisance_parameters import has_white_residuals
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import values_at_residuals
@@ -20,10 +26,12 @@ from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import (
     Trial,
+    fit,
     fit_criterion,
     residual_variance_inflation,
 )
 from ftlm.structure_selection.stepwise import CandidateEvaluator
+from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import feedback_test
 from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
 
@@ -185,6 +193,13 @@ def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
     """Return fits sorted by BIC, best first; BIC uses the smallest variance inflation among them."""
     inflation = min((f.variance_inflation for f in fits), default=1.0)
     return sorted((replace(f, bic=fit_criterion(f.joint, inflation)) for f in fits), key=lambda f: f.bic)
+
+
+def _fit_form(problem: OutputProblem, form: IntegerOrderForm) -> FittedForm:
+    """Return the fit of a form to the runs of a problem."""
+    structure = form.structure(problem)
+    joint = fit(problem.runs, structure, [], refine=False)
+    return FittedForm(structure, joint, form, residual_variance_inflation(joint))
 
 
 @dataclass
@@ -359,13 +374,43 @@ class AutomaticSelection:
         changes_sign = math.isfinite(self.problem.tanh_slope)
         position = replace(speed, order=2, friction="derivative")
         for form in (speeds if changes_sign else []) + [position, replace(position, integrator=True)]:
-            if fits and not has_white_residuals(fits[0].joint):
+            if fits and not has_white_residuals(fits[0].joint) and self._is_friction_likely(form):
                 # Negative friction would add energy, so it is not physical.
                 friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
                 ranked = _rank([*fits, *friction_fits])
                 least = min(f.bic for f in ranked if f.form != form)
                 fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
         return fits
+
+    def _is_friction_likely(self, form: IntegerOrderForm) -> bool:
+        """Whether a friction force, known from a fit of the form without friction, is a significant further input.
+
+        The force opposes the simulated motion. It is significant if it lowers BIC and its coefficient has the sign of
+        friction. Both fits are linear, so that they cost much less than a fit with friction. Also True if a fit fails.
+        """
+        problem, linear = self.problem, replace(form, friction="none")
+        try:
+            without = _fit_form(problem, linear)
+            model, runs = fitted_model(without.joint, without.structure), as_runs(problem.runs)
+            row = model.outputs.index(problem.output)
+            outputs = [samples.outputs[row] for samples in simulate_runs(model, runs)]
+            is_speed = form.friction == "output"
+            forces = [np.tanh(problem.tanh_slope * y) if is_speed else np.sign(np.gradient(y)) for y in outputs]
+            name = f"{problem.output}.friction"
+            with_force = _fit_form(
+                replace(
+                    problem,
+                    runs=[run_with_inputs(run, {name: -force}) for run, force in zip(runs, forces, strict=True)],
+                    drivers=(*problem.drivers, name),
+                    delays={**problem.delays, name: 0.0},
+                ),
+                linear,
+            )
+        except FtlmError:
+            return True
+        is_better = _rank([without, with_force])[0].structure is with_force.structure
+        coefficient = with_force.joint.coefficients[f"b{len(problem.drivers) + 1}_0{problem.suffix}"]
+        return is_better and coefficient > 0.0
 
     def _validate(self, candidates: Sequence[FittedForm]) -> FittedForm | None:
         """Validate fitted forms, and return the one with the best prediction; None if no validation succeeds."""
