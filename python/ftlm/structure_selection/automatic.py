@@ -30,7 +30,7 @@ from ftlm.structure_selection.cross_validation import (
     fit_criterion,
     residual_variance_inflation,
 )
-from ftlm.structure_selection.stepwise import CandidateEvaluator
+from ftlm.structure_selection.stepwise import CandidateEvaluator, initial_guesses
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import feedback_test
 from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
@@ -235,9 +235,22 @@ class AutomaticSelection:
             self._validate(fractional[:VALIDATED_FRACTIONAL])
         return self.evaluator.trials
 
-    def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
-        """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial."""
-        return self._fit_structures([(f.structure(self.problem), f, []) for f in dict.fromkeys(forms)])
+    def _fit(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm] = ()) -> list[FittedForm]:
+        """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial.
+
+        A form with friction starts from the best of the similar `fits`, because automatic initial guesses of friction
+        cost much. All other forms start from automatic initial guesses.
+        """
+        items = []
+        for form in dict.fromkeys(forms):
+            structure = form.structure(self.problem)
+            kind = form.friction, form.order
+            similar = [f for f in fits if f.form and kind == (f.form.friction, f.form.order)]
+            use = form.friction != "none" and similar
+            items.append(
+                (structure, form, initial_guesses(structure, similar[0].joint.values_by_name, {}) if use else [])
+            )
+        return self._fit_structures(items)
 
     def _fit_structures(
         self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
@@ -269,7 +282,7 @@ class AutomaticSelection:
             for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
             if form not in {f.form for f in fits}
         ]:
-            integer_fits = self._fit(fewer)
+            integer_fits = self._fit(fewer, fits)
             if not integer_fits:
                 break
             fits = _rank([*fits, *integer_fits])
@@ -313,7 +326,7 @@ class AutomaticSelection:
             near = [n for form in new if form for n in _neighbors(form) if self._is_admissible(n)]
             more = [n for n in dict.fromkeys(near) if n not in forms_before]
             forms_before.update(more)
-            fits = _rank([*fits, *self._fit(more)])
+            fits = _rank([*fits, *self._fit(more, fits)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
         return fits
 
@@ -376,7 +389,9 @@ class AutomaticSelection:
         for form in (speeds if changes_sign else []) + [position, replace(position, integrator=True)]:
             if fits and not has_white_residuals(fits[0].joint) and self._is_friction_likely(form):
                 # Negative friction would add energy, so it is not physical.
-                friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
+                friction_fits = [
+                    f for f in self._fit([form], fits) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0
+                ]
                 ranked = _rank([*fits, *friction_fits])
                 least = min(f.bic for f in ranked if f.form != form)
                 fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
