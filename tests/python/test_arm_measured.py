@@ -169,6 +169,7 @@ def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
 
 
 @needs_data
+@pytest.mark.slow
 def test_freeing_the_order_of_an_input_costs_nothing_on_a_short_step() -> None:
     # A screening that ends too early, or a fit that is stopped in its flat valley, takes another start of the run.
     angles = {"theta11": "th11_deg", "theta12": "th12_deg"}

@@ -174,10 +174,10 @@ def test_where_a_hub_starts_moves_nothing(nu: float) -> None:
     ("orders", "passes"),
     [
         ((1.9, 0.95, 2.1), None),
-        ((1.8, 0.9, 1.95), None),
-        ((1.95, 1.1, 2.0), None),
+        pytest.param((1.8, 0.9, 1.95), None, marks=pytest.mark.slow),
+        pytest.param((1.95, 1.1, 2.0), None, marks=pytest.mark.slow),
         ((1.9, 0.95, 2.1), [False, True]),
-        ((1.95, 1.1, 2.0), [True, True]),
+        pytest.param((1.95, 1.1, 2.0), [True, True], marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:

@@ -46,7 +46,7 @@ ASKED = {
 
 @pytest.mark.parametrize("name", ASKED)
 def test_a_short_record_ends_in_a_result_or_in_words(name):
-    for seed in range(150 if name.startswith("identify") else 30):
+    for seed in range(60 if name.startswith("identify") else 15):
         with contextlib.suppress(*IN_WORDS):
             str(ASKED[name](record(seed)))
 
