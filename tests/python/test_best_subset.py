@@ -7,10 +7,11 @@ import pytest
 from scipy import signal
 
 import ftlm
+from ftlm.structure_selection import best_subset
 from ftlm.structure_selection.best_subset import (
     MAX_EXHAUSTIVE_SUBSETS,
+    BaseModel,
     Column,
-    Products,
     SubsetScorer,
     base_models,
     score_subsets,
@@ -79,14 +80,21 @@ def by_scipy(runs, subset, own):
     return float(np.mean(scores)), dict(zip(subset, every, strict=True))
 
 
-def test_the_products_say_what_scipy_says(runs):
+def score_at(monkeypatch, point, ground, runs):
+    """Return the scores at one grid point, without refinement."""
+    monkeypatch.setattr(BaseModel, "grid_points", lambda _: [point])
+    monkeypatch.setattr(best_subset, "GRID_REFINEMENTS", 0)
+    return score_subsets(ground, Folds.of(runs, "runs"), Alone())
+
+
+def test_the_products_say_what_scipy_says(runs, monkeypatch):
     """At given own coefficients: every subset fitted on one run and judged on the other one, and fitted on both."""
     every = base_models(NestedStructures(ftlm.equation(WORDS, initial="rest")), tuple(runs))
     ground = next(g for g in every if len(g.own) == 2)
     point = (math.log(5.0), math.log(0.3))
     own = ground.coefficients(point)
     assert own == pytest.approx({"a": -25.0, "d": -1.5})
-    found = score_subsets(ground, Folds.of(runs, "runs"), Alone(), [point])
+    found = score_at(monkeypatch, point, ground, runs)
     assert len(found) == 15
     for one in found:
         subset = sorted(set(one.start) - {"a", "d"})
@@ -125,7 +133,7 @@ def test_too_many_subsets_are_widened_and_the_best_is_among_them():
         values.append(rows.T @ rows)
     made = tuple(Column(f"c{k}", f"u{k}", 0.0, ()) for k in range(count))
     judge = SubsetScorer(made, ((1,), (0,), (0, 1)), (0, 1), np.array([values[0][-1, -1], values[1][-1, -1]]))
-    found = judge.score_all(Products([()], np.array([values])))
+    found = judge.score_all(np.array([values]))
     assert 2**count > MAX_EXHAUSTIVE_SUBSETS > len(found)
     best = min(found.values(), key=lambda v: v.score).score
     assert found[true].score < best + 0.02
@@ -133,7 +141,7 @@ def test_too_many_subsets_are_widened_and_the_best_is_among_them():
     assert all(v.score > best + 1.0 for s, v in found.items() if not set(true) <= set(s))
 
 
-def test_a_term_at_several_orders_is_one_at_a_time(runs):
+def test_a_term_at_several_orders_is_one_at_a_time(runs, monkeypatch):
     words = "D^2 y = a y + d D y + c0 D^g0 s + c1 D^g1 s + c3 v"
     inside = NestedStructures(
         ftlm.equation(words, initial="rest", orders={"g0": (0.0, 1.0, 0.1), "g1": (1.0, 2.0, 0.1)})
@@ -146,7 +154,7 @@ def test_a_term_at_several_orders_is_one_at_a_time(runs):
         ("c1", 2.0),
         ("c3", 0.0),
     ]
-    found = score_subsets(ground, Folds.of(runs, "runs"), Alone(), [(math.log(5.0), math.log(0.3))])
+    found = score_at(monkeypatch, (math.log(5.0), math.log(0.3)), ground, runs)
     # Both at order 1 are one term twice: (3 x 3 - 1 pairs, none included) x (v or not) less nothing at all.
     assert len(found) == 8 * 2 - 1
     assert "c0 s + c1 D^2 s" in " ".join(s.change.words for s in found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import math
@@ -280,7 +281,7 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
     control = python_control()
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
-    orders = {o.constant for item in model.equations for o in (item.order, *(term.order for term in item.terms))}
+    orders = {o.constant for item in model.equations for o in item.orders}
     _coefficients([(1.0, order) for order in sorted(orders)])
     inputs = response_inputs(model, coupled=True)
     filtered, top, bottom = _output_filter(model, inputs)
@@ -488,21 +489,14 @@ def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]
         for d in (d / d[0] for d in own):
             if not any(d.size == denominator.size and np.array_equal(d, denominator) for denominator in distinct):
                 distinct.append(d)
-        common = _product(distinct)
+        common = functools.reduce(np.convolve, distinct, np.ones(1))
         numerators = []
         for n, d in zip(top, own, strict=True):
             rest = [denominator for denominator in distinct if not np.array_equal(denominator, d / d[0])]
             values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
-            numerators.append(_product([values, *rest]) if values.size else np.zeros(1))
+            numerators.append(functools.reduce(np.convolve, rest, values) if values.size else np.zeros(1))
         fractions.append((common, numerators))
     return fractions
-
-
-def _product(factors: Sequence[Floats]) -> Floats:
-    out: Floats = np.ones(1)
-    for factor in factors:
-        out = np.convolve(out, factor)
-    return out
 
 
 def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:

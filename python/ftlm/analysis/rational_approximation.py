@@ -356,7 +356,7 @@ def _error_cause(model: Model, system: Approximation) -> str:
 
 def _exact_band(model: Model) -> tuple[float, float]:
     """Return a frequency band [rad/s] for a system that needs no approximation; raise ModelError for other models."""
-    orders = (o.constant for e in model.equations for o in (e.order, *(t.order for t in e.terms)))
+    orders = (o.constant for e in model.equations for o in e.orders)
     fractional = next((order for order in orders if not order.is_integer()), None)
     late = next((name for name, delay in model.structure.delay.items() if delay), None)
     if fractional is not None or late is not None:

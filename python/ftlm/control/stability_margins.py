@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from ftlm.analysis.frequency_response import (
 from ftlm.analysis.poles import stability
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
+from ftlm.utils.formatting import json_value
 from ftlm.utils.validation import Complex, Floats, as_complex
 
 #: Number of frequencies of a Nyquist curve, and its lowest frequency as a fraction of the crossover.
@@ -88,10 +89,7 @@ class LoopDesign:
 
     def _margins(self) -> dict[str, Any]:
         """Return the margins, nominal and for each parameter sample, as a dictionary for JSON."""
-        margins = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
-        for one in margins:
-            one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
-        return {"nominal": margins[0], "samples": margins[1:]}
+        return {"nominal": json_value(self.nominal), "samples": json_value(self.samples)}
 
     def _margin_lines(self) -> list[str]:
         """Return the margins as lines of text."""

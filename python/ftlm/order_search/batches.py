@@ -82,7 +82,7 @@ class SearchProblem(ABC, Generic[Table]):
     def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
         """Return an object of the Rust core that evaluates blocks of candidates; one serves all blocks of a search."""
 
-    @property
+    @cached_property
     def key(self) -> str:
         """Hexadecimal digest of records and arguments, which identifies the search in the cache of a worker process."""
         digest = hashlib.blake2b(digest_size=16)
@@ -400,11 +400,6 @@ class SearchState(ABC, Generic[Frame, Table]):
         self.threads = work.threads
         self.done = self.total = 0
 
-    @cached_property
-    def key(self) -> str:
-        """Key that identifies the search in the caches of the worker processes."""
-        return self.work.key
-
     def payload(self, block: CandidateBlock) -> SearchProblem[Table] | None:
         """Return the search problem if it is sent with the task of a block; None if workers have it cached."""
         return self.work if block.with_problem else None
@@ -493,7 +488,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function that evaluates a block of this search in a worker process, followed by its arguments."""
         ranged = block.first, block.last, self._seed, block.start, self.threads
-        return evaluate_rounds, self.key, self.payload(block), *ranged
+        return evaluate_rounds, self.work.key, self.payload(block), *ranged
 
     def frame(self, number: int, block: CandidateBlock, piece: Part) -> Rounds:
         """Return the checkpoint record with the partial result of a block of rounds (groups of candidates)."""
@@ -555,7 +550,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function that evaluates a block of candidates in a worker process, followed by its arguments."""
-        return evaluate_candidates, self.key, self.payload(block), self._candidate_spans(block), self.threads
+        return evaluate_candidates, self.work.key, self.payload(block), self._candidate_spans(block), self.threads
 
     def _candidate_spans(self, block: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans (equation, first index, exclusive end, limit of the score).
@@ -626,8 +621,7 @@ class Execution:
 
 def search_equation(work: EquationProblem, execution: Execution) -> _core._Found:
     """Run the order search of one equation, and return its result table."""
-    store = execution.store
-    if store is None and execution.executor is None:
+    if execution.store is None and execution.executor is None:
         return work.search(execution.progress)
     return _run_batches(EquationSearchState(work), execution)
 

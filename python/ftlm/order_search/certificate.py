@@ -101,14 +101,15 @@ def certify_orders(
     KeyboardInterrupt
         On Ctrl-C, within half a second.
     """
-    share = _check_tolerance(tolerance)
+    share = real_number("tolerance", tolerance)
+    if not 0 < share < 1:
+        raise ModelError(
+            f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 means that no orders may be better by more "
+            "than 5 %"
+        )
     most = check_integer("max_cells", max_cells, 1)
-    gap = real_number(
-        "min_separation",
-        (order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT)
-        if min_separation is None
-        else min_separation,
-    )
+    increment = order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT
+    gap = real_number("min_separation", increment if min_separation is None else min_separation)
     if not 0 < gap <= 1:
         raise ModelError(
             f"{setting('min_separation')} {min_separation!r} is outside (0, 1]; the increment of the order grid is "
@@ -142,8 +143,7 @@ def certify_orders(
     except ModelError as error:
         raise named_signals(error, record.signals) from None
     values = [answer["alpha"], *answer["orders"]] if answer["orders"] else []
-    names = [item.order, *(t.order for t in item.terms)]
-    orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
+    orders = {o.names[0]: v for o, v in zip(item.orders, values, strict=False) if o.names}
     nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
     return OrderCertificate(
         answer["at_least"],
@@ -205,16 +205,6 @@ def _check_certifiable(job: Job) -> None:
         )
 
 
-def _check_tolerance(tolerance: float) -> float:
-    share = real_number("tolerance", tolerance)
-    if not 0 < share < 1:
-        raise ModelError(
-            f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 means that no orders may be better by more "
-            "than 5 %"
-        )
-    return share
-
-
 def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
     """Return (NR, number of unstable poles) of the least-squares model at given orders.
 
@@ -228,6 +218,7 @@ def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
     except FtlmError:
         # No candidate has a finite score.
         return math.inf, math.nan
+    unstable_poles = math.nan
     with contextlib.suppress(FtlmError):
-        return result.score / job.standard_deviations()[0], result.model.stability().unstable_poles
-    return result.score / job.standard_deviations()[0], math.nan
+        unstable_poles = result.model.stability().unstable_poles
+    return result.score / job.standard_deviations()[0], unstable_poles

@@ -200,16 +200,16 @@ class SearchSettings:
         for name, value in (("top", top), ("innovation_length", length), ("prior_covariance", covariance)):
             object.__setattr__(self, name, value)
         if self.coefficients != "multi-innovation":
-            changed = [f.name for f in fields(self) if f.name in MULTI_INNOVATION_SETTINGS and self.differs(f.name)]
+            changed = [
+                f.name
+                for f in fields(self)
+                if f.name in MULTI_INNOVATION_SETTINGS and getattr(self, f.name) != f.default
+            ]
             if changed:
                 raise ModelError(
                     f"{parameter(changed[0])} is not used by {parameter('coefficients', self.coefficients)}; leave "
                     f"it out, or use {parameter('coefficients', 'multi-innovation')}"
                 )
-
-    def differs(self, name: str) -> bool:
-        """Whether the option `name` differs from its default."""
-        return bool(getattr(self, name) != getattr(type(self), name))
 
     @property
     def needs_haar(self) -> bool:

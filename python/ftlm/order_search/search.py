@@ -332,8 +332,7 @@ def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[Sea
     item = structure.equations[0]
 
     def orders_by_name(alpha: float, orders: list[float]) -> dict[str, float]:
-        pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
-        return {o.names[0]: v for o, v in pairs if o.names}
+        return {o.names[0]: v for o, v in zip(item.orders, (alpha, *orders), strict=True) if o.names}
 
     table = [
         SearchRow(

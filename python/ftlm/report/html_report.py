@@ -450,7 +450,7 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
     structure = model.structure
     if structure.has_nonlinear_terms:
         return []
-    orders = [order.constant for e in model.equations for order in (e.order, *(t.order for t in e.terms))]
+    orders = [order.constant for e in model.equations for order in e.orders]
     fractional = ", without an approximation of fractional orders" if any(order % 1.0 for order in orders) else ""
     words = f"Exact response of all equations together{fractional}."
     effects = ["friction"] if structure.has_friction else []
@@ -535,9 +535,8 @@ def _recursion_error_charts(result: Identification) -> list[LineChart]:
     figures = []
     for solved in result.model.equations:
         single = result.task.structure.equation(solved.output)
-        free = (single.equations[0].order, *(t.order for t in single.equations[0].terms))
-        numbers = (solved.order, *(t.order for t in solved.terms))
-        orders = {o.names[0]: n.constant for o, n in zip(free, numbers, strict=True) if o.names}
+        pairs = zip(single.equations[0].orders, solved.orders, strict=True)
+        orders = {o.names[0]: n.constant for o, n in pairs if o.names}
         at_orders = single.with_orders(orders)
         if not at_orders.coefficient_names:
             continue

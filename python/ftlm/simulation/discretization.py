@@ -258,7 +258,12 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     delay = structure.delay.get(name)
     if delay and name not in run.inputs:
         raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
-    check_early_input(run, name, delay if delay is not None else structure.free_delays.get(name, (0.0,))[0])
+    least_delay = delay if delay is not None else structure.free_delays.get(name, (0.0,))[0]
+    if least_delay < -run.step * (1.0 + MAX_EARLY_ROUNDING):
+        raise ModelError(
+            f"delay of {name} = {least_delay:g} s is a lead of more than one sampling interval ({run.step:g} s) of run "
+            f"{run.name!r}; shift the rows of that input"
+        )
     limits = [limit for limit in structure.limits if limit.signal == name]
     return {
         **channel,
@@ -268,15 +273,6 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         "delay": delay,
         "limits": [(limit.law, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
     }
-
-
-def check_early_input(run: Run, name: str, delay: float) -> None:
-    """Raise ModelError if an input has a negative delay (lead) of more than one sampling interval."""
-    if delay < -run.step * (1.0 + MAX_EARLY_ROUNDING):
-        raise ModelError(
-            f"delay of {name} = {delay:g} s is a lead of more than one sampling interval ({run.step:g} s) of run "
-            f"{run.name!r}; shift the rows of that input"
-        )
 
 
 def _check_known_inputs(structure: Structure) -> None:

@@ -303,7 +303,7 @@ def starts_at_rest(run: Run, structure: Structure) -> bool:
 
 def has_memory(structure: Structure) -> bool:
     """Whether an order is free or fractional, so that no finite-dimensional state represents the past."""
-    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
+    orders = [o for e in structure.equations for o in e.orders]
     return any(o.names or o.constant != round(o.constant) for o in orders)
 
 

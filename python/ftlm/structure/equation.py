@@ -216,10 +216,7 @@ class Friction:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free friction parameters."""
-        numbers = [self.coefficient] + (
-            [] if self.stribeck is None else [self.stribeck.coefficient, self.stribeck.speed]
-        )
-        return tuple(n for n in numbers if isinstance(n, str))
+        return tuple(n for n in self._parameters if isinstance(n, str))
 
     @property
     def identified_coefficients(self) -> dict[str, float]:
@@ -233,14 +230,12 @@ class Friction:
     @property
     def numbers(self) -> list[float]:
         """Coulomb coefficient and, with a Stribeck term, its coefficient and speed; no parameter may be free."""
-        stribeck_term = self.stribeck
-        return [
-            float(v)
-            for v in (
-                self.coefficient,
-                *(() if stribeck_term is None else (stribeck_term.coefficient, stribeck_term.speed)),
-            )
-        ]
+        return [float(v) for v in self._parameters]
+
+    @property
+    def _parameters(self) -> list[str | float]:
+        own = self.stribeck
+        return [self.coefficient, *([] if own is None else [own.coefficient, own.speed])]
 
     def with_numbers(self, values: Sequence[float]) -> Friction:
         """Return the friction with new parameter values, given in the sequence of :attr:`numbers`."""
@@ -434,9 +429,14 @@ class Equation:
         return tuple(dict.fromkeys([self.output, *(s for t in self.terms for s in t.signals)]))
 
     @property
+    def orders(self) -> tuple[Order, ...]:
+        """Order of the equation, then the orders of its terms."""
+        return (self.order, *(t.order for t in self.terms))
+
+    @property
     def order_names(self) -> tuple[str, ...]:
         """Names of the free orders, in the sequence in which they first occur."""
-        return tuple(dict.fromkeys(n for o in (self.order, *(t.order for t in self.terms)) for n in o.names))
+        return tuple(dict.fromkeys(n for o in self.orders for n in o.names))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:

@@ -144,13 +144,8 @@ class Expression:
             return n * argument_values[0] ** (n - 1) * inner[0]
         if self.operation in EXPRESSION_FUNCTIONS:
             return EXPRESSION_FUNCTIONS[self.operation][1](argument_values[0]) * inner[0]
-        total: Any = 0.0
-        for i, slope in enumerate(inner):
-            product = slope
-            for j, value in enumerate(argument_values):
-                product = product if i == j else product * value
-            total = total + product
-        return total
+        others = [[*argument_values[:i], *argument_values[i + 1 :]] for i in range(len(inner))]
+        return sum(math.prod(factors, start=slope) for factors, slope in zip(others, inner, strict=True))
 
     def split_factor(self) -> tuple[float, Expression]:
         """Return the constant factor of the expression (1 if it has none) and the expression without the factor."""

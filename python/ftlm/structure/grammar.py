@@ -30,6 +30,7 @@ expression in parentheses. Blanks between names, numbers and symbols do not matt
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 from collections.abc import Collection
@@ -689,14 +690,10 @@ class EquationParser(TokenReader):
         for _, bottom, _ in paths:
             if bottom not in denominators:
                 denominators.append(bottom)
-        whole = UNIT_POLYNOMIAL
-        for bottom in denominators:
-            whole = self._times(whole, bottom)
+        whole = functools.reduce(self._times, denominators, UNIT_POLYNOMIAL)
         self.left = [ParsedTerm(c, n, o, output) for c, n, o in whole]
         for top, own, signal in paths:
-            scaled = top
-            for bottom in denominators:
-                scaled = scaled if bottom == own else self._times(scaled, bottom)
+            scaled = functools.reduce(self._times, [bottom for bottom in denominators if bottom != own], top)
             self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
     def _laplace_signal(self) -> str:
@@ -820,10 +817,7 @@ class EquationParser(TokenReader):
                 f"the power {value!r} of a polynomial at character {at + 1} is not a whole number from 1 to "
                 f"{MAX_POLYNOMIAL_POWER}; only these give a sum of powers of s"
             )
-        product = UNIT_POLYNOMIAL
-        for _ in range(int(value)):
-            product = self._times(product, inner)
-        return product
+        return functools.reduce(self._times, [inner] * int(value), UNIT_POLYNOMIAL)
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
         """Return the product of two polynomials in s; terms with the same power and coefficient names are combined."""

@@ -331,7 +331,7 @@ class Structure:
     @property
     def order_names(self) -> tuple[str, ...]:
         """Names of the free orders: first those that equal the order of a term, then those only in expressions."""
-        orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
+        orders = [o for e in self.equations for o in e.orders]
         alone = [o.names[0] for o in orders if o.is_single]
         return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
 
@@ -343,7 +343,7 @@ class Structure:
     @property
     def has_order_law(self) -> bool:
         """Whether an order law relates the orders: an order is an expression, or two terms share a free order."""
-        orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms)) if o.names]
+        orders = [o for e in self.equations for o in e.orders if o.names]
         names = [o.names[0] for o in orders]
         return any(not o.is_single for o in orders) or len(set(names)) < len(names)
 

@@ -74,10 +74,6 @@ class Column:
     order: float
     names: tuple[str, ...]
 
-    def term(self, term: Term, name: str) -> Term:
-        """Return the term at this order with a new coefficient name."""
-        return replace(term, order=Order(self.order), coefficient=name)
-
 
 @dataclass(frozen=True)
 class BaseModel:
@@ -89,11 +85,6 @@ class BaseModel:
     own: tuple[tuple[str, float], ...]
     columns: tuple[Column, ...]
     runs: tuple[Run, ...]
-
-    @property
-    def highest_order(self) -> float:
-        """Highest order of the equation."""
-        return self.structure.equations[0].order.constant
 
     def grid_points(self) -> Iterator[tuple[float, ...]]:
         """Yield grid points, with coordinates ln(frequency) and ln(damping).
@@ -118,7 +109,8 @@ class BaseModel:
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
         ordered = sorted(self.own, key=lambda item: item[1])
-        return {n: -g * w ** (self.highest_order - order) for (n, order), g in zip(ordered, shares, strict=False)}
+        alpha = self.structure.equations[0].order.constant
+        return {n: -g * w ** (alpha - order) for (n, order), g in zip(ordered, shares, strict=False)}
 
     def is_stable(self, point: tuple[float, ...]) -> bool:
         """Whether the model is stable at a grid point; True if no coefficient of an output term is free."""
@@ -135,18 +127,6 @@ class BaseModel:
             if t.signal == item.output
         ]
         return not _core.has_unstable_pole(item.order.constant, own)
-
-
-@dataclass
-class Products:
-    """Gram matrices of the responses to the columns and of the residual of the model without inputs.
-
-    ``values`` has the shape (grid points, runs, columns + 1, columns + 1). The last row and column of each matrix
-    contain the inner products with the residual.
-    """
-
-    points: list[tuple[float, ...]]
-    values: Floats
 
 
 def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
@@ -200,7 +180,7 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
             names = term.order.names
             for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
                 column = Column(str(term.coefficient), term.signal, place, tuple(names))
-                column_term = column.term(term, f"column{len(columns)}")
+                column_term = replace(term, order=Order(place), coefficient=f"column{len(columns)}")
                 if _is_valid_input_set(structure, [*present, *input_terms, column_term], top, runs):
                     columns.append(column)
                     terms.append(column_term)
@@ -258,12 +238,10 @@ def _decimation(runs: Sequence[Run]) -> int:
     return max(1, min(run.length - 1 for run in runs) // MIN_SCREENING_SAMPLES)
 
 
-def score_subsets(
-    base: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
-) -> list[ScreenedSubset]:
+def score_subsets(base: BaseModel, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
     """Return the subsets of the columns of a base model, with their scores on validation data.
 
-    The coefficients of output terms are those at the given `points`, or on a grid that is refined around the best ones.
+    The coefficients of output terms are those on a grid that is refined around the best ones.
     """
     problem = FreeProblem.of(base.structure)
     grid = Objective(problem, base.runs, [1.0], decimation=_decimation(base.runs))
@@ -293,20 +271,19 @@ def score_subsets(
         gram_matrices = [g for part in pool.map_items(one, chunks) for g in part]
         return [(p, g) for p, g in zip(stable, gram_matrices, strict=True) if g is not None]
 
-    solutions = all_of(list(base.grid_points()) if points is None else points)
+    solutions = all_of(list(base.grid_points()))
     scorer = SubsetScorer.of(base, folds, [float(np.nanvar(r[base.structure.outputs[0]])) for r in base.runs], ends)
     spacing = (LOG_FREQUENCY_SPACING, math.log(DAMPING_FACTORS[1] / DAMPING_FACTORS[0]))
     for zoom in range(GRID_REFINEMENTS + 1):
         if not solutions:
             return []
-        products = Products([p for p, _ in solutions], np.array([g for _, g in solutions]))
-        scores = scorer.score_all(products)
-        if zoom == GRID_REFINEMENTS or points is not None or not base.own:
+        scores = scorer.score_all(np.array([g for _, g in solutions]))
+        if zoom == GRID_REFINEMENTS or not base.own:
             break
         spacing = (spacing[0] / 2, spacing[1] / 2)
         points_before = {p for p, _ in solutions}
         best = sorted(scores, key=lambda s: scores[s].score)[:REFINED_SUBSETS]
-        centres = dict.fromkeys(products.points[k] for s in best for k in scores[s].points)
+        centres = dict.fromkeys(solutions[k][0] for s in best for k in scores[s].points)
         near = (
             tuple(c + m * w for c, m, w in zip(centre, moves, spacing, strict=False))
             for centre in centres
@@ -317,7 +294,7 @@ def score_subsets(
     for subset, verdict in scores.items():
         change = _change(base, subset)
         if change is not None:
-            values = base.coefficients(products.points[verdict.points[-1]])
+            values = base.coefficients(solutions[verdict.points[-1]][0])
             values |= {base.columns[k].coefficient: c for k, c in zip(subset, verdict.coefficients, strict=True)}
             out.append(ScreenedSubset(change, values, verdict.score))
     return out
@@ -410,14 +387,14 @@ class SubsetScorer:
             scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
         return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(solutions[points[-1], -1].tolist()))
 
-    def score_all(self, products: Products) -> dict[tuple[int, ...], SubsetScore]:
-        """Return the scores of all subsets.
+    def score_all(self, products: Floats) -> dict[tuple[int, ...], SubsetScore]:
+        """Return the scores of all subsets from Gram matrices, shape (grid points, runs, columns + 1, columns + 1).
 
-        If there are too many, subsets are extended column by column from the best ones of each size, and the remaining
-        ones are not scored.
+        The matrices have the responses to the columns, and last the residual of the model without inputs. If there are
+        too many subsets, they are extended column by column from the best ones of each size, and the remaining ones are
+        not scored.
         """
-        values = products.values
-        pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)
+        pooled = np.stack([products[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)
         choices: dict[str, list[int]] = {}
         for k, column in enumerate(self.columns):
             choices.setdefault(column.coefficient, []).append(k)
@@ -427,7 +404,7 @@ class SubsetScorer:
         def score_missing(subsets: Iterable[tuple[int, ...]]) -> None:
             for subset in subsets:
                 if subset not in out:
-                    out[subset] = self.score_subset(values, pooled, subset)
+                    out[subset] = self.score_subset(products, pooled, subset)
 
         if count <= MAX_EXHAUSTIVE_SUBSETS:
             score_missing(

@@ -185,9 +185,9 @@ class NestedStructures:
             # A non-linear term that contains the output is not an input term.
             item = self.structure.equations[0]
             drives = [t for t in item.terms if t.coefficient in self.droppable and item.output not in t.signals]
-            has_fixed_terms = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
+            has_fixed_terms = any(not self._owns(t) and t.fixed is not None for t in item.terms)
             if not drives or has_fixed_terms:
-                yield Change(self._describe(base), base)
+                yield Change(describe_structure(self.build(base)), base)
                 continue
             for term in drives:
                 yield from self._with_term(base, term)
@@ -196,9 +196,6 @@ class NestedStructures:
         """Return the order of each equation in a variant if it is fixed to an integer, else None."""
         orders = variant.integer_order_values()
         return tuple(orders.get(n) for n in sorted(self._highest))
-
-    def _describe(self, variant: Variant) -> str:
-        return describe_structure(self.build(variant))
 
     def _owns(self, term: Term) -> bool:
         return any(term in e.terms and term.column == e.output for e in self.structure.equations)
@@ -244,8 +241,7 @@ class NestedStructures:
                     return None
                 if isinstance(term.coefficient, str):
                     names_used.append(term.coefficient)
-        names = [*self.structure.coefficient_names]
-        names_used += [n for n in names if n not in droppable]
+        names_used += [n for n in self.structure.coefficient_names if n not in droppable]
         variant = Variant(frozenset(names_used), tuple(sorted(whole.items())), self.structure.offset == "constant")
         # Without output terms, the equation becomes valid only when an input term is added.
         alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
@@ -254,20 +250,14 @@ class NestedStructures:
     def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
         """Yield the variants with one more term, at each integer value of its order."""
         assert isinstance(term.coefficient, str)
-        coefficients = variant.coefficients | {term.coefficient}
-        if not term.order.names:
-            variants = [replace(variant, coefficients=coefficients)]
-        elif term.order.is_single and term.order.names[0] not in variant.integer_order_values():
+        extended = replace(variant, coefficients=variant.coefficients | {term.coefficient})
+        variants = [extended]
+        if term.order.is_single and term.order.names[0] not in variant.integer_order_values():
             name = term.order.names[0]
-            variants = [
-                replace(variant, coefficients=coefficients).with_integer_orders({name: v})
-                for v in self.integer_values(name)
-            ]
+            variants = [extended.with_integer_orders({name: v}) for v in self.integer_values(name)]
             if self._owns(term):
                 # If other output terms occupy all integer orders, the order is free from the start.
-                variants = [v for v in variants if self.is_valid(v)] or [replace(variant, coefficients=coefficients)]
-        else:
-            variants = [replace(variant, coefficients=coefficients)]
+                variants = [v for v in variants if self.is_valid(v)] or [extended]
         for one in variants:
             if self.is_valid(one):
                 yield Change(f"+ {self._term_in(one, term)}", one)
@@ -294,10 +284,7 @@ class NestedStructures:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
                     yield from self._with_term(variant, term)
-        present = {
-            n
-            for n in self.build(variant.with_integer_orders(dict.fromkeys(variant.integer_order_values()))).order_names
-        }
+        present = self.build(variant.with_integer_orders(dict.fromkeys(variant.integer_order_values()))).order_names
         for name in variant.integer_order_values():
             if name in present:
                 yield Change(f"{name} free", variant.with_integer_orders({name: None}))

@@ -233,13 +233,12 @@ def select(
             power_of_two=False,
             gaps=True,
         )
+    work = CandidateEvaluator(folds, workers, progress)
     if store is None:
-        return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, problems_by_output)
+        return _run_selection(work, searched, every, problems_by_output)
     request = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
     with Store(store, request) as open_store:
-        return _run_selection(
-            CandidateEvaluator(folds, workers, progress, store=open_store), searched, every, problems_by_output
-        )
+        return _run_selection(replace(work, store=open_store), searched, every, problems_by_output)
 
 
 def _run_selection(
@@ -285,9 +284,7 @@ def _piece_duration(problems_by_output: Sequence[OutputProblem]) -> float | None
     """Return the duration [s] of the pieces into which runs of an unstable plant are divided; None for other plants."""
     forms = [IntegerOrderForm(n, n - 1) for n in range(1, MAX_ORDER + 1)]
     tests = [
-        least_squares_piece_test(p.runs, form.structure(p), p.runs[0].units)
-        for p in problems_by_output
-        for form in forms
+        least_squares_piece_test(p.runs, f.structure(p), p.runs[0].units) for p in problems_by_output for f in forms
     ]
     return min((t for t in tests if t is not None), key=lambda t: t.residual).seconds if any(tests) else None
 
@@ -377,10 +374,8 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
         driven = [w for w in winners if signal in w.structure.signals]
         if any(name not in w.values for w in driven):
             return False
-        values = np.array([w.values[name] for w in driven])
-        errors = np.array([w.errors[name] for w in driven])
-        is_apart = np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)
-        if np.any(is_apart):
+        values, errors = np.array([(w.values[name], w.errors[name]) for w in driven]).T
+        if np.any(np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)):
             return False
     return True
 
@@ -439,10 +434,11 @@ def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
     disturbances and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
-    fitted = [(t, t.joint) for t in ranked]
     return [
-        t if joint is None else replace(t, bic=fit_criterion(joint), effective_bic=fit_criterion(joint, inflation))
-        for t, joint in fitted
+        t
+        if t.joint is None
+        else replace(t, bic=fit_criterion(t.joint), effective_bic=fit_criterion(t.joint, inflation))
+        for t in ranked
     ]
 
 
