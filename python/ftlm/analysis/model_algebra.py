@@ -187,25 +187,19 @@ def series(first: Model, second: Model) -> Model:
     return Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
-def parallel(first: Model, second: Model) -> Model:
-    """Return the parallel connection, the sum of both outputs; see :meth:`ftlm.Model.parallel`."""
-    (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
-    if a.delay != b.delay:
-        raise _unequal_delays(a, b)
-    top = multiply_polynomials(a.top, b.bottom)
-    add_polynomial(top, multiply_polynomials(b.top, a.bottom))
-    return Ratio(top, multiply_polynomials(a.bottom, b.bottom), a.delay).model(output, signal)
-
-
-def combine(operator: str, left: Model | float, right: Model | float) -> Model:
+def combine(operator: str, left: Model | float, right: Model | float, what: str | None = None) -> Model:
     """Return the product, sum, difference or quotient of two models, or of a model and a number, as one model.
 
-    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``. In a product, `right` acts first, as in python-control. Raise
-    ModelError in the cases of :func:`series`, :func:`parallel` and :func:`inverse`.
+    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``; messages name the operator, or `what`. In a product, `right`
+    acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
+    :meth:`ftlm.Model.parallel` and :meth:`ftlm.Model.inverse`.
     """
-    (a, output, _), (b, _, signal) = (_operand(side, f"the operator {operator}") for side in (left, right))
+    (a, output, _), (b, _, signal) = (_operand(side, what or f"the operator {operator}") for side in (left, right))
     if operator in "+-" and a.delay != b.delay:
-        raise _unequal_delays(a, b)
+        raise ModelError(
+            f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
+            "simulated outputs"
+        )
     if operator == "/" and b.delay:
         raise ModelError(f"the divisor has a delay of {b.delay:g} s, so its inverse is not causal; leave the delay out")
     if operator == "/":
@@ -227,13 +221,6 @@ def _operand(side: Model | float, what: str) -> tuple[Ratio, str, str]:
     return _ratio(side, what) if isinstance(side, Model) else (Ratio({0.0: float(side)}, {0.0: 1.0}, 0.0), "", "")
 
 
-def _unequal_delays(a: Ratio, b: Ratio) -> ModelError:
-    return ModelError(
-        f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
-        "simulated outputs"
-    )
-
-
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:
     """Return the closed loop of two models; see :meth:`ftlm.Model.feedback`."""
     if sign not in (-1, 1):
@@ -241,10 +228,7 @@ def feedback(forward: Model, back: Model | float, sign: int) -> Model:
             f"{parameter('sign', sign)} is neither -1 nor 1; give -1 for negative feedback, or 1 for positive feedback"
         )
     a, output, signal = _ratio(forward, "feedback")
-    if isinstance(back, Model):
-        b, _, _ = _ratio(back, "feedback")
-    else:
-        b = Ratio({0.0: float(back)}, {0.0: 1.0}, 0.0)
+    b, _, _ = _operand(back, "feedback")
     if a.delay or b.delay:
         raise ModelError(
             f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is not an equation; use "

@@ -396,9 +396,9 @@ class Model:
         ModelError
             If the delays differ, or in the cases of :meth:`series`.
         """
-        from ftlm.analysis.model_algebra import parallel
+        from ftlm.analysis.model_algebra import combine
 
-        return parallel(self, other)
+        return combine("+", self, other, "a sum")
 
     @check_arguments
     def feedback(self, back: Model | float = 1.0, *, sign: int = -1) -> Model:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 MAX_FREE_RUN_NR = 0.5
 #: Relative difference of scores and coefficients below which two rows of the table count as one model.
 SAME_MODEL_TOLERANCE = 1e-6
+#: Maximum number of candidates in the table of a report.
+MAX_REPORT_ROWS = 10
 
 
 @dataclass(frozen=True)
@@ -443,7 +445,7 @@ def search_summary(searches: Mapping[str, SearchResult]) -> Table:
     )
 
 
-def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
+def search_top(name: str, search: SearchResult) -> Table:
     """Return a report table of the best candidates of an order search: rank, score, orders, coefficients.
 
     Parameters
@@ -452,13 +454,11 @@ def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
         Output of the searched equation, or ``"stage"`` for coupled equations; shown in the title.
     search
         Result of the search.
-    rows
-        Maximum number of rows of the report table.
     """
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
     orders, coefficients = list(search.orders), list(search.coefficients)
-    rows_shown = search.table[:rows]
+    rows_shown = search.table[:MAX_REPORT_ROWS]
     return Table(
         f"Best {len(rows_shown)} of {number(search.candidates)} candidates: {_search_name(name)}",
         ("rank", "score" if law else score, *map(symbol_html, orders), *map(symbol_html, coefficients)),

@@ -162,7 +162,7 @@ class Expression:
             case "constant":
                 return format_shortest(self.value)
             case "channel":
-                return _derivative_text(self.value, texts.get(self.signal, self.signal))
+                return derivative_text(self.value, texts.get(self.signal, self.signal))
             case "add":
                 text = " + ".join(argument.as_text(texts) for argument in self.arguments)
                 return text.replace("+ -", "- ")
@@ -187,7 +187,7 @@ class Expression:
         return self.as_text()
 
 
-def _derivative_text(order: float, text: str) -> str:
+def derivative_text(order: float, text: str) -> str:
     """Return the derivative of a signal as text, such as ``D^0.5 y``."""
     return text if order == 0 else f"D {text}" if order == 1 else f"D^{format_shortest(order)} {text}"
 

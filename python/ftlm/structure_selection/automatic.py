@@ -21,6 +21,7 @@ from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.nuisance_parameters import has_white_residuals
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import values_at_residuals
+from ftlm.structure.expression import derivative_text
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
@@ -95,13 +96,13 @@ class IntegerOrderForm:
         """Return the structure that has this form, for one output."""
         output, end = problem.output, problem.suffix
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
-        own = [f"a{k}{end} {_derivative(k, output)}" for k in powers]
+        own = [f"a{k}{end} {derivative_text(k, output)}" for k in powers]
         driving = [
-            f"b{number}{k}{end} {_derivative(k, name)}"
+            f"b{number}{k}{end} {derivative_text(k, name)}"
             for number, name in problem.numbered_drivers
             for k in range(self.zeros, -1, -1)
         ]
-        text = f"{_derivative(self.order, output)} = {' + '.join([*own, *driving])}"
+        text = f"{derivative_text(self.order, output)} = {' + '.join([*own, *driving])}"
         if self.friction != "none":
             slope = problem.tanh_slope if self.friction == "output" else math.inf
             text += " " + friction_term(output, f"fc{end}", slope)
@@ -117,10 +118,6 @@ def _with_offset(structure: Structure, offset: str) -> Structure:
     """
     level = "constant" if structure.integrates else "level"
     return replace(structure, offset=check_offset(level if offset == "level" else offset))
-
-
-def _derivative(order: int, name: str) -> str:
-    return {0: name, 1: f"D {name}"}.get(order, f"D^{order} {name}")
 
 
 @dataclass(frozen=True)
@@ -537,11 +534,8 @@ def _natural_frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> 
     """
     for order in (2, 1):
         for item in fits:
-            if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (
-                order,
-                offset,
-                False,
-            ):
+            form = item.form
+            if form is not None and (form.order, form.offset, form.integrator) == (order, offset, False):
                 size = abs(item.joint.coefficients.get(f"a0{suffix}", 0.0))
                 damping = abs(item.joint.coefficients.get(f"a1{suffix}", 0.0))
                 if order == 1 and size > 0.0:

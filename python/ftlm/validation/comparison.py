@@ -248,7 +248,7 @@ class Comparison:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return comparison_html(self)
+        return str(warnings_html(self.warnings) + errors_table([("compared", self)]).to_html())
 
 
 #: Texts that state why an output has no equation error.
@@ -737,8 +737,3 @@ def warnings_html(warnings: Sequence[str]) -> Markup:
         return Markup("")
     items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)
     return Markup("<p><strong>Warnings</strong></p><ul>{}</ul>").format(items)
-
-
-def comparison_html(comparison: Comparison) -> str:
-    """Return HTML with the warnings of a comparison and a table of its equation errors and output errors."""
-    return str(warnings_html(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

@@ -223,10 +223,6 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     )
 
 
-def _few_levels(x: Floats) -> bool:
-    return bool(np.unique(x).size < max(12, 0.01 * x.size))
-
-
 def _smallest_change(y: Floats) -> float:
     changes = np.abs(np.diff(y))
     changes = changes[changes > 1e-12 * float(np.max(np.abs(y)))]
@@ -250,7 +246,7 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
 def _saturation(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     levels = np.unique(y)
-    if name in run.inputs and _few_levels(y):
+    if name in run.inputs and levels.size < max(12, 0.01 * y.size):
         return  # A signal of few levels is at its extremes by design.
     noise, least_change = estimate_noise(y), _smallest_change(y)
     code, role = ("saturation_input", "input") if name in run.inputs else ("saturation", "output")

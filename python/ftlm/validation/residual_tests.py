@@ -286,7 +286,7 @@ class Residuals:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return residuals_html(self)
+        return str(residual_table(self, title=f"Residual tests: {', '.join(self.runs)}").to_html())
 
 
 #: Maximum lag [samples] of the residual tests after every identification; the usual convention.
@@ -688,8 +688,3 @@ def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
         "could not have failed."
     )
     return Table(title, ("output", "test", "statistic", "limit (99 %)", "verdict"), rows, note=note)
-
-
-def residuals_html(tests: Residuals) -> str:
-    """Return the table of residual tests as HTML."""
-    return str(residual_table(tests, title=f"Residual tests: {', '.join(tests.runs)}").to_html())
