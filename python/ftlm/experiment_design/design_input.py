@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -137,23 +137,6 @@ REFERENCE_SQUARE_PERIODS = 5
 MAX_RELATIVE_UNCERTAINTY = 0.5
 
 
-@dataclass(frozen=True)
-class DesignTask:
-    """Arguments of an input design after validation.
-
-    `step` is the sampling interval [s], and `rows` is the number of samples. `period` is the period [samples] of the
-    square wave with which the design is compared.
-    """
-
-    fit: ModelFit
-    step: float
-    rows: int
-    bounds: Bounds
-    criterion: Criterion
-    period: int
-    seed: int
-
-
 @check_arguments
 def design_input(
     model: Identification | Model,
@@ -266,31 +249,29 @@ def design_input(
         raise ModelError(
             f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
         )
-    task = DesignTask(fit, time, rows, bounds, goal, round(wave / time), seed)
+    period_rows = round(wave / time)
     if isinstance(progress, Progress):
-        size = len(fit.names) * len(fit.outputs) * task.rows
+        size = len(fit.names) * len(fit.outputs) * rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
     tracker = ShareTracker(progress)
-    sensitivities = Sensitivities.of(fit, task.step, task.rows - 1, bounds.ramp_samples(task.step))
+    sensitivities = Sensitivities.of(fit, time, rows - 1, bounds.ramp_samples(time))
     tracker.advance_to(0.05)
-    spectrum = best_spectrum(spectral_lines(fit, bounds, task.step, task.rows - 1), goal)
+    spectrum = best_spectrum(spectral_lines(fit, bounds, time, rows - 1), goal)
     tracker.advance_to(0.15)
-    designs = _design_candidates(task, sensitivities, spectrum, tracker)
-    plain = np.stack([p * square_wave(task.rows - 1, task.period) for p in bounds.peaks.values()])
-    reference = fit.run(
-        sensitivities.rig_commands(plain), task.step, f"square of period {task.period * task.step:.4g} s"
-    )
+    designs = _design_candidates(sensitivities, goal, bounds, spectrum, seed, tracker)
+    plain = np.stack([p * square_wave(rows - 1, period_rows) for p in bounds.peaks.values()])
+    reference = fit.run(sensitivities.rig_commands(plain), time, f"square of period {period_rows * time:.4g} s")
     base = float(goal.score(sensitivities.information(sensitivities.derivatives(plain))))
     best = designs[0]
-    commands = best.commands * _robust_scale(task, sensitivities, best.commands)
-    run = fit.run(sensitivities.rig_commands(commands), task.step, "designed")
+    commands = best.commands * _robust_scale(sensitivities, bounds, best.commands)
+    run = fit.run(sensitivities.rig_commands(commands), time, "designed")
     errors = _errors(fit, reference, run)
     ratios = np.log(errors["square"][list(at)]) - np.log(errors["designed"][list(at)])
     tracker.advance_to(1.0)
     return DesignedInput(
         run=run,
         reference=reference,
-        shape=_shape_text(best, run, task),
+        shape=_shape_text(best, run, sensitivities),
         criterion=goal.kind,
         parameters=tuple(fit.names[i] for i in at),
         values=dict(zip(fit.names, fit.values, strict=True)),
@@ -305,14 +286,14 @@ def design_input(
 
 
 def _design_candidates(
-    task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, tracker: ShareTracker
+    sensitivities: Sensitivities, goal: Criterion, bounds: Bounds, spectrum: Spectrum, seed: int, tracker: ShareTracker
 ) -> list[Design]:
     """Return all candidate inputs, best first: initial inputs, and those improved by the exchange algorithm.
 
     The exchange algorithm is started from the best initial inputs of different kinds. Raise ModelError if no input
     makes the parameters of interest identifiable.
     """
-    fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
+    fit, rows = sensitivities.fit, sensitivities.rows
     ended = stop_flag()
 
     def raise_if_cancelled() -> None:
@@ -322,7 +303,7 @@ def _design_candidates(
     peaks = np.array(list(bounds.peaks.values()))[:, None]
     initial_designs = [
         scaled_design(name, peaks * c, sensitivities, goal, bounds)
-        for name, c in initial_inputs(spectrum, len(fit.inputs), rows, task.step, task.seed)
+        for name, c in initial_inputs(spectrum, len(fit.inputs), rows, sensitivities.step, seed)
     ]
     feasible = [d for d in initial_designs if d.score > -math.inf]
     if not feasible:
@@ -551,16 +532,16 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
     )
 
 
-def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floats) -> float:
+def _robust_scale(sensitivities: Sensitivities, bounds: Bounds, commands: Floats) -> float:
     """Return the largest factor, at most 1, with which scaled commands and 95 % bands of outputs meet the limits.
 
     The bands represent the uncertainty of the parameters.
     """
-    outputs, slopes = sensitivities.outputs(commands), sensitivities.derivatives(commands)
-    spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
-    noise = np.array([task.fit.noise[o] for o in task.fit.outputs])[:, None]
+    fit, outputs, slopes = sensitivities.fit, sensitivities.outputs(commands), sensitivities.derivatives(commands)
+    spread = np.einsum("pot,pq,qot->ot", slopes, fit.covariance, slopes)
+    noise = np.array([fit.noise[o] for o in fit.outputs])[:, None]
     reach = np.abs(outputs) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
-    return task.bounds.scale(commands, reach)
+    return bounds.scale(commands, reach)
 
 
 def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
@@ -590,11 +571,11 @@ def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...
     )
 
 
-def _shape_text(best: Design, run: Run, task: DesignTask) -> str:
+def _shape_text(best: Design, run: Run, sensitivities: Sensitivities) -> str:
     """Return text that describes the shape of the designed input: name of the initial input, number of switches."""
     if not best.name.endswith("exchanged"):
         return best.name
-    first = next(iter(task.fit.inputs))
-    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if task.bounds.ramp_samples(task.step) == 1 else 0
+    first = sensitivities.fit.inputs[0]
+    switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if sensitivities.ramp == 1 else 0
     origin = best.name.removesuffix(", exchanged")
     return f"levels exchanged from {origin}" + (f", {switches} switches" if switches else "")
