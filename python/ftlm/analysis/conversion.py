@@ -171,11 +171,7 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
 
 @check_arguments
 def export_text(
-    model: Model,
-    to: Literal["control", "matlab", "json"],
-    *,
-    band: tuple[float, float] | None = None,
-    order: int = 5,
+    model: Model, to: Literal["control", "matlab", "json"], *, band: tuple[float, float] | None = None, order: int = 5
 ) -> str:
     """Return a model as text for another tool: a Python script, a MATLAB script, or JSON.
 

@@ -17,6 +17,7 @@ from ftlm.control.realization import MAX_POLES, Realization
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
+from ftlm.utils.formatting import finite
 from ftlm.utils.parameters import type_name
 from ftlm.utils.validation import Floats, as_floats, error_text
 
@@ -203,15 +204,11 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
         raise DataError(f"{path} is damaged: {error_text(error)}; save the controller again") from error
 
 
-def _limit(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _pid(controller: DiscretePid) -> PidFile:
     return PidFile(
         **controller.pid.to_dict(),
         rate=controller.rate,
-        limit=_limit(controller.limit),
+        limit=finite(controller.limit),
         band=controller.band,
         order=controller.order,
         direct=controller.direct,
@@ -220,28 +217,20 @@ def _pid(controller: DiscretePid) -> PidFile:
 
 
 def _lqg(controller: Lqg) -> LqgFile:
-    observer = controller.observer
-    realization = observer.realization
+    observer, shown = controller.observer, controller.to_dict()
+    realization, outputs = observer.realization, observer.realization.outputs
+    same = ("rate", "limit", "input", "measured", "tracked", "a", "b", "c", "correction", "feedback")
     return LqgFile(
-        realization.rate,
-        _limit(controller.limit),
-        realization.input,
-        list(realization.outputs),
-        list(observer.measured),
-        controller.tracked,
-        realization.a.tolist(),
-        realization.b.tolist(),
-        realization.c.tolist(),
-        observer.gain.tolist(),
-        controller.feedback.tolist(),
-        controller.ahead,
-        [(p.real, p.imag) for p in realization.poles],
-        realization.band,
-        [realization.gain_error[o] for o in realization.outputs],
-        [realization.phase_error[o] for o in realization.outputs],
-        list(observer.noise),
-        observer.process_noise,
-        [observer.deviations[o] for o in realization.outputs],
+        **{name: shown[name] for name in same},
+        outputs=list(outputs),
+        ahead=controller.ahead,
+        poles=[(p.real, p.imag) for p in realization.poles],
+        band=realization.band,
+        gain_error_db=[realization.gain_error[o] for o in outputs],
+        phase_error_degrees=[realization.phase_error[o] for o in outputs],
+        noise=list(observer.noise),
+        drift=observer.process_noise,
+        deviations=[observer.deviations[o] for o in outputs],
     )
 
 

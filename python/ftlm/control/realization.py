@@ -16,15 +16,7 @@ from ftlm.control.stability_margins import Plant
 from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.resources import python_control
-from ftlm.utils.validation import (
-    Complex,
-    Floats,
-    as_floats,
-    check_integer,
-    check_vector,
-    error_text,
-    frequency_pair,
-)
+from ftlm.utils.validation import Complex, Floats, as_floats, check_integer, check_vector, error_text, frequency_pair
 
 #: Number of frequencies of the fit. The error is evaluated at these and at as many frequencies between them.
 FIT_FREQUENCIES = 120

@@ -245,11 +245,11 @@ def design_input(
     goal = Criterion(criterion, at, tuple(units))
     seed = check_seed(seed)
     wave = _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]")
-    if not 2 <= round(wave / time) <= 2 * rows:
+    period_rows = round(wave / time)
+    if not 2 <= period_rows <= 2 * rows:
         raise ModelError(
             f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
         )
-    period_rows = round(wave / time)
     if isinstance(progress, Progress):
         size = len(fit.names) * len(fit.outputs) * rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))

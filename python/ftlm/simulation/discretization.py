@@ -212,8 +212,7 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
     column = Placeholder("column")
     options = [
         choose_text(
-            parameter(role, dict.fromkeys(names, column)),
-            " ".join(parameter(role, {n: column}) for n in names),
+            parameter(role, dict.fromkeys(names, column)), " ".join(parameter(role, {n: column}) for n in names)
         )
         for role, names in roles.items()
         if names

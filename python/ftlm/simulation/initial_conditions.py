@@ -426,11 +426,7 @@ def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Flo
 
 
 def needs_history(
-    structure: Structure,
-    few: Sequence[Floats],
-    many: Sequence[Floats],
-    sizes: Sequence[float],
-    terms: tuple[int, int],
+    structure: Structure, few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float], terms: tuple[int, int]
 ) -> bool:
     """Whether residuals with Caputo's initial terms are so large that terms for past inputs (a history) are required.
 

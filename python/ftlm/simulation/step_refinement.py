@@ -45,13 +45,7 @@ RESPONSE_CHANGE = 1e-5
 
 
 def simulate_refined(
-    model: Model,
-    run: Run,
-    initial: Terms | None,
-    *,
-    tolerance: float,
-    max_m: int = MAX_M,
-    on_grid: bool = False,
+    model: Model, run: Run, initial: Terms | None, *, tolerance: float, max_m: int = MAX_M, on_grid: bool = False
 ) -> OutputSamples:
     """Simulate a model with successively halved steps and Richardson extrapolation until the samples converge.
 

@@ -25,12 +25,7 @@ from ftlm.structure.expression import derivative_text
 from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
-from ftlm.structure_selection.cross_validation import (
-    Trial,
-    fit,
-    fit_criterion,
-    residual_variance_inflation,
-)
+from ftlm.structure_selection.cross_validation import Trial, fit, fit_criterion, residual_variance_inflation
 from ftlm.structure_selection.stepwise import CandidateEvaluator, initial_guesses
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import feedback_test

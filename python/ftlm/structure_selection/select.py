@@ -23,13 +23,7 @@ from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import has_memory
 from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Structure
-from ftlm.structure_selection.automatic import (
-    MAX_ORDER,
-    AutomaticSelection,
-    Delays,
-    IntegerOrderForm,
-    OutputProblem,
-)
+from ftlm.structure_selection.automatic import MAX_ORDER, AutomaticSelection, Delays, IntegerOrderForm, OutputProblem
 from ftlm.structure_selection.candidates import NestedStructures, describe_structure, name_candidates, signature
 from ftlm.structure_selection.checkpoint import Request, Store
 from ftlm.structure_selection.cross_validation import Folds, Trial, fit_criterion, residual_variance_inflation
