@@ -13,12 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm._core import __version__
-from ftlm.analysis.frequency_response import (
-    POWER_TOLERANCE,
-    check_no_input_nonlinearity,
-    response_inputs,
-    transfer_functions,
-)
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity, response_inputs, transfer_functions
 from ftlm.analysis.rational_approximation import approximate, identifier, state_space_matrices
 from ftlm.data.sampling import check_step
 from ftlm.errors import ModelError
@@ -27,6 +22,7 @@ from ftlm.simulation.discretization import check_linear
 from ftlm.structure.equation import format_equation
 from ftlm.structure.order import MAX_ORDER
 from ftlm.structure.parser import equation
+from ftlm.structure.polynomial import POWER_TOLERANCE
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments, warn_caller
 from ftlm.utils.formatting import plural

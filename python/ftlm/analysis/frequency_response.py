@@ -6,7 +6,7 @@ import copy
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,14 +21,11 @@ from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
+from ftlm.structure.polynomial import Polynomial, add_polynomial, multiply_polynomials
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_floats, check_choice
 
-#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
-Polynomial: TypeAlias = dict[float, float]
-#: Difference below which two powers of s count as equal.
-POWER_TOLERANCE = 1e-9
 #: Magnitude of a sum of coefficients, relative to the sum of their magnitudes, below which it is rounding error.
 CANCELLATION_TOLERANCE = 1e-13
 #: Relative step of the numerical derivatives of the delta method.
@@ -53,21 +50,6 @@ def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
     read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
     return tuple(dict.fromkeys(s for s in model.structure.signals if s in read))
-
-
-def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
-    """Add `factor` times the polynomial `other` to the polynomial `into` in place; nearly equal powers are merged."""
-    for power, value in other.items():
-        at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
-        into[at] = into.get(at, 0.0) + factor * value
-
-
-def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
-    """Return the product of two polynomials with real powers."""
-    out: Polynomial = {}
-    for (p, x), (q, y) in itertools.product(a.items(), b.items()):
-        add_polynomial(out, {round(p + q, 9): x * y})
-    return out
 
 
 def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:

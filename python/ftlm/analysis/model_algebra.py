@@ -8,13 +8,7 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
-from ftlm.analysis.frequency_response import (
-    Polynomial,
-    add_polynomial,
-    check_no_input_nonlinearity,
-    multiply_polynomials,
-    transfer_functions,
-)
+from ftlm.analysis.frequency_response import check_no_input_nonlinearity, transfer_functions
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.structure.equation import Equation, Term
@@ -22,6 +16,7 @@ from ftlm.structure.expression import Channel, channel
 from ftlm.structure.grammar import EquationParser
 from ftlm.structure.order import MAX_ORDER, Order
 from ftlm.structure.parser import equation
+from ftlm.structure.polynomial import Polynomial, add_polynomial, multiply_polynomials
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter

@@ -12,8 +12,6 @@ from fractions import Fraction
 import numpy as np
 
 from ftlm.analysis.frequency_response import (
-    POWER_TOLERANCE,
-    Polynomial,
     check_no_input_nonlinearity,
     coupled_outputs,
     covariance_of,
@@ -26,6 +24,7 @@ from ftlm.analysis.frequency_response import (
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
+from ftlm.structure.polynomial import POWER_TOLERANCE, Polynomial
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter

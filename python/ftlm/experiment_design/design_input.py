@@ -25,7 +25,7 @@ from ftlm.progress import Progress, ShareTracker
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting, type_name
-from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
+from ftlm.utils.resources import duration_bounds, estimate_duration
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr
 
@@ -294,12 +294,6 @@ def _design_candidates(
     makes the parameters of interest identifiable.
     """
     fit, rows = sensitivities.fit, sensitivities.rows
-    ended = stop_flag()
-
-    def raise_if_cancelled() -> None:
-        if ended is not None and ended.is_set:
-            raise KeyboardInterrupt
-
     peaks = np.array(list(bounds.peaks.values()))[:, None]
     initial_designs = [
         scaled_design(name, peaks * c, sensitivities, goal, bounds)
@@ -319,14 +313,14 @@ def _design_candidates(
     coarse = max(sensitivities.ramp, 1, -(-rows // COARSE_HOLDS))
     ends = []
     for place, design in enumerate(starts):
-        ends.append(exchange_holds(design, coarse, sensitivities, goal, bounds, raise_if_cancelled))
+        ends.append(exchange_holds(design, coarse, sensitivities, goal, bounds))
         tracker.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
     best = max(ends, key=lambda d: d.score)
     for place, finer in enumerate(HOLD_DIVISORS[1:]):
         hold = max(sensitivities.ramp, 1, coarse // finer)
         if coarse % hold:
             continue
-        further = exchange_holds(best, hold, sensitivities, goal, bounds, raise_if_cancelled)
+        further = exchange_holds(best, hold, sensitivities, goal, bounds)
         best = further if further.score > best.score else best
         tracker.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
     ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]

@@ -6,13 +6,14 @@ A hold is an interval of constant input. An exchange changes the level of one ho
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftlm.experiment_design.problem import Bounds, Criterion, Sensitivities
+from ftlm.utils.resources import stop_flag
 from ftlm.utils.validation import Complex, Floats
 
 #: Levels that an input may have, as fractions of its peak.
@@ -55,20 +56,15 @@ def scaled_design(
 
 
 def exchange_holds(
-    begin: Design,
-    hold: int,
-    sensitivities: Sensitivities,
-    criterion: Criterion,
-    bounds: Bounds,
-    stopped: Callable[[], None] = lambda: None,
+    begin: Design, hold: int, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
 ) -> Design:
     """Return the candidate input to which the exchange algorithm improves the candidate input `begin`.
 
     A hold is an interval of `hold` samples with constant input. First, `begin` is rounded to the levels -1, 0 and 1
     times the peak. An exchange then changes the level of one hold, or of two holds by opposite amounts. The Fisher
     information is quadratic in the commands, so convolutions give its change by every exchange exactly. The best
-    feasible exchange is made until none improves the score, which gives a local optimum. `stopped` is called before
-    each exchange and may raise an exception. Source: Fedorov, Theory of Optimal Experiments, 1972.
+    feasible exchange is made until none improves the score, which gives a local optimum. Source: Fedorov, Theory of
+    Optimal Experiments, 1972.
     """
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)
@@ -84,8 +80,10 @@ def exchange_holds(
     derivatives, outputs = sensitivities.derivatives(commands()), sensitivities.outputs(commands())
     information = sensitivities.information(derivatives)
     score = float(criterion.score(information)) - _log_limit_excess(outputs, limits)
+    ended = stop_flag()
     for _ in range(MAX_EXCHANGES):
-        stopped()
+        if ended is not None and ended.is_set:
+            raise KeyboardInterrupt
         slope = None if score == -math.inf else criterion.gradient(information) / 2
         moves: list[tuple[float, int, int, int, float, Floats]] = []
         for k, one in enumerate(holds):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.errors import ModelError
+from ftlm.structure.polynomial import Polynomial, add_polynomial, multiply_polynomials
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
@@ -20,8 +21,6 @@ from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 Node: TypeAlias = tuple[str, Any]
 #: Impedance [Ω], and the list of its derivatives with respect to the parameters.
 Response: TypeAlias = tuple[Any, list[Any]]
-#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
-Polynomial: TypeAlias = dict[float, float]
 #: Real part of sqrt(s tau) above which its hyperbolic tangent is 1 in double precision; sinh and cosh overflow at 700.
 MAX_DIFFUSION_ARGUMENT = 40.0
 _TOKEN_PATTERN = re.compile(r"p\(|[(),-]|[A-Za-z]+_?\d*")
@@ -243,19 +242,12 @@ class Circuit:
             If the impedance of an element is not a ratio of sums of powers of s.
         """
 
-        def product(one: Polynomial, other: Polynomial) -> Polynomial:
-            out: Polynomial = {}
-            for a, x in one.items():
-                for b, y in other.items():
-                    out[round(a + b, 9)] = out.get(round(a + b, 9), 0.0) + x * y
-            return out
-
         def add_ratios(parts: Sequence[tuple[Polynomial, Polynomial]]) -> tuple[Polynomial, Polynomial]:
             (top, bottom), *others = parts
             for above, below in others:
-                one, two = product(top, below), product(above, bottom)
-                top = {p: one.get(p, 0.0) + two.get(p, 0.0) for p in [*one, *(p for p in two if p not in one)]}
-                bottom = product(bottom, below)
+                top = multiply_polynomials(top, below)
+                add_polynomial(top, multiply_polynomials(above, bottom))
+                bottom = multiply_polynomials(bottom, below)
             return top, bottom
 
         def ratio(node: Node) -> tuple[Polynomial, Polynomial]:
@@ -271,8 +263,7 @@ class Circuit:
                 )
             return element.ratio([self.values[rest + suffix] for suffix, _ in element.parameters])
 
-        top, bottom = ratio(self.tree)
-        return top, bottom
+        return ratio(self.tree)
 
     def __str__(self) -> str:
         return "".join(c for c in self.text if not c.isspace())

@@ -1,0 +1,26 @@
+"""Sums of terms coefficient * s^power with real powers, as dictionaries of coefficients by power."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TypeAlias
+
+#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
+Polynomial: TypeAlias = dict[float, float]
+#: Difference below which two powers of s count as equal.
+POWER_TOLERANCE = 1e-9
+
+
+def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
+    """Add `factor` times the polynomial `other` to the polynomial `into` in place; nearly equal powers are merged."""
+    for power, value in other.items():
+        at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
+        into[at] = into.get(at, 0.0) + factor * value
+
+
+def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
+    """Return the product of two polynomials with real powers."""
+    out: Polynomial = {}
+    for (p, x), (q, y) in itertools.product(a.items(), b.items()):
+        add_polynomial(out, {round(p + q, 9): x * y})
+    return out
