@@ -11,6 +11,7 @@ import numpy as np
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity
 from ftlm.analysis.poles import modes, stability
 from ftlm.data.run import Run
+from ftlm.data.sampling import drop_missing
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.output_error import parameter_set_of
 from ftlm.estimation.result import Identification
@@ -422,11 +423,8 @@ def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict
     out = {}
     for name in names:
         if name in run:
-            values = np.asarray(run[name])
-            values = values[np.isfinite(values)]
-            size = (
-                float(np.max(np.abs(values - (values[0] if from_start else 0.0)), initial=0.0)) if values.size else 0.0
-            )
+            values = drop_missing(run[name])
+            size = float(np.max(np.abs(values - (values[0] if from_start else 0.0))))
             if size > 0:
                 out[name] = size
     return out

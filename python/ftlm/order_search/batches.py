@@ -52,7 +52,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 
 @dataclass(frozen=True)
-class SearchProblem(ABC, Generic[Table]):
+class SearchProblem(ABC):
     """Data shared by all batches of an order search, and the functions of the Rust core that evaluate candidates.
 
     `runs` are the block-pulse records as (pulse width [s], means, series of the sensor filter or None). `inputs` states
@@ -75,10 +75,6 @@ class SearchProblem(ABC, Generic[Table]):
         return list(self.runs), *self.core_arguments, *more
 
     @abstractmethod
-    def search(self, progress: ProgressCallback | None) -> Table:
-        """Run the whole search in this process, and return its result table."""
-
-    @abstractmethod
     def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
         """Return an object of the Rust core that evaluates blocks of candidates; one serves all blocks of a search."""
 
@@ -95,7 +91,7 @@ class SearchProblem(ABC, Generic[Table]):
 
 
 @dataclass(frozen=True)
-class EquationProblem(SearchProblem["_core._Found"]):
+class EquationProblem(SearchProblem):
     """Order search of one equation, in the form that the Rust core takes.
 
     `orders` is (output index, grid values of alpha, terms). A term is (signal index, grid values of its order, whether
@@ -137,7 +133,7 @@ class EquationProblem(SearchProblem["_core._Found"]):
 
 
 @dataclass(frozen=True)
-class CoupledProblem(SearchProblem["_core._FoundStage"]):
+class CoupledProblem(SearchProblem):
     """Order search of coupled equations under an order law, in the form that the Rust core takes.
 
     `axes` are the grid values of each free order. `laws` and `fixed` have one entry per equation. An entry of `laws` is
@@ -221,7 +217,7 @@ def evaluate_candidates(
     return _run_cached(key, work, lambda search: cast("Outcomes", search.evaluate_spans(spans, threads, None)))
 
 
-def _run_cached(key: str, work: SearchProblem[Any] | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
+def _run_cached(key: str, work: SearchProblem | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
     with _lock:
         search = _cached_searches.get(key) or (None if work is None else work.build_evaluator())
         if search is None:
@@ -395,12 +391,12 @@ class SearchState(ABC, Generic[Frame, Table]):
     #: Whether the core itself calls the progress callback during evaluation in this process.
     core_reports_progress = False
 
-    def __init__(self, work: SearchProblem[Table], throughput: Throughput) -> None:
+    def __init__(self, work: SearchProblem, throughput: Throughput) -> None:
         self.work, self.throughput = work, throughput
         self.threads = work.threads
         self.done = self.total = 0
 
-    def payload(self, block: CandidateBlock) -> SearchProblem[Table] | None:
+    def payload(self, block: CandidateBlock) -> SearchProblem | None:
         """Return the search problem if it is sent with the task of a block; None if workers have it cached."""
         return self.work if block.with_problem else None
 

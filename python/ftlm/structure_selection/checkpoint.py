@@ -269,11 +269,9 @@ class Store:
             return StoredFit.of(result) if isinstance(result, JointFit) else FitError.of(result)
 
         def read(answer: Answer) -> JointFit | FtlmError:
-            return (
-                answer.error()
-                if isinstance(answer, FitError)
-                else self._check_result_type(answer, StoredFit, "a fit").fit()
-            )
+            if isinstance(answer, FitError):
+                return answer.error()
+            return self._check_result_type(answer, StoredFit, "a fit").fit()
 
         return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
 
@@ -287,11 +285,8 @@ class Store:
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
-        def write(result: Trial) -> Answer:
-            return StoredTrial(replace(result, joint=None))
-
         request = ("judge", structure, joint.names, joint.values, joint.initial, fine)
-        return self.recall_or_compute(request, compute, write, read)
+        return self.recall_or_compute(request, compute, lambda trial: StoredTrial(replace(trial, joint=None)), read)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return the stored or computed result of the best-subset search."""

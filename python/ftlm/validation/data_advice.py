@@ -19,7 +19,7 @@ from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import attributes, columns, wrap_text
+from ftlm.utils.formatting import attributes, columns, plural, wrap_text
 from ftlm.utils.linalg import orthonormal
 from ftlm.utils.parameters import Note, parameter
 from ftlm.utils.statistics import estimate_noise, is_rest, quantization_step
@@ -153,10 +153,6 @@ def _findings(run: Run, structure: Structure | None) -> Iterator[Finding]:
 def _with_unit(run: Run, name: str, value: float) -> str:
     unit = run.units.get(name, "")
     return f"{value:.4g} {unit}".strip() if unit not in ("", "1") else f"{value:.4g}"
-
-
-def _times(count: int) -> str:
-    return f"{count} time{'' if count == 1 else 's'}"
 
 
 def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -321,7 +317,7 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
         return
     size = float(np.median(np.abs(steps[np.array(rows) - 1])))
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
-    numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": _times(len(rows)), "first": rows[0]}
+    numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": plural(len(rows), "time"), "first": rows[0]}
     yield make_finding("wrap", run=run.name, output=name, **numbers)
 
 
@@ -401,7 +397,9 @@ def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
         crossings = int(np.sum(np.diff(sides) != 0))
         tail = y[-y.size // 5 :]
         if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
-            yield make_finding("short", run=run.name, output=name, times=_times(crossings), duration=run.duration)
+            yield make_finding(
+                "short", run=run.name, output=name, times=plural(crossings, "time"), duration=run.duration
+            )
 
 
 def _offset(run: Run, name: str) -> Iterator[Finding]:
