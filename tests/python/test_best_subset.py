@@ -131,7 +131,7 @@ def test_too_many_subsets_are_widened_and_the_best_is_among_them():
         y = table[:, list(true)] @ [1.0, -2.0, 0.5] + 0.01 * rng.standard_normal(400)
         rows = np.column_stack([table, y])
         values.append(rows.T @ rows)
-    made = tuple(Column(f"c{k}", f"u{k}", 0.0, ()) for k in range(count))
+    made = tuple(Column(f"c{k}", 0.0, ()) for k in range(count))
     judge = SubsetScorer(made, ((1,), (0,), (0, 1)), (0, 1), np.array([values[0][-1, -1], values[1][-1, -1]]))
     found = judge.score_all(np.array([values]))
     assert 2**count > MAX_EXHAUSTIVE_SUBSETS > len(found)

@@ -70,10 +70,6 @@ class Term:
         """Value of factor * coefficient; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
-    def as_text(self, signal: str) -> str:
-        """Return the term as text, with `signal` in place of the name of its signal."""
-        return self.format({self.signal: signal})
-
     def format(self, inputs: Mapping[str, str]) -> str:
         """Return the term as text; `inputs` maps the name of an input to its text with delay and non-linearity."""
         if isinstance(self.coefficient, str):

@@ -70,7 +70,6 @@ class Column:
     """Input term at one integer value of its order; ``names`` are the free orders that this value fixes."""
 
     coefficient: str
-    signal: str
     order: float
     names: tuple[str, ...]
 
@@ -179,7 +178,7 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
         for term in droppable:
             names = term.order.names
             for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
-                column = Column(str(term.coefficient), term.signal, place, tuple(names))
+                column = Column(str(term.coefficient), place, tuple(names))
                 column_term = replace(term, order=Order(place), coefficient=f"column{len(columns)}")
                 if _is_valid_input_set(structure, [*present, *input_terms, column_term], top, runs):
                     columns.append(column)
