@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftlm.data.sampling import make_read_only
 from ftlm.errors import DataError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
@@ -74,8 +75,8 @@ class FrequencyData:
                 f"{self.name}: response has shape {response.shape}, frequency {frequency.shape}; give one value each"
             )
         _refuse(~np.isfinite(response), response, f"{self.name}: response", "is not finite; leave such rows out")
-        object.__setattr__(self, "frequency", _read_only_copy(frequency))
-        object.__setattr__(self, "response", _read_only_copy(response))
+        object.__setattr__(self, "frequency", make_read_only(frequency.copy()))
+        object.__setattr__(self, "response", make_read_only(response.copy()))
         if self.deviation is not None:
             deviation = _column(f"{self.name}: deviation", self.deviation)
             if deviation.ndim == 1 and deviation.size != frequency.size:
@@ -84,7 +85,7 @@ class FrequencyData:
                 )
             words = "is not above 0; leave such rows out, or weight without deviations"
             _refuse(~(deviation > 0), deviation, f"{self.name}: deviation", words)
-            object.__setattr__(self, "deviation", _read_only_copy(deviation))
+            object.__setattr__(self, "deviation", make_read_only(deviation.copy()))
 
     @classmethod
     def from_arrays(
@@ -222,9 +223,3 @@ def _refuse(bad: np.ndarray, values: np.ndarray, name: str, way_out: str) -> Non
         at = int(np.argmax(bad))
         what, _, rest = way_out.partition(";")
         raise DataError(f"{name} {what}: {values[at]} at row {at}, {int(np.sum(bad))} in all;{rest}")
-
-
-def _read_only_copy(values: np.ndarray) -> np.ndarray:
-    copy = values.copy()
-    copy.setflags(write=False)
-    return copy

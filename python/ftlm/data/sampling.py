@@ -16,7 +16,7 @@ from ftlm import _core
 from ftlm.errors import DataError
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, parameter
-from ftlm.utils.validation import Floats, as_array, as_mapping, bad_rows, join_names, nearest
+from ftlm.utils.validation import Floats, Scalar, as_array, as_mapping, bad_rows, join_names, nearest
 
 Intersample: TypeAlias = Literal["zoh", "foh"]
 # Every estimator squares values; larger ones overflow in double precision.
@@ -37,7 +37,7 @@ def uniform_times(rows: int, step: float) -> Floats:
     return np.arange(rows, dtype=np.float64) * step
 
 
-def make_read_only(values: Floats) -> Floats:
+def make_read_only(values: NDArray[Scalar]) -> NDArray[Scalar]:
     """Make an array read-only, and return a read-only view of it; an array that is not contiguous is copied first."""
     owner = np.ascontiguousarray(values)
     if owner.flags.writeable:

@@ -335,14 +335,10 @@ def find_table(
     _check_width(rows[-2:], source)
     separator, comma, mark, table_lines = _choose_separator(rows, layout_options, source)
     width = _width(table_lines)
-    first = (
-        0 if layout_options.skip is not None and layout_options.header is not None else _first_row(table_lines, width)
-    )
-    top = (
-        first
-        if layout_options.skip is None or layout_options.header is None
-        else min(layout_options.header, len(table_lines))
-    )
+    if layout_options.skip is None or layout_options.header is None:
+        top = _first_row(table_lines, width)
+    else:
+        top = min(layout_options.header, len(table_lines))
     names, units, top = _header(table_lines, top, width, layout_options, source, own=own)
     header = 0 if names is None else 1 if units is None else 2
     layout = Layout(

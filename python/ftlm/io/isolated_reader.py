@@ -58,26 +58,19 @@ class BinaryFormat:
     package: str
     extra: str
     label: str
-    repair_hint: str
+    repair_hint: str = "save it again"
     has_sheets: bool = False
 
 
 _MATLAB_REPAIR_HINT = "save it again with save('FILE.mat', '-v7')"
 MATLAB_FORMAT = BinaryFormat("mat", (".mat",), "scipy", "mat", ".mat", _MATLAB_REPAIR_HINT)
 MATLAB_73_FORMAT = BinaryFormat("hdf5", (), "h5py", "hdf5", ".mat (version 7.3)", _MATLAB_REPAIR_HINT)
-HDF5_FORMAT = BinaryFormat("hdf5", (".h5", ".hdf5", ".hdf", ".he5"), "h5py", "hdf5", "HDF5", "save it again")
-PARQUET_FORMAT = BinaryFormat("parquet", (".parquet", ".pq"), "pyarrow", "parquet", "parquet", "save it again")
-FEATHER_FORMAT = BinaryFormat("feather", (".feather", ".arrow"), "pyarrow", "parquet", "feather", "save it again")
-NUMPY_FORMAT = BinaryFormat("numpy", (".npz", ".npy"), "numpy", "", "NumPy", "save it again")
-SPREADSHEET_FORMAT = BinaryFormat(
-    "sheet",
-    (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods"),
-    "python_calamine",
-    "excel",
-    "sheet",
-    "save it again",
-    has_sheets=True,
-)
+HDF5_FORMAT = BinaryFormat("hdf5", (".h5", ".hdf5", ".hdf", ".he5"), "h5py", "hdf5", "HDF5")
+PARQUET_FORMAT = BinaryFormat("parquet", (".parquet", ".pq"), "pyarrow", "parquet", "parquet")
+FEATHER_FORMAT = BinaryFormat("feather", (".feather", ".arrow"), "pyarrow", "parquet", "feather")
+NUMPY_FORMAT = BinaryFormat("numpy", (".npz", ".npy"), "numpy", "", "NumPy")
+_SPREADSHEET_SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
+SPREADSHEET_FORMAT = BinaryFormat("sheet", _SPREADSHEET_SUFFIXES, "python_calamine", "excel", "sheet", has_sheets=True)
 BINARY_FORMATS = (MATLAB_FORMAT, HDF5_FORMAT, PARQUET_FORMAT, FEATHER_FORMAT, NUMPY_FORMAT, SPREADSHEET_FORMAT)
 _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 

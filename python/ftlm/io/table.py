@@ -21,28 +21,11 @@ from ftlm.utils.validation import bad_rows, join_names, nearest
 
 _RELATIVE_TIME_TOLERANCE = 1e-9
 #: Further names of time columns besides t, time and seconds, case-folded and without word separators.
-_OTHER_TIMES = frozenset(
-    (
-        "timestamp",
-        "datetime",
-        "zeit",
-        "zeitstempel",
-        "datumzeit",
-        "datumuhrzeit",
-        "uhrzeit",
-        "elapsedtime",
-        "elapsed",
-        "timeelapsed",
-        "xvalue",
-        "temps",
-        "tiempo",
-        "tempo",
-        "sec",
-        "secs",
-        "second",
-        "sekunden",
-    )
+_OTHER_TIME_NAMES = (
+    "timestamp datetime zeit zeitstempel datumzeit datumuhrzeit uhrzeit elapsedtime elapsed timeelapsed xvalue temps "
+    "tiempo tempo sec secs second sekunden"
 )
+_OTHER_TIMES = frozenset(_OTHER_TIME_NAMES.split())
 _JOINER_REMOVAL = str.maketrans("", "", " _-/.")
 _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 

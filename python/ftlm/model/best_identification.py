@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import os
     from pathlib import Path
 
+    from ftlm.estimation.result import Identification
     from ftlm.utils.validation import Floats
 
 
@@ -23,19 +24,19 @@ class BestIdentification:
     best: Any
 
     @property
-    def _identification(self) -> Any:
+    def _identification(self) -> Identification:
         if self.best is None:
             raise ModelError(
                 "this result has no identification of its best model; call search_orders with the runs and the store, "
                 "or identify the structure"
             )
-        return self.best
+        best: Identification = self.best
+        return best
 
     @property
     def fit(self) -> dict[str, float]:
         """Fit of the simulation on the estimation runs in percent, by output."""
-        fit: dict[str, float] = self._identification.fit
-        return fit
+        return self._identification.fit
 
     #: Alias of :attr:`fit`, whose name states the unit.
     fit_percent = fit
@@ -43,32 +44,27 @@ class BestIdentification:
     @property
     def values(self) -> dict[str, float]:
         """Estimates of the parameters of the best model by name."""
-        values: dict[str, float] = self._identification.values
-        return values
+        return self._identification.values
 
     @property
     def standard_errors(self) -> dict[str, float]:
         """Standard errors of the parameters of the best model by name; {} for methods that give none."""
-        errors: dict[str, float] = self._identification.standard_errors
-        return errors
+        return self._identification.standard_errors
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % confidence intervals (low, high) of the parameters of the best model by name."""
-        intervals: dict[str, tuple[float, float]] = self._identification.intervals
-        return intervals
+        return self._identification.intervals
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the rows and columns of ``covariance``."""
-        names: tuple[str, ...] = self._identification.names
-        return names
+        return self._identification.names
 
     @property
     def covariance(self) -> Floats:
         """Covariance matrix of the parameters in ``names``; see :attr:`ftlm.Identification.covariance`."""
-        covariance: Floats = self._identification.covariance
-        return covariance
+        return self._identification.covariance
 
     def validate(self, runs: Any) -> Any:
         """Compare the best model with other runs; see :meth:`ftlm.Identification.validate`."""
@@ -80,5 +76,4 @@ class BestIdentification:
 
     def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
         """Write an HTML page about the best model; see :meth:`ftlm.Identification.report`."""
-        page: Path = self._identification.report(path, validation=validation, force=force)
-        return page
+        return self._identification.report(path, validation=validation, force=force)

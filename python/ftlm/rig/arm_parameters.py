@@ -273,18 +273,15 @@ class ArmParameters:
             "coulomb": [self.stage1.coulomb, self.stage2.coulomb],
         }
         sensors = {
+            **vars(self),
             "strain_scale": STRAIN_SCALE,
-            "strain_bias": self.strain_bias,
             "noise": [*self.strain_noise, *self.current_noise],
             "sense_bias": self.current_bias,
             "sense_scale": SENSE_SCALE,
             "command_scale": COMMAND_SCALE,
-            "encoder_scale": self.encoder_scale,
             "range": 10.0,
-            "bits": self.bits,
             "current_limit": CURRENT_LIMIT,
             "offset": self.current_offset,
-            "travel": self.travel,
         }
         return _core.VirtualArm(links, sensors, step, MAX_SUBSTEP_S, horizon)
 

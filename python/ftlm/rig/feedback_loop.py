@@ -23,7 +23,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters
 from ftlm.rig.excitation import finite_number
-from ftlm.rig.recording import Experiment, RigSetup, check_times
+from ftlm.rig.recording import Experiment, check_times
 from ftlm.rig.rig import MAX_RUN_DURATION_S, Board, Rig
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import plural
@@ -145,8 +145,8 @@ def control(
             reset()
         return ControllerSource(controller, rows, rate, getattr(board, "clock", time.perf_counter))
 
-    setup = RigSetup(rig, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board)
-    experiment = Experiment(setup, duration, limit, rate, name, out, force, live, progress)
+    board_options = rig, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board
+    experiment = Experiment(*board_options, duration, limit, rate, name, out, force, live, progress)
     return experiment.record_run(loop, {"control": description})
 
 

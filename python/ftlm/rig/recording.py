@@ -339,9 +339,9 @@ def record(
     duration, limit, rate = check_times(duration, limit, rate)
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
     commands = excitation.commands(rate, duration)
-    setup = RigSetup(rig, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board)
     name = excitation.shape if name is None else name
-    experiment = Experiment(setup, duration, limit, rate, name, out, force, live, progress)
+    board_options = rig, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board
+    experiment = Experiment(*board_options, duration, limit, rate, name, out, force, live, progress)
     return experiment.record_run(lambda board: FixedCommands(commands), {"input": excitation.to_dict()})
 
 
@@ -366,8 +366,8 @@ class CommandSource(Protocol):
 
 
 @dataclass(frozen=True)
-class RigSetup:
-    """Arguments of :func:`record` that select a board and define its operation."""
+class Experiment:
+    """Arguments of an experiment, after validation of seed and times; see :func:`record`."""
 
     rig: str | Board
     seed: int
@@ -378,9 +378,17 @@ class RigSetup:
     watchdog: float
     arm: bool
     board: str
+    duration: float
+    limit: float
+    rate: float
+    name: str
+    out: str | os.PathLike[str] | None
+    force: bool
+    live: Streaming | None
+    progress: Callable[[int, int], None] | None
 
-    def select_board(self, limit: float) -> tuple[Board, dict[str, Any]]:
-        """Return the selected board for runs of at most `limit` seconds, and metadata on the board.
+    def select_board(self) -> tuple[Board, dict[str, Any]]:
+        """Return the selected board and metadata on the board.
 
         Raise ModelError or DataError if rig, offset or parameters are invalid.
         """
@@ -400,7 +408,7 @@ class RigSetup:
                         "of motor 1 and motor 2 [A]"
                     )
                 arm = replace(arm, current_offset=(first, second))
-            board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=limit)
+            board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=self.limit)
             return board, {"parameters": arm.to_dict()}
         if isinstance(self.rig, str):
             check_choice("rig", self.rig, ("virtual", "q8"))
@@ -410,43 +418,27 @@ class RigSetup:
         own = getattr(self.rig, "parameters", None)
         return self.rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
-
-@dataclass(frozen=True)
-class Experiment:
-    """Arguments of an experiment after validation; see :func:`record`."""
-
-    setup: RigSetup
-    duration: float
-    limit: float
-    rate: float
-    name: str
-    out: str | os.PathLike[str] | None
-    force: bool
-    live: Streaming | None
-    progress: Callable[[int, int], None] | None
-
     def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
         """Run the experiment and return the recorded run.
 
         `source_on` returns the command source for the selected board, and `more_details` are added to the metadata.
         Raise ModelError or DataError for invalid arguments, and RigFault if the rig stops the run.
         """
-        setup = self.setup
         # Flags that permit an arm to move must be bool; other values that count as true are rejected.
-        for name, flag in (("real_time", setup.real_time), ("arm", setup.arm), ("force", self.force)):
+        for name, flag in (("real_time", self.real_time), ("arm", self.arm), ("force", self.force)):
             if not isinstance(flag, bool):
                 raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
             raise ModelError(f"progress is {type_name(self.progress)}; give a function of (done, total)")
-        if setup.sensor_filter is not None and not (
-            isinstance(setup.sensor_filter, str) and setup.sensor_filter == "stock"
+        if self.sensor_filter is not None and not (
+            isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
         ):
             raise ModelError(
-                f"{setting('sensor_filter')} {short_repr(setup.sensor_filter)} is not known; use 'stock' or None"
+                f"{setting('sensor_filter')} {short_repr(self.sensor_filter)} is not known; use 'stock' or None"
             )
-        board, details = setup.select_board(self.limit)
-        paced = setup.real_time or board.hardware or bool(getattr(board, "real_time", False))
-        if board.hardware and not setup.arm:
+        board, details = self.select_board()
+        paced = self.real_time or board.hardware or bool(getattr(board, "real_time", False))
+        if board.hardware and not self.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and "
                 f"confirm with {parameter('arm', True)}"
@@ -460,22 +452,22 @@ class Experiment:
         source = source_on(board)
         about: dict[str, Any] = {
             "rig": board.name,
-            "seed": setup.seed,
+            "seed": self.seed,
             "rate": self.rate,
             "duration": self.duration,
             "real_time": paced,
-            "watchdog": setup.watchdog,
-            "sensor_filter": setup.sensor_filter,
+            "watchdog": self.watchdog,
+            "sensor_filter": self.sensor_filter,
             **more_details,
             **details,
         }
         link = Rig(
             board,
             rate=self.rate,
-            watchdog=setup.watchdog,
+            watchdog=self.watchdog,
             limit=self.limit,
             limits=Limits(),
-            sensor_filter=STOCK_FILTER if setup.sensor_filter else None,
+            sensor_filter=STOCK_FILTER if self.sensor_filter else None,
         )
         step, live = 1.0 / self.rate, self.live
         if live is not None and not math.isclose(live.step, step, rel_tol=1e-9):

@@ -378,20 +378,14 @@ class Limits:
         """
         return _core.Guard(
             {
+                **vars(self),
                 "step": step,
                 "strain_scale": STRAIN_SCALE,
                 "sense_scale": SENSE_SCALE,
                 "command_scale": COMMAND_SCALE,
                 "encoder_scale": ENCODER_SCALE,
                 "current_limit": self.current,
-                "slew": self.slew,
-                "continuous": self.continuous,
-                "thermal_time": self.thermal_time,
                 "deflection_limit": self.deflection,
-                "saturation": self.saturation,
-                "moving_current": self.moving_current,
-                "standstill": self.standstill,
-                "fastest": self.fastest,
                 "late_limit": self.max_write_delay,
                 "missed_limit": self.max_missed_deadlines,
                 "filter": sensor_filter,
