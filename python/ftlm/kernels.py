@@ -222,12 +222,7 @@ def toeplitz_solve(kernel: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
 @check_arguments
 def multi_innovation(
-    Q: ArrayLike,
-    m: ArrayLike,
-    p: int = 7,
-    *,
-    prior_covariance: ArrayLike,
-    trace: bool = False,
+    Q: ArrayLike, m: ArrayLike, p: int = 7, *, prior_covariance: ArrayLike, trace: bool = False
 ) -> NDArray[np.float64]:
     """Return the multi-innovation estimate of X in m = Q X by equations (42)-(44) of the paper, starting from X = 0.
 

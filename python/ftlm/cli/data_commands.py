@@ -38,12 +38,7 @@ def open_(
 
 
 @command
-def inspect(
-    files: list[str],
-    *,
-    reading: ReadingOptions,
-    as_json: bool = False,
-) -> None:
+def inspect(files: list[str], *, reading: ReadingOptions, as_json: bool = False) -> None:
     """Print range, noise, quantization and initial rest of the signals of runs, and advice before identification."""
     inspected = [(run.inspect(), run.advice()) for run in reading.runs(files)]
     if as_json:

@@ -291,14 +291,7 @@ def search(
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
-            name: make_job(
-                runs,
-                part,
-                restrict_grid(every, part),
-                settings,
-                m=m,
-                threads=threads,
-            )
+            name: make_job(runs, part, restrict_grid(every, part), settings, m=m, threads=threads)
             for name, part in parts.items()
         }
         open_store = None
@@ -426,13 +419,7 @@ def show_notes(store: Store) -> None:
 
 
 @command
-def resume(
-    store: str,
-    *,
-    recover: bool = False,
-    threads: int | None = None,
-    as_json: bool = False,
-) -> None:
+def resume(store: str, *, recover: bool = False, threads: int | None = None, as_json: bool = False) -> None:
     """Resume the searches of a checkpoint file and print their results; no other file is needed.
 
     Options
@@ -455,11 +442,7 @@ def resume(
 
 
 @command
-def status(
-    store: str,
-    *,
-    as_json: bool = False,
-) -> None:
+def status(store: str, *, as_json: bool = False) -> None:
     """Print the progress of the searches of a checkpoint file, which may be in use."""
     states = search_status(store)
     if as_json:

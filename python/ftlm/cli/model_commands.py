@@ -74,14 +74,7 @@ def compare(
 
 
 @command
-def resid(
-    model: str,
-    files: list[str],
-    *,
-    lags: Positive = 25,
-    reading: ReadingOptions,
-    as_json: bool = False,
-) -> None:
+def resid(model: str, files: list[str], *, lags: Positive = 25, reading: ReadingOptions, as_json: bool = False) -> None:
     """Test residuals for whiteness and independence of the inputs; exit code 4 if a test fails.
 
     Options

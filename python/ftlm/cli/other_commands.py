@@ -170,12 +170,7 @@ def orders(
 
 
 @command
-def app(
-    files: list[str] | None = None,
-    *,
-    port: int | None = None,
-    browser: bool = True,
-) -> None:
+def app(files: list[str] | None = None, *, port: int | None = None, browser: bool = True) -> None:
     """Start the local web application for identification in a browser; Ctrl-C stops it.
 
     Arguments

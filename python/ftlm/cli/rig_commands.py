@@ -42,10 +42,7 @@ _READER_PACKAGES = {
 
 
 @command
-def doctor(
-    *,
-    as_json: bool = False,
-) -> None:
+def doctor(*, as_json: bool = False) -> None:
     """Print versions, processor cores, vector unit, and whether the driver of the rig is installed."""
     about: dict[str, Any] = {
         "ftlm": _core.__version__,

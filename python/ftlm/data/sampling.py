@@ -182,9 +182,8 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
     if wrong:
         thing, count = wrong[0]
         raise DataError(
-            f"{thing}: {plural(count, 'row')} where {expected} are expected, {len(wrong)} of {len(lengths)} "
-            f"columns differ; "
-            "give every column one number per row of the same record"
+            f"{thing}: {plural(count, 'row')} where {expected} are expected, {len(wrong)} of {len(lengths)} columns "
+            "differ; give every column one number per row of the same record"
         )
 
 

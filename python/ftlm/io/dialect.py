@@ -615,8 +615,7 @@ def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool,
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
             f"a table of {width} cells per row; give every line the same number of cells, or state how many lines to "
-            "leave "
-            f"out with {layout_parameter(skip=Placeholder('LINES'))}"
+            f"leave out with {layout_parameter(skip=Placeholder('LINES'))}"
         )
 
 

@@ -30,12 +30,7 @@ from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model
 from ftlm.order_search.search import landscape as scores_of
-from ftlm.plot.comparison_charts import (
-    comparison_charts,
-    correlation_chart,
-    residual_rows,
-    signal_chart,
-)
+from ftlm.plot.comparison_charts import comparison_charts, correlation_chart, residual_rows, signal_chart
 from ftlm.plot.model_charts import TimeResponse, bode_charts, pole_charts, response_chart
 from ftlm.structure.circuit import Circuit
 from ftlm.svg.charts import BarChart, CorrelationMap, Landscape, PlaneChart

@@ -162,9 +162,8 @@ def behavior_tables(model: Model) -> list[Table]:
             for k, m in enumerate(model_modes)
         ]
         note = (
-            "The time constant is 1/|Re s| of an oscillation and 1/|s| of a relaxation; standard errors are to "
-            "first order from the "
-            "covariance of the fit."
+            "The time constant is 1/|Re s| of an oscillation and 1/|s| of a relaxation; standard errors are to first "
+            "order from the covariance of the fit."
         )
         columns = ("mode", "pole s [rad/s]", "frequency [rad/s]", "±", "damping", "±", "time constant [s]", "±")
         tables.append(Table("Modes", columns, rows, note=note))
@@ -335,8 +334,7 @@ def first_sections(
     units = model.units
     words = [
         "No check raised a warning. Checked: simulation against equation error, orders close to one another or on the "
-        "edge of their interval, influence of the prior, coefficient law, residuals, stability of the scheme, the "
-        "data."
+        "edge of their interval, influence of the prior, coefficient law, residuals, stability of the scheme, the data."
     ]
     if not validated:
         words.append("No validation run was given, so the prediction of other data is unknown.")
@@ -348,10 +346,7 @@ def first_sections(
     # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     own = compared[0][1] if compared and compared[0][0] == "estimation" else None
-    equations = [
-        *equations_html(model, None if own is None else own.offsets),
-        stability_note(model),
-    ]
+    equations = [*equations_html(model, None if own is None else own.offsets), stability_note(model)]
     validated_on = [(label, c) for label, c in compared if label == "validation"]
     fits = [(label, c) for label, c in compared if label != "validation"]
     left_runs = list(runs)

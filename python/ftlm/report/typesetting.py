@@ -64,10 +64,7 @@ def equation_html(
         # The sign of the first term is a prefix operator; the other signs are infix operators between terms.
         lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(
-            _math(
-                lead + _number_math(abs(value)) + THIN_SPACE + _operand_math(term, delay or {}, limits),
-                "term",
-            )
+            _math(lead + _number_math(abs(value)) + THIN_SPACE + _operand_math(term, delay or {}, limits), "term")
         )
     if item.friction is not None:
         fc, fs, vs = item.friction.law

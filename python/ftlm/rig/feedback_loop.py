@@ -312,9 +312,8 @@ def _reference_per_sample(values: Floats, rows: int, rate: float, travel: tuple[
     reference = np.tile(values, (rows, 1)) if values.ndim == 1 else values
     if len(reference) != rows:
         raise DataError(
-            f"reference has {plural(len(reference), 'row')}, and a run of {(rows - 1) / rate:g} s at {rate:g} "
-            f"Hz has {rows}; "
-            f"give as many, or leave {parameter('duration')} out"
+            f"reference has {plural(len(reference), 'row')}, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has "
+            f"{rows}; give as many, or leave {parameter('duration')} out"
         )
     for hub, most in enumerate(travel):
         angles = reference[:, hub]

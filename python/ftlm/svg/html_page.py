@@ -129,10 +129,7 @@ class Table:
         ends = list(accumulate(width for _, width in self.groups))
         at = ends.index(column) + 1 if ends else 0
         left = replace(
-            self,
-            columns=self.columns[:column],
-            rows=[row[:column] for row in self.rows],
-            groups=self.groups[:at],
+            self, columns=self.columns[:column], rows=[row[:column] for row in self.rows], groups=self.groups[:at]
         )
         right = replace(
             self,
