@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
+
+import msgspec.toml
 
 from ftlm._core import __version__
 from ftlm.arm.flexible_link import flexible_link
@@ -22,6 +25,7 @@ from ftlm.structure.parser import equation
 from ftlm.structure.structure import Offset, Structure
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import select
+from ftlm.svg.html_page import read_resource
 from ftlm.utils.resources import estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, is_run_name
 
@@ -357,10 +361,8 @@ def sanitize_for_docstring(text: str) -> str:
 
 
 #: Form fields of the layout of a text file: those with integer values, and those with text values.
-INTEGER_LAYOUT_FIELDS, TEXT_LAYOUT_FIELDS = (
-    ("skip", "header"),
-    ("encoding", "separator", "decimal", "thousands", "dates", "sheet"),
-)
+INTEGER_LAYOUT_FIELDS = ("skip", "header")
+TEXT_LAYOUT_FIELDS = ("encoding", "separator", "decimal", "thousands", "dates", "sheet")
 COLUMN_ROLES = ("", "time", "input", "output")
 MAX_SIGNALS = 500
 
@@ -461,6 +463,15 @@ MAX_SUGGESTED_SIGNALS = 6
 MAX_DELAY_SHARE = 0.1
 
 
+@cache
+def _suggested_kinds() -> list[dict[str, str]]:
+    """Return the suggested kinds of structures, with name, purpose ("why") and equation, from their file."""
+    kinds: list[dict[str, str]] = msgspec.toml.decode(read_resource("suggested_structures.toml", "ftlm.app"))[
+        "structures"
+    ]
+    return kinds
+
+
 def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: float) -> list[dict[str, str]]:
     """Return suggested structures for the outputs of a run.
 
@@ -470,28 +481,14 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
     suggestions: list[dict[str, str]] = []
     driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
-        drives = "".join(f" + b{k} {name}" for k, name in enumerate(driven))
         ends = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
-        late = "".join(f" + b{k} {name}(t - {ends})" for k, name in enumerate(driven))
-        for name, why, lhs, own, right in (
-            ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}", drives),
-            ("Lag with dead time", "a lag that answers late: its delay is estimated", "D", "a0 {y}", late),
-            ("Lag of free order", "diffusion, batteries, creep: its order is estimated", "D^alpha", "a0 {y}", drives),
-            ("Oscillator", "second order: a mass on a spring", "D^2", "a1 D {y} + a0 {y}", drives),
-            (
-                "Oscillator, damping of free order",
-                "viscoelastic damping: its order is estimated",
-                "D^2",
-                "a1 D^mu {y} + a0 {y}",
-                drives,
-            ),
-            ("Oscillator of free orders", "both orders are estimated", "D^alpha", "a1 D^mu {y} + a0 {y}", drives),
-            ("Third order", "an oscillator behind a lag", "D^3", "a2 D^2 {y} + a1 D {y} + a0 {y}", drives),
-            ("Integrator", "an angle or a level driven by a torque or a flow", "D^2", "a1 D {y}", drives),
-            ("Integrator, dry friction", "a motor's angle that sticks", "D^2", "a1 D {y} - fc sign(D {y})", drives),
-        ):
-            text = f"{lhs} {output} = {own.format(y=output)}{right}"
-            suggestions.append({"name": name, "why": why, "structure": text, "output": output})
+        terms = {
+            "inputs": "".join(f" + b{k} {name}" for k, name in enumerate(driven)),
+            "delayed_inputs": "".join(f" + b{k} {name}(t - {ends})" for k, name in enumerate(driven)),
+        }
+        for kind in _suggested_kinds():
+            structure = kind["equation"].format(y=output, **terms)
+            suggestions.append({"name": kind["name"], "why": kind["why"], "structure": structure, "output": output})
     for stage in (1, 2):
         if {f"I{stage}", f"theta{stage}1", f"theta{stage}2"} <= {*inputs, *outputs}:
             suggestions.append(

@@ -108,13 +108,10 @@ def split_numbers(text: str) -> list[float]:
 
 #: Options that do not exist, with the correct option that an error message suggests.
 OPTION_ALIASES = {"--equation": "--structure", "--circuit": "--structure"}
-#: Minimum number of gaps of two or more spaces in a line that is treated as a table row. Patterns of such a gap, and of
-#: the beginning of a list entry.
-MIN_TABLE_GAPS, _GAP_PATTERN, _ENTRY_PATTERN = (
-    3,
-    re.compile(" {2,}"),
-    re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )"),
-)
+#: Minimum number of gaps of two or more spaces in a line that is treated as a table row, and pattern of such a gap.
+MIN_TABLE_GAPS, _GAP_PATTERN = 3, re.compile(" {2,}")
+#: Pattern of the beginning of a list entry.
+_ENTRY_PATTERN = re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
 #: Message of typer's option parser for a value that is not among the choices of an option.
 _CHOICE_PATTERN = re.compile(r".*?'([^']*)' is not one of (.*)\.")
 #: Names of types in help texts.
@@ -326,11 +323,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     outputs = {name: option.ending for name, option in described.items() if option.is_output}
 
     @functools.wraps(work)
+    @use_interface("command line")
     def run(**arguments: Any) -> None:
-        with use_interface("command line"):
-            execute(**arguments)
-
-    def execute(**arguments: Any) -> None:
         option_records = {
             name: kind(**{f.name: arguments.pop(f.name) for f in fields(kind)}) for name, kind in records.items()
         }

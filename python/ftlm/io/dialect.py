@@ -28,11 +28,9 @@ SEPARATOR_CHARACTERS: dict[str, str | None] = {"semicolon": ";", "tab": "\t", "c
 DECIMAL_CHARACTERS = {"point": ".", "comma": ","}
 THOUSANDS_CHARACTERS: dict[str, str | None] = {"none": "", "point": ".", "comma": ",", "space": None, "apostrophe": "'"}
 DATE_ORDERS = ("ymd", "dmy", "mdy")
-#: Layout options that apply to sheets and to text files.
-SHEET_OPTIONS, TEXT_OPTIONS = (
-    ("skip", "header", "dates", "sheet"),
-    ("encoding", "separator", "decimal", "thousands", "skip", "header", "dates"),
-)
+#: Layout options that apply to sheets, and those that apply to text files.
+SHEET_OPTIONS = ("skip", "header", "dates", "sheet")
+TEXT_OPTIONS = ("encoding", "separator", "decimal", "thousands", "skip", "header", "dates")
 _MAX_SKIPPED_LINES = 1 << 40
 
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 import textwrap
+import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from numbers import Integral
@@ -21,16 +22,8 @@ DIVERGED_TEXT = "diverged"
 MAX_LINE_CHARACTERS, MIN_LINE_CHARACTERS = 110, 40
 _EQUATION_PATTERN = re.compile(r"D\^?\S* \S+ = ")
 GREEK_LETTERS = {
-    "alpha": "α",
-    "beta": "β",
-    "gamma": "γ",
-    "delta": "δ",
-    "theta": "θ",
-    "mu": "μ",
-    "nu": "ν",
-    "tau": "τ",
-    "phi": "φ",
-    "omega": "ω",
+    name: unicodedata.lookup(f"GREEK SMALL LETTER {name}")
+    for name in ("alpha", "beta", "gamma", "delta", "theta", "mu", "nu", "tau", "phi", "omega")
 }
 _SUBSCRIPT_DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 SUPERSCRIPT_DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
