@@ -62,7 +62,7 @@ def fractional_integral(
     The cost is O(n log n) for n samples.
     """
     eta, width = real_number("order", order), real_number("step", step)
-    return apply_along_axis("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
+    return apply_along_axis(x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
 
 
 @check_arguments
@@ -130,7 +130,7 @@ def fractional_derivative(
         starts = np.ascontiguousarray(starts)
         return _core.fractional_derivative(rows, alpha, width, definition, starts)
 
-    return apply_along_axis("x", x, axis, work)
+    return apply_along_axis(x, axis, work)
 
 
 @check_arguments
@@ -156,7 +156,7 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     ModelError
         A length that is not a power of two.
     """
-    return apply_along_axis("x", x, axis, _core.haar_transform)
+    return apply_along_axis(x, axis, _core.haar_transform)
 
 
 @check_arguments
@@ -180,7 +180,7 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     ModelError
         A length that is not a power of two.
     """
-    return apply_along_axis("x", x, axis, _core.haar_inverse)
+    return apply_along_axis(x, axis, _core.haar_inverse)
 
 
 @check_arguments

@@ -25,7 +25,6 @@ from ftlm.fractional_calculus import haar_transform as haar
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import (
-    Scalar,
     as_floats,
     check_choice,
     check_integer,
@@ -815,10 +814,5 @@ def _with_kernels(
     if columns.shape[1] != m:
         raise DataError(f"kernel has {columns.shape[1]} values and {name} has {m}; give both the same length")
     lead = _broadcast({"kernel": of, name: values.shape[:-1]})
-    groups = _broadcast_to(np.arange(columns.shape[0]).reshape(of), lead).ravel().tolist()
-    return work(columns, _broadcast_to(values, (*lead, m)).reshape(-1, m), groups).reshape(*lead, m)
-
-
-def _broadcast_to(array: NDArray[Scalar], shape: tuple[int, ...]) -> NDArray[Scalar]:
-    """Return a view of an array broadcast to a shape; the array itself if it already has this shape."""
-    return array if array.shape == shape else np.broadcast_to(array, shape)
+    groups = np.broadcast_to(np.arange(columns.shape[0]).reshape(of), lead).ravel().tolist()
+    return work(columns, np.broadcast_to(values, (*lead, m)).reshape(-1, m), groups).reshape(*lead, m)

@@ -26,7 +26,6 @@ from ftlm.data.sampling import (
     describe_resampled_signals,
     fill_input_gaps,
     grid_positions,
-    has_too_few_values,
     interpolate_gaps,
     masked_rows_error,
     missing_mask,
@@ -187,8 +186,9 @@ class RunArguments:
             if not is_missing.any():
                 continue
             if name in self.outputs:
-                if has_too_few_values(values):
-                    what = f"{int((~is_missing).sum())} values, but {MIN_RUN_SAMPLES} are needed"
+                count = int((~is_missing).sum())
+                if count < MIN_RUN_SAMPLES:
+                    what = f"{count} values, but {MIN_RUN_SAMPLES} are needed"
                     raise bad_rows(self.label_of(name), what, 0, int(is_missing.sum()), "use a longer record")
                 notes.append(
                     describe_missing(
@@ -263,7 +263,7 @@ class RunArguments:
         """
         first, last = 0, times.size
         if self.window is not None:
-            first, last = window_rows(times, self.window, "window", self.time_label)
+            first, last = window_rows(times, self.window, self.time_label)
         if last - first < MIN_RUN_SAMPLES:
             thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(

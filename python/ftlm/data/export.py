@@ -9,7 +9,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,14 +29,12 @@ from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, nam
 
 def arguments_from_frame(
     frame: object,
-    *,
     time: Hashable | None,
     step: float | None,
     inputs: object,
     outputs: object,
     units: Mapping[str, str] | None,
     time_unit: str | None,
-    window: Sequence[float | None] | None,
     **more: Any,
 ) -> RunArguments:
     """Return the arguments of a run from the columns of a frame; see :meth:`ftlm.Run.from_frame`."""
@@ -81,7 +79,6 @@ def arguments_from_frame(
         time=clock,
         units=units,
         time_unit=unit,
-        window=window,
         labels=labels,
         notes=notes,
         time_label=label,

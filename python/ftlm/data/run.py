@@ -186,18 +186,9 @@ class Run:
             large; if lengths differ; if a name is invalid or used twice; if a unit or intersample behavior is unknown;
             if time is not finite, repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
+        own, measured = as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs)
         arguments = RunArguments(
-            as_mapping("inputs", {} if inputs is None else inputs),
-            as_mapping("outputs", outputs),
-            step=step,
-            time=time,
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=window,
-            time_unit=time_unit,
-            missing=missing,
+            own, measured, step, time, units, intersample, name, resample, window, time_unit, missing=missing
         )
         return cls._from_checked(**arguments.checked_fields())
 
@@ -251,20 +242,8 @@ class Run:
         """
         from ftlm.data.export import arguments_from_frame
 
-        arguments = arguments_from_frame(
-            frame,
-            time=time,
-            step=step,
-            inputs=inputs,
-            outputs=outputs,
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=window,
-            time_unit=time_unit,
-            missing=missing,
-        )
+        more = {"intersample": intersample, "name": name, "resample": resample, "window": window, "missing": missing}
+        arguments = arguments_from_frame(frame, time, step, inputs, outputs, units, time_unit, **more)
         return cls._from_checked(**arguments.checked_fields())
 
     @property
@@ -385,7 +364,7 @@ class Run:
         DataError
             If a limit lies outside the run, the limits do not increase, or fewer than three rows remain.
         """
-        first, last = window_rows(uniform_times(self.length, self.step), (start, stop), "window")
+        first, last = window_rows(uniform_times(self.length, self.step), (start, stop))
         if last - first < MIN_RUN_SAMPLES:
             raise DataError(
                 f"window: {plural(last - first, 'row', 'remain')}, {MIN_RUN_SAMPLES} are needed; widen the limits"

@@ -347,7 +347,7 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
     return mean
 
 
-def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
+def window_rows(clock: Floats, window: object, thing: str = "time") -> tuple[int, int]:
     """Return the index of the first row inside a data window, and the index after its last row.
 
     `window` is a pair of times [s] since the first row; a time of None marks an open end. Raise DataError if the window
@@ -355,17 +355,17 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     """
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
         raise DataError(
-            f"{parameter(argument, window)} is not a pair (start, stop) of seconds; use None for an open end"
+            f"{parameter('window', window)} is not a pair (start, stop) of seconds; use None for an open end"
         )
     limits: list[float | None] = []
     for limit in window:
         value = as_number(limit)
         if value is None and limit is not None:
             raise DataError(
-                f"{parameter(argument)}: limit {limit!r} is not a number; give seconds, or None for an open end"
+                f"{parameter('window')}: limit {limit!r} is not a number; give seconds, or None for an open end"
             )
         if value is not None and not math.isfinite(value):
-            raise DataError(f"{parameter(argument)}: limit {value!r} is not finite; use None for an open end")
+            raise DataError(f"{parameter('window')}: limit {value!r} is not finite; use None for an open end")
         limits.append(value)
     start, stop = limits
     ends = clock[[0, -1]]
@@ -383,35 +383,18 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     way_out = f"{thing} has times from 0 to {whole:.12g} s since its first row"
     for limit in (start, stop):
         if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= whole + _EDGE_TOLERANCE_STEPS * step:
-            raise DataError(f"{parameter(argument)}: limit {limit!r} s is out of range; {way_out}")
+            raise DataError(f"{parameter('window')}: limit {limit!r} s is out of range; {way_out}")
     low = 0.0 if start is None else start
     high = math.inf if stop is None else stop
     if low >= high:
-        raise DataError(f"{parameter(argument)}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
+        raise DataError(f"{parameter('window')}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(
             (since >= low - _EDGE_TOLERANCE_STEPS * step) & (since < high - _EDGE_TOLERANCE_STEPS * step)
         )
     if rows.size == 0:
-        raise DataError(f"{argument}: no row lies between {start!r} and {stop!r} s; {way_out}")
+        raise DataError(f"window: no row lies between {start!r} and {stop!r} s; {way_out}")
     return int(rows[0]), int(rows[-1]) + 1
-
-
-def check_rows(since: Floats, step: float) -> int:
-    """Return the number of samples at a new step [s]; raise DataError if it is below 3 or above 50 million.
-
-    `since` are the original sample times [s since the first].
-    """
-    spans = float(since[-1]) / step
-    if spans + 1 > _MAX_RUN_SAMPLES:
-        raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
-    rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
-    if rows < MIN_RUN_SAMPLES:
-        raise DataError(
-            f"{parameter('resample', step)} leaves {plural(rows, 'row')}, {MIN_RUN_SAMPLES} are needed; use a "
-            f"smaller step"
-        )
-    return rows
 
 
 def rows_coincide(since: Floats, step: float) -> bool:
@@ -424,12 +407,20 @@ def rows_coincide(since: Floats, step: float) -> bool:
 def resample_uniform(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Return signals with sample times `since` [s], resampled to a uniform step [s]; see :func:`check_rows` for errors.
+    """Return signals with sample times `since` [s], resampled to a uniform step [s].
 
     Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `behaviour` has the
-    intersample behavior by input.
+    intersample behavior by input. Raise DataError if there would be fewer than three samples, or more than 50 million.
     """
-    check_rows(since, step)
+    spans = float(since[-1]) / step
+    if spans + 1 > _MAX_RUN_SAMPLES:
+        raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
+    rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
+    if rows < MIN_RUN_SAMPLES:
+        raise DataError(
+            f"{parameter('resample', step)} leaves {plural(rows, 'row')}, {MIN_RUN_SAMPLES} are needed; use a "
+            f"smaller step"
+        )
     return NonuniformSamples(since, dict(data)).resample(behaviour, step)
 
 
@@ -570,11 +561,6 @@ class NonuniformSamples:
     def replace_signals(self, **changes: Any) -> NonuniformSamples:
         """Return a copy with some signals replaced."""
         return NonuniformSamples(self.times, {**self.data, **changes})
-
-
-def has_too_few_values(values: Floats) -> bool:
-    """Whether fewer than three samples are present, that is, not NaN."""
-    return int(np.sum(~np.isnan(values))) < MIN_RUN_SAMPLES
 
 
 def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:

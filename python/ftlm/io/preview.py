@@ -169,7 +169,10 @@ class OpenedFile:
     def __str__(self) -> str:
         heads = ("column", "role", "unit", "first", "low", "high")
         columns = self.columns[:_MAX_LISTED_COLUMNS]
-        cells = [heads, *((_truncate_text(c.name), _role(c), _truncate_text(c.unit), *_figures(c)) for c in columns)]
+        cells: list[tuple[str, ...]] = [heads]
+        for c in columns:
+            texts = _truncate_text(c.name), f"{c.role} {c.signal}".rstrip(), _truncate_text(c.unit)
+            cells.append((*texts, *_figures(c)))
         widths = [max(len(row[k]) for row in cells) for k in range(6)]
         counts = f"{self.rows} row{'s' * (self.rows != 1)}, {len(self.columns)} column{'s' * (len(self.columns) != 1)}"
         lines = [f"{_truncate_text(self.path)}: {self.kind}; {counts}"]
@@ -422,10 +425,6 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
 def _toml(value: object) -> str:
     """Return a text or a number in TOML syntax."""
     return json.dumps(value, ensure_ascii=False)
-
-
-def _role(column: FileColumn) -> str:
-    return f"{column.role} {column.signal}" if column.signal else column.role
 
 
 def _figures(column: FileColumn) -> tuple[str, str, str]:

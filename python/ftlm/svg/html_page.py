@@ -303,9 +303,7 @@ class Page:
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the page to an HTML file, and return its path; see :func:`write_page`."""
-        return write_page(
-            path, title=self.title, sections=self.sections, lead=self.lead, force=force, verdict=self.verdict
-        )
+        return write_page(path, force=force, **vars(self))
 
 
 class ReportMixin(ABC):

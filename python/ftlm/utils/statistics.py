@@ -208,12 +208,7 @@ def autoregression(series: Sequence[Floats], most: int) -> Floats:
     most
         Maximum order.
     """
-    return fit_whitening_filter(series, most)[0]
-
-
-def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
-    """Return the whitening filter of :func:`autoregression` and the variance of the whitened series."""
-    return _core.whitening_filter(series, most)
+    return _core.whitening_filter(series, most)[0]
 
 
 def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:

@@ -348,20 +348,18 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
     return array
 
 
-def apply_along_axis(
-    name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """Return the result of `work` along one axis of an array, in the shape of the array.
+def apply_along_axis(x: ArrayLike, axis: int, work: Callable[[Floats], Floats]) -> Floats:
+    """Return the result of `work` along one axis of an array, in the shape of the array; messages call the array x.
 
     `work` maps a matrix to a matrix of the same shape, row by row. Raise DataError for values that are not finite, an
     empty array or an unknown axis.
     """
-    array = finite_floats(name, values)
+    array = finite_floats("x", x)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
-        raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
+        raise DataError(f"x has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
     samples = np.moveaxis(array, axis, -1)
     if samples.shape[-1] == 0:
-        raise DataError(f"{name} has shape {array.shape} and no values; give at least one")
+        raise DataError(f"x has shape {array.shape} and no values; give at least one")
     rows = np.ascontiguousarray(samples.reshape(-1, samples.shape[-1]))
     return np.moveaxis(work(rows).reshape(samples.shape), -1, axis)
 
