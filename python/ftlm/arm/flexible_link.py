@@ -602,8 +602,7 @@ def link_model(
             own = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
             values |= {n: v for n, v in own.items() if n in structure.coefficient_names}
     values |= dict(coefficients or {})
-    integer = {name: INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0) for name in structure.order_names}
-    free = integer | dict(orders or {})
+    free = {name: integer_order(name) for name in structure.order_names} | dict(orders or {})
     return Model(
         structure.with_orders(free).with_coefficients(values),
         orders=free,

@@ -355,7 +355,8 @@ def _complex_text(value: complex) -> str:
 #: Colors from the best (lowest) score to the worst, from the color map viridis. The best scores are dark, which is well
 #: visible on white, and lightness is monotone.
 HEAT_COLORS = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
-NO_SCORE = "#9aa3ad"
+#: Color of a cell without a value.
+NO_VALUE = "#9aa3ad"
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,7 +445,7 @@ class Landscape(Figure):
             j = 0
             # Adjacent cells of a row with equal color are drawn as one rectangle.
             for step, alike in groupby(row):
-                count, colour = len(list(alike)), HEAT_COLORS[step] if step >= 0 else NO_SCORE
+                count, colour = len(list(alike)), HEAT_COLORS[step] if step >= 0 else NO_VALUE
                 place = left + j * cell_w, bottom - (i + 1) * cell_h
                 out.append(_rectangle(*place, count * cell_w, f"{cell_h + 0.3:.1f}", colour))
                 j += count
@@ -492,7 +493,6 @@ def _label_indices(count: int, most: int) -> list[int]:
 CORRELATION_COLORS = ("#1f4e8c", "#4b80bd", "#8fb3d9", "#c8d9ea", "#eceff1", "#f4d5c4", "#e9a27f", "#cf6535", "#9c3009")
 #: Indices of the colors on which text is white.
 DARK_COLOR_INDICES = {0, 1, 7, 8}
-NO_VALUE = "#9aa3ad"
 #: Maximum width of a cell, and minimum width of a cell that shows its correlation as a number [px].
 MAX_CELL_PX, MIN_LABELED_CELL_PX = 46.0, 30.0
 MAX_COLUMN_NAME_CHARACTERS = 12

@@ -374,8 +374,7 @@ class LineChart(Figure):
         # The neutral line is drawn first, below the other lines.
         for line in sorted(self.content[0], key=lambda item: item.style != 0 or item.dots):
             if d := _stem_path(line, plot) if self.stems else _path(line, plot, points):
-                stroke = _stroke(line.style, dots=line.dots)
-                out.append(element("path", vector_effect="non-scaling-stroke", **stroke, d=d))
+                out.append(element("path", vector_effect="non-scaling-stroke", **_stroke(line), d=d))
         box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
         view = f"0 0 {plot.width * TENTHS_PER_PIXEL:.0f} {plot.height * TENTHS_PER_PIXEL:.0f}"
         return element("svg", out, class_="plot", preserveAspectRatio="none", **box, viewBox=view)
@@ -431,14 +430,14 @@ def _stem_path(line: _Line, plot: PlotArea) -> str:
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[rows], line.y[rows]), strict=True))
 
 
-def _stroke(style: int, *, dots: bool = False) -> dict[str, str]:
-    """Return the SVG stroke attributes for an index in LINE_STYLES; dots have no dash pattern."""
-    light, _, dashes = LINE_STYLES[style]
-    dashes = "" if dots else dashes
+def _stroke(line: _Line) -> dict[str, str]:
+    """Return the SVG stroke attributes of a line; dots have no dash pattern."""
+    light, _, dashes = LINE_STYLES[line.style]
+    dashes = "" if line.dots else dashes
     # The measured line is wider, so that it stays visible behind a simulated line that coincides with it.
-    thickness = DOT_DIAMETER_PX if dots else 3.4 if style == 0 else 1.5
+    thickness = DOT_DIAMETER_PX if line.dots else 3.4 if line.style == 0 else 1.5
     # The style sheet of a page replaces the color in dark mode; the attribute applies without a style sheet.
-    stroke = {"class_": f"line{style}", "fill": "none", "stroke": light, "stroke_width": f"{thickness:g}"}
+    stroke = {"class_": f"line{line.style}", "fill": "none", "stroke": light, "stroke_width": f"{thickness:g}"}
     stroke |= {"stroke_linejoin": "round", "stroke_linecap": "butt" if dashes else "round"}
     return stroke | ({"stroke_dasharray": dashes} if dashes else {})
 
@@ -476,7 +475,7 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
 def _line_sample(line: _Line, x: float, y: float, length: int) -> Markup:
     """Return a short sample of a line as SVG markup for its label: `length` [px] from (x, y), or a dot."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
-    return element("path", **_stroke(line.style, dots=line.dots), d=f"M{at:.1f} {y:.1f}h{reach}")
+    return element("path", **_stroke(line), d=f"M{at:.1f} {y:.1f}h{reach}")
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
