@@ -188,6 +188,23 @@ def test_rust_does_not_panic_on_user_data():
     assert {name_of(path): found for path in RUST if (found := pattern.findall(code_of(path)))} == {}
 
 
+def test_no_method_is_checked_twice():
+    """`check_arguments` of a class decorates its public methods; a second time would name the keywords twice."""
+    twice = [
+        f"{name_of(path)}: {kind.name}.{method.name}"
+        for path in PYTHON
+        for kind in ast.walk(tree_of(path))
+        if isinstance(kind, ast.ClassDef) and "check_arguments" in map(ast.unparse, kind.decorator_list)
+        for method in kind.body
+        if isinstance(method, ast.FunctionDef) and "check_arguments" in map(ast.unparse, method.decorator_list)
+    ]
+    assert not twice
+    model = ftlm.Model(ftlm.equation("D y = -1 y + 2 u"))
+    with pytest.raises(TypeError) as refused:
+        model.simulate(tol=2)
+    assert str(refused.value).count("known: run, ") == 1
+
+
 def test_only_the_report_draws():
     users = {name_of(path) for path in PYTHON if imports_of(path) & {"matplotlib", "pylab", "plotly"}}
     assert all(name.startswith("python/ftlm/report/") for name in users)

@@ -275,7 +275,6 @@ class OutputError:
                 f"{parameter('noise', 'ar')} is not used with {parameter(other)}; leave one of the two out"
             )
 
-    @check_arguments
     def fit(
         self,
         runs: Sequence[Run],

@@ -169,7 +169,6 @@ class Model:
         """Names of the modeled outputs."""
         return self.structure.outputs
 
-    @check_arguments
     def linearized(self, at: Mapping[str, float]) -> Model:
         """Return the linear model of small deviations from an operating point.
 
@@ -192,7 +191,6 @@ class Model:
 
         return linearize(self, at)
 
-    @check_arguments
     def simulate(
         self,
         run: Run,
@@ -206,21 +204,18 @@ class Model:
 
         return simulate(self, run, tolerance=tolerance, initial=initial, max_m=max_m)
 
-    @check_arguments
     def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
         """Compare the model with measured runs by equation error and output error; see :func:`ftlm.compare`."""
         from ftlm.validation.comparison import compare
 
         return compare(self, runs, m=m)
 
-    @check_arguments
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
         """Test whether residuals are white and independent of the inputs; see :func:`ftlm.resid`."""
         from ftlm.validation.residual_tests import resid
 
         return resid(self, runs, lags=lags)
 
-    @check_arguments
     def frequency_response(self, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
         """Return the exact complex frequency response, shape (outputs, inputs, W), at angular frequencies w [rad/s].
 
@@ -230,26 +225,22 @@ class Model:
 
         return frequency_response(self, w, coupling=coupling, sensor=sensor)
 
-    @check_arguments
     def step_response(self, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
         """Return the response to unit steps, shape (outputs, inputs, N); see :func:`ftlm.analysis.step_response`."""
         from ftlm.analysis.frequency_response import step_response
 
         return step_response(self, time, tolerance=tolerance)
 
-    @check_arguments
     def stability(self, *, coupling: str = "simulated") -> Stability:
         """Return whether the model is stable, with the reason; see :func:`ftlm.analysis.stability`."""
         from ftlm.analysis.poles import stability
 
         return stability(self, coupling=coupling)
 
-    @check_arguments
     def is_stable(self, *, coupling: str = "simulated") -> bool:
         """Return whether bounded inputs give bounded outputs; an integrator is not stable in this sense."""
         return self.stability(coupling=coupling).stable
 
-    @check_arguments
     def poles(self, *, coupling: str = "simulated") -> Complex:
         """Return the poles [rad/s] on the principal Riemann sheet; see :func:`ftlm.analysis.poles`."""
         from ftlm.analysis.poles import poles
@@ -262,7 +253,6 @@ class Model:
 
         return zeros(self, output, input)
 
-    @check_arguments
     def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
         """Return frequency, damping and time constant of every mode; see :func:`ftlm.analysis.modes`."""
         from ftlm.analysis.poles import modes
@@ -275,7 +265,6 @@ class Model:
 
         return dcgain(self)
 
-    @check_arguments
     def step(self, time: ArrayLike | None = None) -> TimeResponse:
         """Return the response to unit steps from rest with its standard deviation; notebooks show it as a plot.
 
@@ -303,14 +292,12 @@ class Model:
 
         return time_response(self, time, "step")
 
-    @check_arguments
     def impulse(self, time: ArrayLike | None = None) -> TimeResponse:
         """Return the response to unit impulses as means over sampling intervals; otherwise as :meth:`step`."""
         from ftlm.plot.model_charts import time_response
 
         return time_response(self, time, "impulse")
 
-    @check_arguments
     def bode(self, w: ArrayLike | None = None) -> Bode:
         """Return gain and phase of the frequency response with 95 % bands; notebooks show them as a plot.
 
@@ -362,14 +349,12 @@ class Model:
 
         return cls(structure_of(system, inputs, outputs))
 
-    @check_arguments
     def to_control(self, *, band: tuple[float, float] | None = None, order: int = 5) -> Any:
         """Return a python-control system by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
         from ftlm.analysis.rational_approximation import to_control
 
         return to_control(self, band=band, order=order)
 
-    @check_arguments
     def series(self, following: Model) -> Model:
         """Return the exact series connection, in which the output of this model is the input of `following`.
 
@@ -385,7 +370,6 @@ class Model:
 
         return series(self, following)
 
-    @check_arguments
     def parallel(self, other: Model) -> Model:
         """Return the exact parallel connection, the sum of the outputs of both models for the same input.
 
@@ -400,7 +384,6 @@ class Model:
 
         return combine("+", self, other, "a sum")
 
-    @check_arguments
     def feedback(self, back: Model | float = 1.0, *, sign: int = -1) -> Model:
         """Return the exact closed loop G / (1 - sign G H), where G is this model.
 
@@ -481,14 +464,12 @@ class Model:
 
         return to_tf(self)
 
-    @check_arguments
     def to_ss(self, *, step: float | None = None) -> Any:
         """Return an exact python-control StateSpace if all orders are integers; see :func:`ftlm.analysis.to_ss`."""
         from ftlm.analysis.conversion import to_ss
 
         return to_ss(self, step=step)
 
-    @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model to a JSON file, atomically, and return the path.
 

@@ -43,7 +43,6 @@ class OrderGrid:
     alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE
     orders: Mapping[str, Values] = field(default_factory=dict)
 
-    @check_arguments
     def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
         """Return the grid values of each free order of a structure, by name.
 

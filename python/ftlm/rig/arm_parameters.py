@@ -69,13 +69,11 @@ class StageParameters:
     mu: float
     coulomb: float = 0.0
 
-    @check_arguments
     def orders(self, stage: int) -> dict[str, float]:
         """Return the five free orders of the order law by name, with the indices of joint 1 or 2 (`stage`)."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
-    @check_arguments
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
         """Return the coefficients of hub and link equation by name, with the indices of joint 1 or 2 (`stage`).
 
@@ -147,7 +145,6 @@ class ArmParameters:
     name: str = "effective"
 
     @classmethod
-    @check_arguments
     def of(cls, source: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
         """Return the parameter set that a name or a TOML file denotes, or the argument itself.
 
@@ -226,7 +223,6 @@ class ArmParameters:
             )
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 
-    @check_arguments
     def model(self, *, friction: bool = False) -> Model:
         """Return the model of the arm from motor currents to angles.
 
@@ -264,7 +260,6 @@ class ArmParameters:
         order_values = {n: v for n, v in orders.items() if n in structure.order_names}
         return Model(structure.with_orders(order_values).with_coefficients(coefficients), orders=order_values)
 
-    @check_arguments
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
         """Return the simulated arm at rest, for runs of at most `horizon` seconds with sampling interval `step` [s]."""
         model = self.model()

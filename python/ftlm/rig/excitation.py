@@ -58,7 +58,6 @@ class Excitation:
     seed: int = 0
     file: str | os.PathLike[str] | None = None
 
-    @check_arguments
     def commands(self, rate: float, duration: float) -> Floats:
         """Return the currents [A] of both motors, shape (round(duration·rate) + 1, 2); the last row is zero.
 

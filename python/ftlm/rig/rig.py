@@ -370,7 +370,6 @@ class Limits:
     max_write_delay: float = 0.05
     max_missed_deadlines: int = 20
 
-    @check_arguments
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
         """Return the core object that enforces the limits at a sampling interval `step` [s].
 
