@@ -452,7 +452,7 @@ def paper_models(identified):
     models = {"integer-order model of the maker": (ftlm.link_model(form="published"), comparison)}
     models |= {f"p = {p}": (identified.model, comparison) for p in (1, 3, 5, 7)}
     models["diverged"] = (identified.model, diverged)
-    return {label: Candidate(label, model, errors, None, {}) for label, (model, errors) in models.items()}
+    return {label: Candidate(model, errors, None, {}) for label, (model, errors) in models.items()}
 
 
 def test_paper_table_has_the_papers_columns(identified):

@@ -21,7 +21,7 @@ from ftlm.reproduction.checks import checks, fractional_orders, make_check, tabl
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import stages_of
 from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
-from ftlm.reproduction.stage import OrderComparison, Panel, compare_optimizers
+from ftlm.reproduction.stage import Cases, OrderComparison, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
@@ -176,14 +176,14 @@ def test_verdicts_follow_the_numbers(reproduction):
 
 
 def trials_of(found, prior, arm="fractional"):
-    return {t.output: t for t in found.panel.trials if (t.prior, t.arm) == (prior, arm)}
+    return {t.output: t for t in found.cases.trials if (t.prior, t.arm) == (prior, arm)}
 
 
 def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
     claim = by_words(checks(reproduction), "than the genetic algorithm")
     assert claim.holds is None
     assert "K0" in claim.ruling.factors
-    for contest in reproduction.panel.contests:
+    for contest in reproduction.cases.contests:
         assert set(contest.order_grid) == {1.0, 1e10}
         assert [set(errors) for errors in contest.optimizers.values()] == [{0, 1}] * 2
         if contest.output.endswith("1"):
@@ -191,7 +191,7 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
             assert contest.order_grid[1e10] < min(e for errors in contest.optimizers.values() for e in errors.values())
             assert contest.order_grid[1.0] > 10 * contest.order_grid[1e10]
     # Bounds of a rival are wider or narrower than the maker's values as the data have it.
-    bounds = reproduction.stages[1].rivals["theta11"].optimizers["genetic"].bounds
+    bounds = reproduction.stages[1].optimizer_comparisons["theta11"].optimizers["genetic"].bounds
     assert bounds["a1"][1] != pytest.approx(2 * 628.889, rel=0.01)
 
 
@@ -218,7 +218,7 @@ def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction
     claim = by_words(checks(reproduction), "larger innovation length")
     assert claim.verdict.startswith("depends on")
     assert set(claim.ruling.factors) == {"K0", "the angle"}
-    for t in reproduction.panel.trials:
+    for t in reproduction.cases.trials:
         if t.prior == 1e10:
             assert max(t.errors.values()) < 1.01 * min(t.errors.values())
 
@@ -227,7 +227,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     found = checks(reproduction)
     for words in ("better than whole ones", "closer to the run than the manual's"):
         assert by_words(found, words).verdict == "not decidable by a simulation"
-    freed = {(f.arm, f.stage): f for f in reproduction.panel.order_comparisons}
+    freed = {(f.arm, f.stage): f for f in reproduction.cases.order_comparisons}
     for stage in (1, 2):
         put_in, whole = freed["fractional", stage], freed["whole orders", stage]
         assert whole.fractional_orders == []
@@ -236,12 +236,12 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
             assert nr < 0.5 * put_in.integer_nr[o]
             assert whole.free_nr[o] == pytest.approx(whole.integer_nr[o], rel=0.02)
     # On the maker's arm the manual is better than any p, on one of fractional orders a hub's p = 7 is.
-    for t in reproduction.panel.trials:
+    for t in reproduction.cases.trials:
         if t.arm == "whole orders":
             assert t.nr > t.manual
     # Of a measured run nobody chose the truth.
-    own = replace(reproduction.panel, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
-    measured = replace(reproduction, simulated=False, panel=own)
+    own = replace(reproduction.cases, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
+    measured = replace(reproduction, simulated=False, cases=own)
     assert by_words(checks(measured), "better than whole ones").verdict == "holds"
     assert by_words(checks(measured), "closer to the run than the manual's").verdict == "inconclusive"
 
@@ -259,7 +259,7 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     whole = replace(better, orders={"gamma1": (0.98, 0.9, 1.1)}, gains={"y": 0.2})
     assert whole.improves("y") is False
     assert replace(whole, gains={"y": 3.0}).improves("y") is None
-    data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
+    data = SimpleNamespace(cases=Cases((), (), (replace(better, is_degenerate=True),)), simulated=False)
     claim = make_check(fractional_orders, data)
     assert claim.verdict == "inconclusive"
     assert "Inconclusive in 1 cases" in claim.computed
@@ -278,7 +278,7 @@ def test_a_fit_that_must_not_be_used_is_no_case_of_a_claim(reproduction):
 
 
 def test_verdicts_turn_when_the_numbers_do(reproduction):
-    panel = reproduction.panel
+    panel = reproduction.cases
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
     trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in panel.trials)
     contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
@@ -297,7 +297,7 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     other = replace(stage, candidates=swapped, printed_orders=stage.candidates["output error"])
     ran = tuple(
         replace(r, angle_deviation=r.implied_deviation, stability=replace(r.stability, stable=True))
-        for r in reproduction.ran
+        for r in reproduction.printed_model_runs
     )
     tables = {
         o: replace(
@@ -314,7 +314,9 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
         )
         for o, t in reproduction.as_printed.items()
     }
-    made = replace(reproduction, stages={1: other}, panel=Panel(trials, contests, freed), ran=ran, as_printed=tables)
+    made = replace(
+        reproduction, stages={1: other}, cases=Cases(trials, contests, freed), printed_model_runs=ran, as_printed=tables
+    )
     found = checks(made)
     for words in (
         "larger innovation length",
@@ -495,7 +497,7 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     assert "Tables 6 and 7 and Figure 11 are left out" in words
     assert f"has {moving.length} rows: joint fits by output error take one of 3 rows, 0.006 s apart" in words
     stage = found.stages[2]
-    assert stage.rivals == {}
+    assert stage.optimizer_comparisons == {}
     # Every model is compared on the same pulses, thinned or not.
     assert {c.estimation.m for c in stage.candidates.values()} == {stage.candidates["p = 7"].estimation.m}
     assert {c.validation.m for c in stage.candidates.values()} == {stage.candidates["p = 7"].validation.m}
@@ -530,9 +532,9 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
         }
         rivals = {
             o: replace(r, models={n: replace(c, validation=None) for n, c in r.models.items()})
-            for o, r in stage.rivals.items()
+            for o, r in stage.optimizer_comparisons.items()
         }
-        stages[number] = replace(stage, candidates=candidates, rivals=rivals)
+        stages[number] = replace(stage, candidates=candidates, optimizer_comparisons=rivals)
     alone = replace(reproduction, sine=None, stages=stages, simulated=False)
     text = alone.page(tmp_path / "alone.html").read_text()
     assert "nothing is validated" in text
@@ -577,8 +579,8 @@ def test_what_cannot_be_done_is_said_before_any_work(tmp_path, words, code, mess
 @pytest.mark.slow
 @pytest.mark.parametrize("absent", ["pygad", "scipy.optimize"])
 def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reproduction, tmp_path, monkeypatch, absent):
-    def stage_without_searches(work, genetic):
-        return replace(reproduction.stages[work.number], rivals=work.rivals(genetic))
+    def stage_without_searches(work):
+        return replace(reproduction.stages[work.number], optimizer_comparisons=work.compare_optimizers())
 
     monkeypatch.setattr("ftlm.reproduction.stage.StageWork.compute_stage", stage_without_searches)
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
@@ -588,10 +590,10 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
     assert lines[0].startswith("Tables 6 and 7 and Figure 11 are left out: ")
     assert "pip install 'ftlm[genetic]'" in lines[0]
     assert found.notes.count(lines[0]) == 1
-    assert found.rivals == {}
-    assert found.panel.contests == ()
+    assert found.optimizer_comparisons == {}
+    assert found.cases.contests == ()
     # The joint fits of the other arm do not need the optimizers.
-    assert {c.arm for c in found.panel.order_comparisons} == {"fractional", "whole orders"}
+    assert {c.arm for c in found.cases.order_comparisons} == {"fractional", "whole orders"}
     page = found.page(tmp_path / "paper.html").read_text()
     assert "Tables 6 and 7 and Figure 11 are left out: " in page
     assert "Table 5." in page

@@ -31,11 +31,16 @@ from ftlm.reproduction.stage import (
     compare_optimizers,
     compare_orders,
     convergence_step,
-    rivals_order_grid,
-    simulated_panel,
+    simulated_cases,
 )
 from ftlm.reproduction.workload import TotalProgress, WorkerProgress, seconds_of, seconds_of_all, seeds_for
 from ftlm.simulation.discretization import prepare
+
+
+def silent_progress():
+    """Progress of a worker that nobody listens to."""
+    return WorkerProgress(TotalProgress(1.0, None), threading.Event())
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The rule
@@ -155,12 +160,12 @@ def test_printed_models_move_5_to_316_times_less_than_the_paper_s_arm(first_stag
 
 def test_words_on_printed_models_follow_their_numbers(first_stage):
     rows = tuple(first_stage.values())
-    text = deviation_text(SimpleNamespace(ran=rows))
+    text = deviation_text(SimpleNamespace(printed_model_runs=rows))
     assert "from 5.78 to 316, median 18.9" in text
     assert "at least 0.83 to 0.997, where 0.14 to 0.37 is printed: in 8 of 8 rows" in text
     # Had they moved as far, nothing would follow.
     moving = tuple(replace(r, angle_deviation=0.9 * r.implied_deviation) for r in rows)
-    assert deviation_text(SimpleNamespace(ran=moving)).endswith("from 1.11 to 1.11, median 1.11")
+    assert deviation_text(SimpleNamespace(printed_model_runs=moving)).endswith("from 1.11 to 1.11, median 1.11")
 
 
 def test_the_one_angle_reading_moves_as_little(first_stage):
@@ -213,7 +218,7 @@ def test_tables_4_and_5_come_near_as_equation_errors(tables):
 
 def test_the_scan_s_closed_form_is_the_recursion(tables):
     made = tables["theta21"]
-    assert made.reading.prior in PRIOR_GRID
+    assert made.interpretation.prior in PRIOR_GRID
     run, scales = papers_record()
     for output, scale in scales.items():
         assert np.std(run[output]) == pytest.approx(implied_spreads()[output][1])
@@ -221,11 +226,11 @@ def test_the_scan_s_closed_form_is_the_recursion(tables):
     m, step = 2048, 10.0 / 2048
     record = ftlm.simulation.discretization.record(run, flexible_link(stage=2, form="published", laws=()), m)
     own, other, u = record.of("theta21"), record.of("theta22"), record.of("I2")
-    assert made.reading.terms == "own angle in a"
+    assert made.interpretation.terms == "own angle in a"
     parts = [(own, 0.15), (other, 0.1), (other, 0.2), (u, 2.0)]
     columns = [ftlm.haar_transform(ftlm.fractional_integral(s, eta, step=step)) for s, eta in parts]
     rows, wanted = np.stack(columns, axis=1), ftlm.haar_transform(own)
-    p, x, gain = 3, np.zeros(4), np.eye(4) / made.reading.prior
+    p, x, gain = 3, np.zeros(4), np.eye(4) / made.interpretation.prior
     for k in range(m):
         newest = slice(max(0, k - p + 1), k + 1)
         q = rows[newest]
@@ -304,14 +309,13 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         raise ftlm.ModelError("enough")
 
     monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
-    monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
-    preset = Preset(ftlm.OrderGrid(increment=step), None, 2)
+    preset = Preset(ftlm.OrderGrid(increment=step), threads=1)
     with pytest.raises(ftlm.ModelError):
-        simulated_panel(1, "whole orders", [1], 0.0, preset, 1)
-    work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
-    assert work.rivals(None) == {}
-    assert rivals_order_grid(step, 0.01).increment == step
+        simulated_cases(1, "whole orders", [1], 0.0, preset, silent_progress())
+    work = StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress())
+    assert work.compare_optimizers() == {}
+    assert replace(preset, rivals_increment=0.01).rivals_order_grid.increment == step
     assert given[0] == given[1] == (ftlm.OrderGrid(increment=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
@@ -329,7 +333,7 @@ def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
 def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
     monkeypatch.setattr("ftlm.reproduction.stage.COARSE_INCREMENT", 0.4)
     run, lattice = demo_run("square"), ftlm.OrderGrid(increment=0.2)
-    work = StageWork(1, run, None, Preset(lattice, None, 2), 1, lambda _: None, None)
+    work = StageWork(1, run, None, Preset(lattice, threads=1), lambda _: None, silent_progress())
     options = {"coefficients": "multi-innovation", "innovation_length": 3}
     seen = []
     monkeypatch.setattr(
@@ -341,7 +345,7 @@ def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
     assert seen == [0.2, 0.4, *[0.2] * 10]
     for output in ("theta11", "theta12"):
         single = work.measured.equation(output)
-        every = ftlm.search_orders(work.on, single, lattice, top=1, threads=1, **options)
+        every = ftlm.search_orders(work.estimation_run, single, lattice, top=1, threads=1, **options)
         mine = found.estimation.output_error[output].error
         assert every.score <= mine * (1 + 1e-9)
         assert mine < 1.01 * every.score
@@ -358,10 +362,10 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
 
     monkeypatch.setattr("ftlm.reproduction.stage.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
-        compare_orders(1, demo_run("square"), "fractional", 1, validation=demo_run("sine"))
-    preset = Preset(ftlm.OrderGrid(increment=0.25), None, 2)
+        compare_orders(1, demo_run("square"), "fractional", validation=demo_run("sine"), threads=1, progress=None)
+    preset = Preset(ftlm.OrderGrid(increment=0.25), threads=1)
     for simulated, initial in ((True, "rest"), (False, "auto")):
-        work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)
+        work = StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress(), simulated)
         seen += [work.coupled.initial, work.published.initial]
         assert seen[-2:] == [initial, initial]
     assert seen[0] == "rest"

@@ -10,15 +10,15 @@ from ftlm.reproduction.cross_validation import (
 )
 from ftlm.reproduction.published_values import AsPrinted, as_printed, implied_spreads, printed_saturation
 from ftlm.reproduction.simulated_arm import demo_plant, demo_run
-from ftlm.reproduction.stage import Candidate, Rival, Stage
+from ftlm.reproduction.stage import Candidate, OptimizerComparison, Stage
 
 __all__ = [
     "AsPrinted",
     "Candidate",
     "Check",
     "Deflection",
+    "OptimizerComparison",
     "OrderCrossValidation",
-    "Rival",
     "Stage",
     "Verdict",
     "as_printed",

@@ -18,16 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import (
-    ANGLE_NAMES,
-    INNOVATION_LENGTHS,
+    FIRST_P,
+    LAST_P,
     PRIOR_COVARIANCES,
-    WEAK_PRIOR,
     PrintedModelRun,
     page_text,
     prior_text,
     read_texts,
 )
-from ftlm.reproduction.simulated_arm import STAGE_NUMBERS
+from ftlm.reproduction.simulated_arm import ANGLE_NAMES, STAGE_NUMBERS
 from ftlm.reproduction.stage import TRACE_EVERY, Trial, are_usable
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
@@ -43,7 +42,6 @@ Case = tuple[bool, dict[str, str]]
 ARM_FACTOR = "the arm"
 #: Thresholds in the rules of claims.toml, by name; relative differences are in percent.
 RULE_NUMBERS: Mapping[str, float] = read_texts("claims")["rules"]
-FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,10 @@ class ClaimVerdict:
     levels: tuple[tuple[str, int, int], ...] = ()
 
     def __str__(self) -> str:
-        words = " and ".join(part for part in (", ".join(self.factors[:-1]), *self.factors[-1:]) if part)
-        return f"{self.word} {words}" if self.word == "depends on" else self.word
+        if self.word != "depends on":
+            return self.word
+        *others, last = self.factors
+        return f"{self.word} {', '.join(others)} and {last}" if others else f"{self.word} {last}"
 
     @property
     def counts(self) -> str:
@@ -185,16 +185,16 @@ def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
     return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
 
 
-def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
-    return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in reproduction.ran])
+def _of_rows(rows: Iterable[PrintedModelRun], holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
+    return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in rows])
 
 
-def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
-    cases = [
-        case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
-        for t in trials
-    ]
-    return combine_cases(cases, **of)
+def _of_trials(trials: Iterable[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
+    def case_of(t: Trial) -> Case:
+        angle, record = symbol(t.output), str(t.seed)
+        return case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=angle, the_record=record)
+
+    return combine_cases([case_of(t) for t in trials], **of)
 
 
 def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
@@ -204,7 +204,7 @@ def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[fl
     """
     texts = []
     for prior in PRIOR_COVARIANCES:
-        first = {t.output: numbers(t) for t in reversed(reproduction.panel.trials) if t.prior == prior}
+        first = {t.output: numbers(t) for t in reversed(reproduction.cases.trials) if t.prior == prior}
         texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: first[o] for o in ANGLE_NAMES if o in first}, 4)}")
     return "; ".join(texts)
 
@@ -228,10 +228,11 @@ def deviation_text(reproduction: Reproduction) -> str:
     The implied standard deviation of the measured angle is RMSE / NR of the printed row. If a ratio makes the printed
     NR of a row impossible, the text also has the smallest possible NR.
     """
-    ratios = sorted(r.deviation_ratio for r in reproduction.ran)
+    rows = reproduction.printed_model_runs
+    ratios = sorted(r.deviation_ratio for r in rows)
     # If the standard deviation of a response is r times smaller than that of the angle, NR is at least 1 - 1/r.
-    floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in reproduction.ran]
-    values = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in reproduction.ran]
+    floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in rows]
+    values = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in rows]
     count = sum(low > nr for low, nr in zip(floors, values, strict=True))
     middle = f"from {ratios[0]:.3g} to {ratios[-1]:.3g}, median {statistics.median(ratios):.3g}"
     if not count:
@@ -249,23 +250,23 @@ def movement(reproduction: Reproduction) -> Evidence:
 
     It holds if the ratio of standard deviations is within a factor of 2.
     """
-    worst, most = max(reproduction.ran, key=lambda r: r.deviation_ratio), RULE_NUMBERS["deviation_ratio"]
-    return _of_rows(reproduction, lambda r: 1 / most < r.deviation_ratio < most), {
+    rows, most = reproduction.printed_model_runs, RULE_NUMBERS["deviation_ratio"]
+    worst = max(rows, key=attrgetter("deviation_ratio"))
+    return _of_rows(rows, lambda r: 1 / most < r.deviation_ratio < most), {
         "angle": symbol(worst.output),
-        "p": worst.p,
-        "deviation": worst.angle_deviation,
-        "ratio": worst.deviation_ratio,
-        "implied": worst.implied_deviation,
+        "worst": worst,
         "ratios": deviation_text(reproduction),
-        "deviations": by_angle({r.output: [r.implied_deviation] for r in reproduction.ran}),
+        "deviations": by_angle({r.output: [r.implied_deviation] for r in rows}),
     }
 
 
 def stability(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that the models printed in the paper are stable."""
-    outputs = dict.fromkeys(r.output for r in reproduction.ran)
-    poles = {o: [r.stability.unstable_poles for r in reproduction.ran if r.output == o] for o in outputs}
-    return _of_rows(reproduction, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
+    rows = reproduction.printed_model_runs
+    poles: dict[str, list[float]] = defaultdict(list)
+    for r in rows:
+        poles[r.output].append(r.stability.unstable_poles)
+    return _of_rows(rows, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
 
 
 def returned_coefficients(reproduction: Reproduction) -> Evidence:
@@ -276,21 +277,20 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
     cases: list[Case] = []
     last: dict[float, dict[str, list[float]]] = {k: {} for k in PRIOR_COVARIANCES}
     orders: list[str] = []
-    for r, k in product(reproduction.ran, PRIOR_COVARIANCES):
+    for r, k in product(reproduction.printed_model_runs, PRIOR_COVARIANCES):
+        angle, K0 = symbol(r.output), prior_text(k)
         a = r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan)
         away = abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1)
-        cases.append(
-            case(away < RULE_NUMBERS["difference"] / 100, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p))
-        )
+        cases.append(case(away < RULE_NUMBERS["difference"] / 100, K0=K0, the_angle=angle, p=str(r.p)))
         if r.p == LAST_P:
             last[k][r.output] = [a]
         if k in r.orders:
             found = ", ".join(f"{symbol(n)} {v:g}" for n, v in r.orders[k].items() if not n.startswith("alpha"))
-            orders.append(f"{symbol(r.output)}, K0 = {prior_text(k)}: {found}")
+            orders.append(f"{angle}, K0 = {K0}: {found}")
     return combine_cases(cases), {
         "values": ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(a)}" for k, a in last.items()),
         "orders": "; ".join(orders),
-        "stated": _printed_text(lambda row: row.coefficients["a"], dict.fromkeys(r.output for r in reproduction.ran)),
+        "stated": _printed_text(lambda row: row.coefficients["a"], last[PRIOR_COVARIANCES[0]]),
     }
 
 
@@ -301,7 +301,7 @@ def recomputed_tables(reproduction: Reproduction) -> Evidence:
     printed ones, with equal signs.
     """
     tables = reproduction.as_printed
-    settings = (f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
+    settings = (f"{symbol(o)} {t.interpretation}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
     return _of_angles({o: t.is_close for o, t in tables.items()}), {
         "away": ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in tables.items()),
         "ratios": by_angle({o: [t.ratios[c][-1] for c in "bdg"] for o, t in tables.items()}),
@@ -324,7 +324,7 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
 
 def error_falls(t: Trial) -> bool:
     """Whether the error, eq. (45) of the paper, never increases with innovation length p and falls by over 2 %."""
-    e = [t.errors[p] for p in INNOVATION_LENGTHS]
+    e = list(t.errors.values())
     return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULE_NUMBERS["difference"] / 100) * e[0]
 
 
@@ -333,7 +333,7 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
 
     `arrived` is the number of steps by p. The largest p must save at least 10 % of the steps of the smallest.
     """
-    steps = [arrived[p] for p in INNOVATION_LENGTHS]
+    steps = list(arrived.values())
     if max(steps) <= TRACE_EVERY:
         return None
     # The claim fails if an error never converges, because infinite numbers of steps cannot be compared.
@@ -343,15 +343,15 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
 
 def innovation_length(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error."""
-    return _of_trials(reproduction.panel.trials, error_falls), {
+    return _of_trials(reproduction.cases.trials, error_falls), {
         "errors": _by_prior(reproduction, lambda t: t.errors.values()),
-        "stated": _printed_text(lambda row: row.error, lengths=INNOVATION_LENGTHS),
+        "stated": _printed_text(lambda row: row.error, lengths=printed.INNOVATION_LENGTHS),
     }
 
 
 def convergence(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that a larger innovation length p converges in fewer recursion steps."""
-    trials = reproduction.panel.trials
+    trials = reproduction.cases.trials
     comparable = [t for t in trials if converges_faster(t.convergence_steps) is not None]
     return _of_trials(comparable, lambda t: converges_faster(t.convergence_steps)), {
         "steps": _by_prior(reproduction, lambda t: t.convergence_steps.values()),
@@ -365,7 +365,7 @@ def weak_prior(reproduction: Reproduction) -> Evidence:
 
     Only results with a weak prior are used.
     """
-    weak = [t for t in reproduction.panel.trials if t.prior == WEAK_PRIOR]
+    weak = [t for t in reproduction.cases.trials if t.prior == printed.WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
     spread = [weak_prior_variation(each) for s in reproduction.stages.values() for each in s.weak.values()]
@@ -397,30 +397,24 @@ def has_smaller_error(error: float, seeds: Iterable[float]) -> bool:
 
 def optimizers(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
-    contests = reproduction.panel.contests
-    cases = [
-        case(
-            has_smaller_error(error, errors.values()),
-            K0=prior_text(k),
-            the_arm=c.arm,
-            the_angle=symbol(c.output),
-            the_rival=name,
-        )
-        for c in contests
-        for k, error in c.order_grid.items()
-        for name, errors in c.optimizers.items()
-    ]
+    contests = reproduction.cases.contests
+    cases = []
+    for c in contests:
+        for k, (name, errors) in product(c.order_grid, c.optimizers.items()):
+            holds = has_smaller_error(c.order_grid[k], errors.values())
+            cases.append(case(holds, K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name))
     first = {c.output: c for c in reversed(contests)}
     own = {o: first[o] for o in ANGLE_NAMES if o in first}
     of_seeds = (min, statistics.median, max)
-    errors = {
+    both = {
         o: (*c.order_grid.values(), *(f(each.values()) for each in c.optimizers.values() for f in of_seeds))
         for o, c in own.items()
     }
+    seeds = [len(c.optimizers["genetic"]) for c in contests]
     return combine_cases(cases), {
-        "errors": by_angle(errors),
+        "errors": by_angle(both),
         "budgets": ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values())),
-        "seeds": " to ".join(dict.fromkeys(str(f(len(c.optimizers["genetic"]) for c in contests)) for f in (min, max))),
+        "seeds": " to ".join(dict.fromkeys(map(str, (min(seeds), max(seeds))))),
         "stated": by_angle({o: [part[0] for part in printed.TABLE_7_CRITERIA[o]] for o in own}, 5),
     }
 
@@ -432,7 +426,7 @@ def manual(reproduction: Reproduction) -> Evidence:
     is decidable only if the outcome does not depend on the arm.
     """
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
-    return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
+    return _of_trials(reproduction.cases.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
         "stated": by_angle(both, 4),
     }
@@ -443,7 +437,7 @@ def fractional_orders(reproduction: Reproduction) -> Evidence:
 
     With simulated arms, it is decidable only if the outcome does not depend on the arm.
     """
-    freed = reproduction.panel.order_comparisons
+    freed = reproduction.cases.order_comparisons
     verdicts = [(f, o, improves) for f in freed for o in f.free_nr if (improves := f.improves(o)) is not None]
     cases = [case(improves, the_arm=f.arm, the_angle=symbol(o)) for f, o, improves in verdicts]
     both = (f"{f.arm}: {by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr})}" for f in freed)
@@ -462,9 +456,8 @@ def close_orders(reproduction: Reproduction) -> Evidence:
     """
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
-    holding = {
-        o: out < RULE_NUMBERS["error_ratio"] * eq and out < RULE_NUMBERS["explaining_nr"] for o, (eq, out) in nr.items()
-    }
+    ratio, most = RULE_NUMBERS["error_ratio"], RULE_NUMBERS["explaining_nr"]
+    holding = {o: free < ratio * equation and free < most for o, (equation, free) in nr.items()}
     return _of_angles(holding, of_the_machine=reproduction.simulated), {
         "errors": by_angle(nr),
         "stated": _printed_text(lambda row: row.nr, near, digits=4),
@@ -506,11 +499,10 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
     The first value follows from Table 3 of the paper, and the second from the manufacturer's effective parameters. The
     third value is printed in the paper.
     """
-    sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
     coefficients = {}
     for output, row in printed.INTEGER_ROWS.items():
         stage = printed.stage_of(output)
-        table, effective = (parameters[stage].coefficients(stage) for parameters in sets)
+        table, effective = (PARAMETER_SETS[n][stage].coefficients(stage) for n in ("table-3", "effective"))
         for letter, value in row.coefficients.items():
             name = printed.parameter_name(letter, output)
             coefficients[name] = (table[name], effective[name], value)
@@ -522,7 +514,7 @@ def dropped_derivative(reproduction: Reproduction) -> Evidence:
 
     Equations (19) and (21) drop it. The claim holds if the printed orders give this derivative the order 0.
     """
-    orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
+    orders = {n: printed.printed_numbers(n, LAST_P)[0] for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
     parts = [stage.derived for stage in reproduction.stages.values()]
     return combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]), {
@@ -569,18 +561,11 @@ def possible_row(_: Reproduction) -> Evidence:
     """
     row = printed.INTEGER_ROWS["theta22"]
     mean = row.error / printed.PULSE_COUNT
-    numbers = {"mean": mean, "pulses": printed.PULSE_COUNT, "error": row.error, "rmse": row.rmse}
-    return combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]), numbers
+    return combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]), {"mean": mean, "row": row}
 
 
 #: Values of placeholders that the texts of several claims contain.
-SHARED_FIELDS = {
-    "first_p": FIRST_P,
-    "last_p": LAST_P,
-    "trace_every": TRACE_EVERY,
-    "weak_prior": WEAK_PRIOR,
-    "published": printed,
-}
+SHARED_FIELDS = {"first_p": FIRST_P, "last_p": LAST_P, "trace_every": TRACE_EVERY, "published": printed, **RULE_NUMBERS}
 #: Checks in the order of the page. Their texts are in claims.toml under the names of the functions.
 CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
     movement,
@@ -606,18 +591,15 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
 def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
     """Evaluate the check of one claim, and return it with its texts from claims.toml."""
     ruling, fields = check(reproduction)
-    texts, values = (
-        read_texts("claims")[check.__name__],
-        {**RULE_NUMBERS, "counts": ruling.counts, **SHARED_FIELDS, **fields},
-    )
+    texts, values = read_texts("claims")[check.__name__], {"counts": ruling.counts, **SHARED_FIELDS, **fields}
     return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
 
 
 def checks(reproduction: Reproduction) -> list[Check]:
     """Return the checks of all claims of the paper; a claim is omitted if the reproduction lacks results for it."""
-    texts = read_texts("claims")
+    needs = {check: read_texts("claims")[check.__name__].get("needs", ()) for check in CLAIM_CHECKS}
     return [
         make_check(check, reproduction)
-        for check in CLAIM_CHECKS
-        if all(attrgetter(name)(reproduction) for name in texts[check.__name__].get("needs", ()))
+        for check, names in needs.items()
+        if all(attrgetter(name)(reproduction) for name in names)
     ]

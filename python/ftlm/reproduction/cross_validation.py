@@ -6,12 +6,13 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from ftlm.arm.flexible_link import link_structure
+from ftlm.arm.flexible_link import integer_order, link_structure
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
@@ -30,7 +31,7 @@ from ftlm.svg.figure import SMALL_WIDTH_PX
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import Cell, Exact, finite, format_bound, json_value, symbol, symbol_html
+from ftlm.utils.formatting import Cell, Exact, attributes, finite, format_bound, json_value, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
@@ -45,8 +46,6 @@ FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
     "fractional damping": ("mu",),
     "both fractional": ("beta", "mu"),
 }
-#: Integer order of each of these terms.
-WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Maximum number of samples of a run in a fit. For a run of 20 s, the modes of the arm are a decade below this rate.
 MAX_SAMPLES = 1250
 #: Label of structures without the term in the other deflection's rate (``Deflection.without_rate``).
@@ -93,11 +92,11 @@ class RunFit:
         joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
         letters = {letter_of(n): n for n in values}
-        names = {n: n for n in values}
+        estimates = {n: (v, *self.result.intervals[n]) for n, v in values.items()}
         if {"beta", "mu"} <= letters.keys() and values[letters["beta"]] > values[letters["mu"]]:
-            for one, other in (("beta", "mu"), ("a", "d")):
-                names |= {letters[one]: letters[other], letters[other]: letters[one]}
-        return {n: (values[names[n]], *self.result.intervals[names[n]]) for n in values}
+            for one, other in ((letters["beta"], letters["mu"]), (letters["a"], letters["d"])):
+                estimates[one], estimates[other] = estimates[other], estimates[one]
+        return estimates
 
     @property
     def numbers(self) -> int:
@@ -168,11 +167,10 @@ class Deflection:
         """
         gains = {}
         for run, whole in self.fits[INTEGER_KIND].items():
-            other = self.fits[kind].get(run)
-            for other_run in whole.comparisons:
-                if other_run != run:
-                    alone, free = whole.fit(other_run), -math.inf if other is None else other.fit(other_run)
-                    gains[run, other_run] = 0.0 if alone == free else free - alone
+            free = self.fits[kind].get(run)
+            for other in (name for name in whole.comparisons if name != run):
+                before, after = whole.fit(other), -math.inf if free is None else free.fit(other)
+                gains[run, other] = 0.0 if before == after else after - before
         return gains
 
     def worse(self, kind: str) -> list[str]:
@@ -180,8 +178,8 @@ class Deflection:
 
         Integer orders are a special case of every kind, so such a fit has not found the optimum.
         """
-        both = ((run, each, self.fits[INTEGER_KIND][run]) for run, each in self.fits[kind].items())
-        return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MIN_FIT_GAIN]
+        whole = self.fits[INTEGER_KIND]
+        return [r for r, free in self.fits[kind].items() if not free.fit(r) > whole[r].fit(r) - MIN_FIT_GAIN]
 
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
         """Return the 95 % intervals (low, high) of the free orders of a kind, by order name, then by estimation run."""
@@ -201,21 +199,17 @@ class Deflection:
 
         It is inconclusive if a fit failed, is unusable, or is worse than integer orders on its estimation run.
         """
-        intervals, whole_fits, fits = self.intervals(kind), self.fits[INTEGER_KIND], self.fits[kind]
-        worse = self.worse(kind)
-        bad = [run for each in (fits, whole_fits) for run, f in each.items() if is_degenerate(f.result)]
-        degenerate = list(dict.fromkeys(bad))
+        intervals, gains, whole, free = self.intervals(kind), self.gains(kind), self.fits[INTEGER_KIND], self.fits[kind]
+        worse, used = self.worse(kind), [*free.items(), *whole.items()]
+        degenerate = list(dict.fromkeys(run for run, fit in used if is_degenerate(fit.result)))
         complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
-        whole = {name: WHOLE_ORDERS[letter_of(name)] for name in intervals}
-        improves = improves_prediction(list(self.gains(kind).values()), intervals, whole) if complete else None
+        integer_orders = {name: integer_order(name) for name in intervals}
+        improves = improves_prediction(list(gains.values()), intervals, integer_orders) if complete else None
 
-        def fit(each: Mapping[str, RunFit], run: str, other: str) -> str:
-            return percent(each[run].fit(other)) if run in each else "no fit"
+        def fit(fits: Mapping[str, RunFit], run: str, other: str) -> str:
+            return percent(fits[run].fit(other)) if run in fits else "no fit"
 
-        pairs = "; ".join(
-            f"{run} → {other} {fit(whole_fits, run, other)}, then {fit(fits, run, other)}"
-            for run, other in self.gains(kind)
-        )
+        pairs = "; ".join(f"{run} → {o} {fit(whole, run, o)}, then {fit(free, run, o)}" for run, o in gains)
         orders = "; ".join(
             f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
             for name, each in intervals.items()
@@ -230,13 +224,20 @@ class Deflection:
         return Verdict(kind, improves, words)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return equation, verdicts, fits and failures as a dictionary for JSON, without ``without_rate``."""
+        """Return equation, verdicts, fits and failures as a dictionary for JSON."""
+        without_rate = {} if self.without_rate is None else {"without_rate": self.without_rate.to_dict()}
         return {
             "equation": str(self.structure),
             "verdicts": {v.kind: {"improves": v.improves, "words": v.words} for v in self.verdicts},
             "fits": json_value(self.fits),
             "failed": {f"{kind}, {run}": words for (kind, run), words in self.failed.items()},
+            **without_rate,
         }
+
+    @property
+    def parts(self) -> list[tuple[str, Deflection]]:
+        """Pairs (suffix of headings, cross-validation): with and, if present, without the other deflection's rate."""
+        return [("", self)] + ([] if self.without_rate is None else [(f", {WITHOUT_RATE_LABEL}", self.without_rate)])
 
 
 def _range(low: float, high: float) -> str:
@@ -279,22 +280,15 @@ class OrderCrossValidation:
             "runs": [run.name for run in self.runs],
             "filtered": self.filtered,
             "margin": MIN_FIT_GAIN,
-            "deflections": {
-                output: d.to_dict() | ({} if d.without_rate is None else {"without_rate": d.without_rate.to_dict()})
-                for output, d in self.deflections.items()
-            },
-            "notes": list(self.notes),
+            **attributes(self, ("deflections", "notes")),
         }
 
 
 def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
     """Return texts on angles that are constant in a part of a run, as of a dead sensor; fits use them unchanged."""
-    notes = []
-    for stage in stages:
-        structure = link_structure(stage, both=len(stages) == 2, filtered=False)
-        for run in runs:
-            notes += [f"run {run.name}: {dead.sentence}" for dead in dead_channel_findings([run], structure)]
-    return list(dict.fromkeys(notes))
+    structures = [link_structure(stage, both=len(stages) == 2, filtered=False) for stage in stages]
+    found = [(run, dead) for item in structures for run in runs for dead in dead_channel_findings([run], item)]
+    return list(dict.fromkeys(f"run {run.name}: {dead.sentence}" for run, dead in found))
 
 
 def cross_validate_orders(
@@ -349,36 +343,34 @@ def cross_validate_orders(
     both = len(stages) == 2
     structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
     notes: list[str] = []
-    runs_used = []
+    used = []
     for run in runs:
         every = -(-run.length // MAX_SAMPLES)
         if every > 1:
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
-        runs_used.append(decimate_run(run, every) if every > 1 else run)
+        used.append(decimate_run(run, every) if every > 1 else run)
     notes += dead_channel_notes(runs, stages)
     if isinstance(progress, Progress):
         numbers = [len(s.order_names) + len(s.coefficient_names) for s in structures]
-        each = sum(output_error_cost(run.length, count) for count in numbers for run in runs_used)
+        each = sum(output_error_cost(run.length, count) for count in numbers for run in used)
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
         progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
 
     def cross_validate(structure: Structure, suffix: str = "") -> Deflection:
         """Fit a structure with each set of free orders to every run; return the cross-validation of its output."""
-        output, own = structure.outputs[0], [run.select(list(structure.signals)) for run in runs_used]
+        output, own = structure.outputs[0], [run.select(list(structure.signals)) for run in used]
         fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
         failed = {}
-        for kind, free in FREE_ORDERS_BY_KIND.items():
-            letters = {n: letter_of(n) for n in structure.order_names}
-            fixed_orders = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
-            for run in own:
-                log(f"{output}{suffix}: {kind}, fitted to {run.name}")
-                try:
-                    result = identify(run, structure.with_orders(fixed_orders), threads=threads, progress=progress)
-                    fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in own})
-                except FtlmError as error:
-                    if kind == INTEGER_KIND:
-                        raise ModelError(f"{output}, integer orders, fitted to {run.name}: {error}") from error
-                    failed[kind, run.name] = str(error)
+        for (kind, free), run in product(FREE_ORDERS_BY_KIND.items(), own):
+            log(f"{output}{suffix}: {kind}, fitted to {run.name}")
+            fixed = {n: integer_order(n) for n in structure.order_names if letter_of(n) not in free}
+            try:
+                result = identify(run, structure.with_orders(fixed), threads=threads, progress=progress)
+                fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in own})
+            except FtlmError as error:
+                if kind == INTEGER_KIND:
+                    raise ModelError(f"{output}, integer orders, fitted to {run.name}: {error}") from error
+                failed[kind, run.name] = str(error)
         return Deflection(output, structure, fits, failed)
 
     deflections = {}
@@ -388,7 +380,7 @@ def cross_validate_orders(
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
             deflection = replace(deflection, without_rate=cross_validate(less, f", {WITHOUT_RATE_LABEL}"))
         deflections[deflection.output] = deflection
-    return OrderCrossValidation(tuple(runs_used), deflections, filtered, tuple(notes))
+    return OrderCrossValidation(tuple(used), deflections, filtered, tuple(notes))
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
@@ -416,16 +408,6 @@ def verdict_sentence(output: str, verdict: Verdict) -> str:
     return f"{symbol(output)}: {sentence}"
 
 
-def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
-    """Return (heading, cross-validation) for each deflection: with, then without the rate of the other deflection."""
-    both = [(o, suffix, d) for o, full in result.deflections.items() for suffix, d in _with_and_without(full)]
-    return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
-
-
-def _with_and_without(full: Deflection) -> list[tuple[str, Deflection]]:
-    return [("", full)] + ([] if full.without_rate is None else [(f", {WITHOUT_RATE_LABEL}", full.without_rate)])
-
-
 def _verdict(output: str, verdict: Verdict) -> Markup:
     template = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}</span></span>')
     return template.format(verdict_sentence(output, verdict), verdict.words)
@@ -438,22 +420,20 @@ def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> l
     """
     charts, output = [], deflection.output
     names = [run.name or "" for run in result.runs]
-    for run, other_run in zip(names, names[1:] + names[:1], strict=True):
-        at = deflection.fits[INTEGER_KIND][run].comparisons[other_run]
-        lines, words = [("measured", at.measured[output][0])], []
+    for run, other in zip(names, names[1:] + names[:1], strict=True):
+        measured = deflection.fits[INTEGER_KIND][run].comparisons[other]
+        lines, words = [("measured", measured.measured[output][0])], []
         for kind in (INTEGER_KIND, CHARTED_KIND):
             fit = deflection.fits[kind].get(run)
             if fit is None:
                 words.append(f"{kind}: no fit")
                 continue
-            lines.append((kind, fit.comparisons[other_run].simulated[output][0]))
-            words.append(f"{kind} {percent(fit.fit(other_run))} % with {fit.numbers} numbers")
-        caption = "; ".join(words)
-        options = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
-        title = f"{symbol(output)} on {other_run}, fitted to {run}"
-        charts.append(
-            angle_chart(pulse_times(at), lines, output, title, f"{caption[0].upper()}{caption[1:]}.", **options)
-        )
+            lines.append((kind, fit.comparisons[other].simulated[output][0]))
+            words.append(f"{kind} {percent(fit.fit(other))} % with {fit.numbers} numbers")
+        caption, title = "; ".join(words), f"{symbol(output)} on {other}, fitted to {run}"
+        caption = f"{caption[0].upper()}{caption[1:]}."
+        size = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
+        charts.append(angle_chart(pulse_times(measured), lines, output, title, caption, **size))
     return charts
 
 
@@ -475,52 +455,52 @@ def rate_effect_table(result: OrderCrossValidation) -> Table | None:
 
 def fits_table(result: OrderCrossValidation) -> Table:
     """Return a table of fits [%] with one row per structure and one column per (estimation run, validation run)."""
-    pairs = [(run.name, other.name) for run in result.runs for other in result.runs]
+    pairs = list(product((run.name for run in result.runs), repeat=2))
     rows: dict[str, list[list[Cell]]] = {}
-    for heading, deflection in _structures(result):
-        rows[heading] = []
-        for kind, each in deflection.fits.items():
-            numbers = next((Exact(f.numbers) for f in each.values()), None)
-            percentages = [percent(each[run].fit(other)) if run in each else None for run, other in pairs]
-            cells = [
-                v if v is None or run == other else Markup("<strong>{}</strong>").format(v)
-                for v, (run, other) in zip(percentages, pairs, strict=True)
-            ]
-            rows[heading].append([kind, numbers, *cells])
+    for output, full in result.deflections.items():
+        for suffix, deflection in full.parts:
+            cells = rows[f"{symbol(output)}{suffix}"] = []
+            for kind, fits in deflection.fits.items():
+                numbers = next((Exact(f.numbers) for f in fits.values()), None)
+                cells.append([kind, numbers, *(_fit_cell(fits.get(run), run, other) for run, other in pairs)])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
     return make_table("cross_fits", rows, {"@runs": heads})
 
 
+def _fit_cell(fit: RunFit | None, run: str, other: str) -> Cell:
+    """Return the cell of the fit to one run on another, bold for a validation run; None without a fit."""
+    if fit is None:
+        return None
+    return percent(fit.fit(other)) if run == other else Markup("<strong>{}</strong>").format(percent(fit.fit(other)))
+
+
 def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
     """Return a table of the estimates and 95 % intervals of every fit to a deflection, one row per parameter."""
-    rows: dict[str, list[list[Cell]]] = {
-        f"{kind}, fitted to {run}": [
-            [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in ends)]
-            for name, (value, *ends) in fit.estimates.items()
-        ]
-        for kind, each in deflection.fits.items()
-        for run, fit in each.items()
-    }
+    rows: dict[str, list[list[Cell]]] = {}
+    for kind, fits in deflection.fits.items():
+        for run, fit in fits.items():
+            rows[f"{kind}, fitted to {run}"] = [
+                [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in ends)]
+                for name, (value, *ends) in fit.estimates.items()
+            ]
     return make_table("cross_estimates", rows, output=f"{symbol(deflection.output)}{suffix}")
 
 
 def _deflection_section(full: Deflection) -> Section:
-    parts = _with_and_without(full)
-    results = {
-        f"{kind}, {run}{suffix}": f.result for suffix, d in parts for kind, e in d.fits.items() for run, f in e.items()
-    }
-    failed = [f"{kind}, {run}{suffix}: {words}" for suffix, d in parts for (kind, run), words in d.failed.items()]
+    results: dict[str, Identification | None] = {}
+    failed: list[str] = []
+    for suffix, d in full.parts:
+        results |= {f"{kind}, {run}{suffix}": f.result for kind, fits in d.fits.items() for run, f in fits.items()}
+        failed += [f"{kind}, {run}{suffix}: {words}" for (kind, run), words in d.failed.items()]
     whole, free = full.fits[INTEGER_KIND], full.fits[CHARTED_KIND]
     run, fit = next(iter({**whole, **free}.items()))
-    models = next(iter(whole.values())).result.model, fit.result.model
+    equations = [*next(iter(whole.values())).result.model.equations, *fit.result.model.equations]
+    introduction = f"With integer orders and with both free, fitted to {run}:"
     return Section(
         symbol(full.output),
-        [
-            f"With integer orders and with both free, fitted to {run}:",
-            *(equation_html(e) for e in dict.fromkeys(e for m in models for e in m.equations)),
-        ],
+        [introduction, *map(equation_html, dict.fromkeys(equations))],
         warnings=[*failed, *(f"{models}: {sentence}" for models, sentence in grouped_findings(results))],
-        tables=[estimates_table(d, suffix) for suffix, d in parts],
+        tables=[estimates_table(d, suffix) for suffix, d in full.parts],
     )
 
 
@@ -549,14 +529,17 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
         If the file exists and `force` is False, or it cannot be written.
     """
     check_free(path, force=force)
-    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in result.deflections.items()] for kind in FRACTIONAL_KINDS}
-    first = each.pop(CHARTED_KIND)
-    charts = [chart for d in result.deflections.values() for chart in validation_charts(result, d)]
-    places = rate_effect_table(result)
-    alone = [verdict for pair in zip(*each.values(), strict=True) for verdict in pair]
+    both: list[Markup] = []
+    alone: list[Markup] = []
+    charts: list[LineChart] = []
+    for output, deflection in result.deflections.items():
+        for verdict in deflection.verdicts:
+            (both if verdict.kind == CHARTED_KIND else alone).append(_verdict(output, verdict))
+        charts += validation_charts(result, deflection)
+    tables = [table for table in (rate_effect_table(result), fits_table(result)) if table is not None]
     sections = [
-        Section("On runs that were not fitted to", first, figures=charts, small=True),
-        Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(result)]),
+        Section("On runs that were not fitted to", both, figures=charts, small=True),
+        Section("One order at a time", alone, tables=tables),
         *(_deflection_section(d) for d in result.deflections.values()),
         _method_section(result),
     ]

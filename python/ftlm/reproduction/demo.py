@@ -23,19 +23,9 @@ from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
-from ftlm.reproduction.published_values import INNOVATION_LENGTHS, page_text
-from ftlm.reproduction.report import (
-    convergence_chart,
-    criteria_cells,
-    derivative_chart,
-    fits_table,
-    fits_text,
-    joint_equations,
-    letters_of,
-    make_table,
-    number_cells,
-    table_text,
-)
+from ftlm.reproduction import report
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS, LAST_P, page_text
+from ftlm.reproduction.report import convergence_chart, derivative_chart, table_text
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage import GRID_ALPHA, Candidate, Preset, Stage, StageWork
 from ftlm.reproduction.workload import TotalProgress, WorkerProgress, seconds_of
@@ -49,7 +39,7 @@ TOP_CANDIDATES = 20
 #: Number of recursion steps between two points of a convergence curve, which then has 128 points.
 TRACE_EVERY = 16
 #: Labels of the models that are saved, by the suffix of their file name.
-SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
+SAVED_MODELS = {"paper": f"p = {LAST_P}", "output-error": "output error"}
 #: Labels of the models in the terminal summary. "p = 7" is multi-innovation with innovation length 7.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
 #: Widths [characters] of the columns after the first one, in text tables of models and of estimates.
@@ -63,12 +53,13 @@ def paper_table(models: Mapping[str, Candidate], *, title: str = "Identified mod
     """
 
     def cells(label: str, candidate: Candidate, output: str) -> list[Cell]:
-        both = (candidate.estimation.equation_error[output], candidate.estimation.output_error[output])
-        return [label, *number_cells(*letters_of(candidate.model, output)), *chain(*map(criteria_cells, both))]
+        numbers = report.number_cells(*report.letters_of(candidate.model, output))
+        errors = candidate.estimation.equation_error[output], candidate.estimation.output_error[output]
+        return [label, *numbers, *chain(*map(report.criteria_cells, errors))]
 
     outputs = next(iter(models.values())).estimation.output_error
     rows = {o: [cells(label, c, o) for label, c in models.items()] for o in outputs}
-    return make_table("both_errors", rows, title=title)
+    return report.make_table("both_errors", rows, title=title)
 
 
 @dataclass(frozen=True)
@@ -165,16 +156,16 @@ def run_demo(
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
     grid = OrderGrid(increment=increment, alpha=GRID_ALPHA)
-    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, None)
+    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, rivals_increment=None, threads=threads)
     seconds = (len(INNOVATION_LENGTHS) + 1) * seconds_of("search", increment) + seconds_of("output error", increment)
     whole = TotalProgress(len(STAGE_NUMBERS) * seconds, progress)
     steps = WorkerProgress(whole, threading.Event())
     for stage in STAGE_NUMBERS:
-        work = StageWork(stage, square, sine, preset, threads, log, steps)
-        models = {"integer order": work.euler_candidate("integer order", work.manual("integer order"))}
+        work = StageWork(stage, square, sine, preset, log, steps)
+        models = {"integer order": work.euler_candidate(work.manual())}
         models |= work.searches()
         words = "all orders and coefficients together by output error, from the current alone"
-        models["output error"] = work.joint("output error", work.coupled, words)
+        models["output error"] = work.joint(work.coupled, words)
         traces = work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS})
         derived = work.dropped_derivative(models["output error"].model)
         demo.stages[stage] = Stage(stage, models, traces, {}, {}, work.printed_orders(), derived, None)
@@ -217,7 +208,7 @@ def demo_details(demo: Demo) -> str:
         lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
         lines += [*table_text(paper_table(stage.candidates), 16, PAPER_TABLE_WIDTHS), ""]
         lines += ["Fit of the simulation in percent: on the square run, and on the sine run that no model has seen"]
-        lines += [*fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
+        lines += [*report.fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
         estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
         lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
     lines += [page_text("demo_tables"), ""]
@@ -233,32 +224,24 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
     The page has charts of the validation run, verdicts, fits, and a section with the tables of each joint. Raise
     DataError if the file exists and `force` is False, or it cannot be written.
     """
-    boxes = Markup("").join(
-        verdict_box(checked.verdict, f"Stage {stage}, output error: ")
-        for stage, checked in demo.validations.items()
-        if checked.verdict is not None
-    )
-    runs = {"square, fitted to": "estimation", "sine, not seen": "validation"}
-    bars = [
-        replace(chart, width=SMALL_WIDTH_PX, caption="")
-        for stage in demo.stages.values()
-        for chart in compared_bars(
-            [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in stage.candidates.items()],
-            title="Fit of the simulation",
-        )
-    ]
-    # Four charts fit a laptop screen without their sliders, which the sections of the stages have.
-    simulations = [
-        replace(chart, width=SMALL_WIDTH_PX, height=200, slider=False)
-        for stage, checked in demo.validations.items()
-        for chart in comparison_charts(checked, units=demo.results[stage]["output error"].model.units)
-    ]
+    boxes, runs = Markup(""), {"square, fitted to": "estimation", "sine, not seen": "validation"}
+    bars: list[Figure] = []
+    simulations: list[Figure] = []
+    for number, stage in demo.stages.items():
+        checked, units = demo.validations[number], demo.results[number]["output error"].model.units
+        if checked.verdict is not None:
+            boxes += verdict_box(checked.verdict, f"Stage {number}, output error: ")
+        fits = [(label, [(r, getattr(c, part)) for r, part in runs.items()]) for label, c in stage.candidates.items()]
+        bars += [replace(bar, width=SMALL_WIDTH_PX, caption="") for bar in compared_bars(fits)]
+        # Four charts fit a laptop screen without their sliders, which the sections of the stages have.
+        charts = comparison_charts(checked, units=units)
+        simulations += [replace(chart, width=SMALL_WIDTH_PX, height=200, slider=False) for chart in charts]
     sections = [
         Section("Measured and simulated: the sine run", figures=simulations, small=True),
         Section("Verdicts", verdict=boxes),
         Section("Fit of every model", page_text("demo_models"), figures=bars, small=True),
         *(_stage_section(demo, stage) for stage in demo.results),
-        Section("Fits in numbers", collapsed=True, tables=[fits_table(stage) for stage in demo.stages.values()]),
+        Section("Fits in numbers", collapsed=True, tables=[report.fits_table(stage) for stage in demo.stages.values()]),
     ]
     title = "A flexible arm, identified from one run"
     return write_page(path, title=title, sections=sections, lead=page_text("demo_lead"), force=force)
@@ -268,33 +251,25 @@ def _stage_section(demo: Demo, stage: int) -> Section:
     """Return the section on one joint, in which findings on the output-error model precede those on other models."""
     results = demo.results[stage]
     best = results["output error"]
-    compared = {
-        "output error, square run": best.comparison,
-        "multi-innovation, p = 7, square run": results["p = 7"].comparison,
-    }
-    charts: list[Figure] = [
-        f for label, c in compared.items() for f in comparison_charts(c, units=best.model.units, label=label)
-    ]
+    compared = {"output error": best, f"multi-innovation, p = {LAST_P}": results[f"p = {LAST_P}"]}
+    charts: list[Figure] = []
+    for label, result in compared.items():
+        charts += comparison_charts(result.comparison, units=best.model.units, label=f"{label}, square run")
     charts += [*pole_charts(best.model), *best.model.step().figures()]
     for output in best.model.outputs:
         title = f"Error (45) of {symbol(output)} after each step of the recursion"
         charts.append(convergence_chart(demo.stages[stage].traces[output], title, log_x=False))
     first, rest = first_findings(best.findings)
     others = grouped_findings({n: r for n, r in results.items() if n != "output error"})
-    searches = {f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}
+    searches = search_summary({f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()})
+    tables = paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current").split(9)
     return Section(
         f"Stage {stage}",
-        [*joint_equations(best.model), page_text("demo_tables")],
+        [*report.joint_equations(best.model), page_text("demo_tables")],
         warnings=first,
         more=[*rest, *(f"{models}: {sentence}" for models, sentence in others)],
-        tables=[
-            *behavior_tables(best.model),
-            estimates_table(best, demo.truth[stage]),
-        ],
+        tables=[*behavior_tables(best.model), estimates_table(best, demo.truth[stage])],
         fold="All models",
-        folded_tables=[
-            *paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current").split(9),
-            search_summary(searches),
-        ],
+        folded_tables=[*tables, searches],
         figures=[*charts, derivative_chart(demo.stages[stage].derived)],
     )

@@ -15,14 +15,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from pathlib import Path
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from ftlm import _core
 from ftlm.analysis.poles import Stability, stability
-from ftlm.arm.flexible_link import flexible_link
+from ftlm.arm.flexible_link import ORDER_OF, flexible_link
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.fractional_calculus import haar_transform
@@ -32,23 +32,22 @@ from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS, OrderGrid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
-from ftlm.reproduction.simulated_arm import PAPERS_ARM, StageNumber, demo_run
+from ftlm.reproduction.simulated_arm import ANGLE_NAMES, PAPERS_ARM, StageNumber, demo_run
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite
+from ftlm.svg.html_page import read_resource
+from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite, json_value
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, compare_means, metrics
 
-#: Innovation lengths p of the paper, its number of block pulses, and its angles in the order of the indices n = 1 … 4.
+#: Innovation lengths p of the paper, the smallest and the largest, and its number of block pulses.
 INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS
+FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 PULSE_COUNT = 2048
-ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 #: Letters of the orders and of the coefficients, in the order of the tables' columns.
 ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
-#: Order of each coefficient's term in the paper's equations (22)-(25).
-ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 #: Prior covariance that is so large that only the data determine the estimates.
 WEAK_PRIOR = 1e10
 #: Prior covariances K0 that are compared: that of the paper (identity matrix), and a weak prior.
@@ -79,14 +78,13 @@ class PublishedRow:
 
 def read_paper_table(name: str) -> list[dict[str, str]]:
     """Return the rows of the csv file `name` in the folder of this module, each as texts by column name."""
-    with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(read_resource(name, "ftlm.reproduction").splitlines()))
 
 
 @cache
 def read_texts(name: str) -> dict[str, Any]:
     """Return the contents of the file `name`.toml in the folder of this module, by key."""
-    return tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(read_resource(f"{name}.toml", "ftlm.reproduction"))
 
 
 def page_text(key: str, **values: Any) -> str:
@@ -97,18 +95,14 @@ def page_text(key: str, **values: Any) -> str:
 
 def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
     """Return the rows of the paper's Tables 4 to 7 by (table number, angle, model)."""
-
-    def values(record: Mapping[str, str], names: Sequence[str]) -> dict[str, float]:
-        return {name: Exact(record[name]) for name in names if record[name]}
-
-    return {
-        (each["table"], each["angle"], each["model"]): PublishedRow(
-            values(each, ORDER_LETTERS),
-            values(each, COEFFICIENT_LETTERS),
-            **values(each, ("error", "rmse", "nr")),
-        )
-        for each in read_paper_table("published_tables.csv")
-    }
+    rows = {}
+    for cells in read_paper_table("published_tables.csv"):
+        place = cells.pop("table"), cells.pop("angle"), cells.pop("model")
+        values = {name: Exact(text) for name, text in cells.items() if text}
+        orders = {name: values.pop(name) for name in ORDER_LETTERS if name in values}
+        coefficients = {name: values.pop(name) for name in COEFFICIENT_LETTERS if name in values}
+        rows[place] = PublishedRow(orders, coefficients, **values)
+    return rows
 
 
 _ROWS_BY_PLACE = _read_rows()
@@ -140,11 +134,6 @@ def parameter_name(letter: str, output: str) -> str:
 def stage_of(output: str) -> StageNumber:
     """Return the number of the joint (stage) to which an angle belongs: 1 for theta11 and theta12, else 2."""
     return 1 if output[-2] == "1" else 2
-
-
-def last_orders(output: str) -> dict[str, float]:
-    """Return the orders that the paper prints for an angle and innovation length 7, by name, such as alpha1."""
-    return {parameter_name(n, output): v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
@@ -187,18 +176,10 @@ def prior_text(prior: float) -> str:
     return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
 
 
-#: Interpretations of the terms with coefficients a, b, d and g. Each has a description, and the signal in every term of
-#: the equation of a hub angle and of a deflection: the angle itself, the other angle of its joint, or the current u.
-TERM_INTERPRETATIONS = {
-    "(22)–(25)": ("as printed there", "other own other u", "own other own u"),
-    "(26), one angle": ("every term has the angle itself", "own own own u", "own own own u"),
-    "own angle in a": ("the angle itself in a, the other one in b and d", "own other other u", "own other other u"),
-    "a and b exchanged": (
-        "the orders of (22)–(25), the columns a and b of the table exchanged",
-        "own other other u",
-        "other own own u",
-    ),
-}
+#: Interpretations of the terms with coefficients a, b, d and g. Each has a meaning, the orders of a, b and d, and the
+#: signal in every term of the equation of a hub angle and of a deflection: the angle itself ("own"), the other angle of
+#: its joint ("other"), or the current ("u").
+TERM_INTERPRETATIONS: Mapping[str, Mapping[str, Any]] = read_texts("page")["terms"]
 #: Prior covariances K0 that are tried to match the printed tables: eight per decade.
 PRIOR_GRID = tuple(float(v) for v in np.logspace(-3, 5, 65))
 #: Limits and increment (the paper's) of the grid on which the printed orders are ranked.
@@ -250,7 +231,7 @@ class AsPrinted:
     ----------
     output
         Name of the angle.
-    reading
+    interpretation
         Interpretation whose values are closest to the printed ones.
     rows
         Recomputed rows by innovation length p.
@@ -269,7 +250,7 @@ class AsPrinted:
     """
 
     output: str
-    reading: Interpretation
+    interpretation: Interpretation
     rows: dict[int, Row]
     ratio: float
     ratio_at_unit_prior: float
@@ -306,33 +287,25 @@ class AsPrinted:
 
         NR is the normalized residual.
         """
-        return all(
-            1.0 / MAX_COEFFICIENT_RATIO <= q <= MAX_COEFFICIENT_RATIO for column in self.ratios.values() for q in column
-        )
+        low, high = 1.0 / MAX_COEFFICIENT_RATIO, MAX_COEFFICIENT_RATIO
+        return all(low <= ratio <= high for column in self.ratios.values() for ratio in column)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as a dictionary for JSON."""
-        fit = ("reading", "ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows")
-        return {"closest settings": str(self.reading)} | attributes(self, (*fit, "rank", "among", "best"))
+        settings = {"closest settings": str(self.interpretation), "reading": json_value(self.interpretation)}
+        numbers = attributes(self, ("ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows"))
+        return settings | numbers | attributes(self, ("rank", "among", "best"))
 
 
 class _AngleRegression:
     """Regressors of one angle at any orders, and coefficients by the closed form of eq. (44) of the paper.
 
-    `output` is this angle. `angles` has the block-pulse means of both angles of the joint, and `current` has those of
-    the motor current. `step` is the width of a block pulse [s]. The methods name the signals "own" (this angle),
-    "other" (the other angle of the joint) and "u" (the current).
+    `output` is this angle, and `step` the width of a block pulse [s]. `means` are block-pulse means by signal: "own"
+    (this angle), "other" (the other angle of the joint) and "u" (the motor current).
     """
 
-    def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
-        other = output[:-1] + ("2" if output.endswith("1") else "1")
-        self.output, self.step, self.signals = (
-            output,
-            step,
-            {"own": angles[output], "other": angles[other], "u": current},
-        )
-        self.y = angles[output]
-        self.m = self.y.size
+    def __init__(self, output: str, means: Mapping[str, Floats], step: float) -> None:
+        self.output, self.means, self.step, self.y = output, means, step, means["own"]
         self.haar_y = haar_transform(self.y)
         self._transforms: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
@@ -340,8 +313,8 @@ class _AngleRegression:
         """Return the fractional integral of the signal "own", "other" or "u", and its Haar transform, each (m,)."""
         key = signal, round(order, 6)
         if key not in self._transforms:
-            kernel = block_pulse_kernel(order, self.m, step=self.step)
-            series = _core.series_multiply(kernel, self.signals[signal], self.m)
+            kernel = block_pulse_kernel(order, PULSE_COUNT, step=self.step)
+            series = _core.series_multiply(kernel, self.means[signal], PULSE_COUNT)
             self._transforms[key] = series, haar_transform(series)
         return self._transforms[key]
 
@@ -350,18 +323,17 @@ class _AngleRegression:
 
         `terms` is a key of `TERM_INTERPRETATIONS`.
         """
-        _, hub, deflection = TERM_INTERPRETATIONS[terms]
-        return (hub if self.output.endswith("1") else deflection).split()
+        signals: list[str] = TERM_INTERPRETATIONS[terms]["hub" if self.output.endswith("1") else "deflection"]
+        return signals
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
         """Return the regressors of a, b, d and g, eq. (42) of the paper, as time signals and Haar transforms.
 
         Both arrays have the shape (m, 4).
         """
-        names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
-        etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
-        parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
-        time, haar = zip(*parts, strict=True)
+        alpha = orders["alpha"]
+        etas = [*(alpha - orders[n] for n in TERM_INTERPRETATIONS[terms]["orders"]), alpha]
+        time, haar = zip(*map(self.integral, self.places(terms), etas), strict=True)
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
     def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
@@ -370,7 +342,7 @@ class _AngleRegression:
         They are weighted least-squares estimates with a prior. `haar` are the Haar transforms of the regressors, with M
         rows. With the innovation length p, row i = 1 … M has the weight min(p, M - i + 1).
         """
-        weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
+        weights = np.minimum(p, PULSE_COUNT - np.arange(PULSE_COUNT)).astype(np.float64)
         weighted = haar * weights[:, None]
         gram, right = weighted.T @ haar, weighted.T @ self.haar_y
         grams = gram + np.eye(haar.shape[1]) / np.asarray(priors)[:, None, None]
@@ -412,54 +384,53 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
         Recomputed table of each angle, by name.
     """
     run, scales = papers_record()
-    readings = {}
+    tables = {}
     for output in outputs:
-        stage = stage_of(output)
-        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), sensor_filter="stock")
+        structure = flexible_link(
+            stage=stage_of(output), form="published", coupling="measured", laws=(), sensor_filter="stock"
+        )
         own = record(run, structure, PULSE_COUNT, filtered=False)
-        hub, deflection = structure.outputs
-        plain_angles = {o: own.of(o) for o in structure.outputs}
-        behind = plain_angles[deflection]
-        filter_series = sensor_series(structure, PULSE_COUNT, own.step)
+        hub, deflection = map(own.of, structure.outputs)
+        filter_series, filtered = sensor_series(structure, PULSE_COUNT, own.step), deflection
         if filter_series is not None:
-            behind = _core.series_multiply(filter_series, behind, PULSE_COUNT)
+            filtered = _core.series_multiply(filter_series, deflection, PULSE_COUNT)
         # The standard deviation that the paper implies is that of the recorded angle, which has passed the filter.
-        behind = behind * float(np.std(plain_angles[deflection])) / float(np.std(behind))
-        angles_by_filter = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
-        current = own.of(f"I{stage}")
-        angles = {
-            filtered: _AngleRegression(series, current, output, own.step)
-            for filtered, series in angles_by_filter.items()
-        }
-        readings[output] = _closest_recomputation(output, angles, scales[output])
-    return readings
+        filtered = filtered * float(np.std(deflection)) / float(np.std(filtered))
+        angles = []
+        for link in (deflection, filtered):
+            pair = (hub, link) if output == structure.outputs[0] else (link, hub)
+            means = {"own": pair[0], "other": pair[1], "u": own.of(f"I{output[-2]}")}
+            angles.append(_AngleRegression(output, means, own.step))
+        tables[output] = _closest_recomputation(output, angles, scales[output])
+    return tables
 
 
-def _closest_recomputation(output: str, angles: Mapping[bool, _AngleRegression], scale: float) -> AsPrinted:
+def _closest_recomputation(output: str, angles: Sequence[_AngleRegression], scale: float) -> AsPrinted:
     """Return the recomputed table of an angle that is closest to the printed one, over all interpretations.
 
     `angles` has the regressors without and with the sensor filter. The filter is tried for deflections only.
     """
-    table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
+    table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][FIRST_P].orders
+    priors = (*PRIOR_GRID, 1.0)
     candidates: list[tuple[float, Interpretation, dict[int, Row]]] = []
     for filtered, terms in product((False, True) if output.endswith("2") else (False,), TERM_INTERPRETATIONS):
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
-        priors = (*PRIOR_GRID, 1.0)
         solved = {p: angle.solve_coefficients(haar, priors, p) for p in INNOVATION_LENGTHS}
+        own_terms = np.array([place == "own" for place in angle.places(terms)])
         for k, prior in enumerate(priors):
-            figures = {p: metrics(angle.y, time @ x[k]) for p, x in solved.items()}
+            errors = {p: metrics(angle.y, time @ x[k]) for p, x in solved.items()}
             for flipped in (False, True):
-                signs = np.array([-1.0 if flipped and place == "own" else 1.0 for place in angle.places(terms)])
+                signs = np.where(flipped & own_terms, -1.0, 1.0)
                 rows = {
-                    p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[k]).tolist(), strict=True)), figures[p])
+                    p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[k]).tolist(), strict=True)), errors[p])
                     for p, x in solved.items()
                 }
                 candidates.append((_log_distance(rows, table), Interpretation(terms, filtered, flipped, prior), rows))
-    away, reading, rows = min(candidates, key=lambda one: one[0])
+    away, interpretation, rows = min(candidates, key=itemgetter(0))
     at_one = min(distance for distance, each, _ in candidates if each.prior == 1.0)
-    ranks = _rank_orders(angles[reading.filtered], reading, orders)
-    return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), *ranks, scale)
+    ranks = _rank_orders(angles[interpretation.filtered], interpretation, orders)
+    return AsPrinted(output, interpretation, rows, math.exp(away), math.exp(at_one), *ranks, scale)
 
 
 def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) -> float:
@@ -477,23 +448,22 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
 
 
 def _rank_orders(
-    angle: _AngleRegression, reading: Interpretation, orders: Mapping[str, float]
+    angle: _AngleRegression, interpretation: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
     """Rank the printed orders beta, gamma and mu among all orders of a grid, by the sum of absolute equation errors.
 
     Return the rank of the printed orders, the number of grid points, and the orders with the smallest sum. The
     coefficients of each point are those of the largest innovation length p.
     """
-    count = round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
+    varied, count = ("beta", "gamma", "mu"), round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
     values = [round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9) for k in range(count)]
-    varied = ("beta", "gamma", "mu")
     errors: dict[tuple[float, ...], float] = {}
-    for each in product(values, values, values):
-        time, haar = angle.regressors(reading.terms, {**orders, **dict(zip(varied, each, strict=True))})
-        (x,) = angle.solve_coefficients(haar, (reading.prior,), INNOVATION_LENGTHS[-1])
+    for each in product(values, repeat=len(varied)):
+        time, haar = angle.regressors(interpretation.terms, {**orders, **dict(zip(varied, each, strict=True))})
+        (x,) = angle.solve_coefficients(haar, (interpretation.prior,), LAST_P)
         errors[each] = float(np.sum(np.abs(angle.y - time @ x)))
     own = errors[tuple(round(float(orders[n]), 9) for n in varied)]
-    best = min(errors, key=lambda each: errors[each])
+    best = min(errors, key=errors.__getitem__)
     first = {"alpha": float(orders["alpha"]), **dict(zip(varied, best, strict=True))}
     return 1 + sum(e < own for e in errors.values()), len(errors), first
 
@@ -566,8 +536,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
     """Return the model of both printed equations of a joint, which are coupled and have the current as input."""
     orders, coefficients = printed_numbers(stage, p)
     structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
-    identified = structure.with_orders(orders).with_coefficients(coefficients)
-    return Model(identified, orders=orders, m=PULSE_COUNT)
+    return Model(structure.with_orders(orders).with_coefficients(coefficients), orders=orders, m=PULSE_COUNT)
 
 
 def one_angle(output: str, p: int) -> Model:
@@ -596,21 +565,11 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
         free, own, verdict = compare_means(model, drive), model.simulate(drive), stability(model)
         for output in model.outputs:
             response = free.simulated[output][0]
-            single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output]))
-            runs.append(
-                PrintedModelRun(
-                    output,
-                    p,
-                    verdict,
-                    float(np.std(response)),
-                    float(np.std(single.simulated[output][0])),
-                    implied_spreads()[output][1],
-                    pulse_times(free),
-                    response,
-                    pulse_means(scaled[output], PULSE_COUNT),
-                    *_reidentify(own, structure.equation(output), orders, p, threads),
-                )
-            )
+            single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output])).simulated[output][0]
+            deviations = float(np.std(response)), float(np.std(single)), implied_spreads()[output][1]
+            arm = pulse_means(scaled[output], PULSE_COUNT)
+            refits = _reidentify(own, structure.equation(output), orders, p, threads)
+            runs.append(PrintedModelRun(output, p, verdict, *deviations, pulse_times(free), response, arm, *refits))
     return runs
 
 
@@ -623,20 +582,18 @@ def _reidentify(
     prior covariance K0, whose values are dictionaries by name. The best orders are computed only for the largest
     innovation length p, and are empty otherwise. A K0 without a finite simulation error is omitted.
     """
-    own = {n: [orders[n]] for n in single.order_names}
-    near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
-    wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}
 
     def best(axes: dict[str, list[float]]) -> dict[float, Model]:
-        models = {}
+        grid, models = OrderGrid(increment=SEARCH_INCREMENT, orders=axes), {}
         for prior in PRIOR_COVARIANCES:
             with suppress(FtlmError):  # no candidate has a finite error
-                grid = OrderGrid(increment=SEARCH_INCREMENT, orders=axes)
                 models[prior] = best_orders(run, single, grid, p, prior, m=PULSE_COUNT, threads=threads).model
         return models
 
-    searched = best(wide) if p == INNOVATION_LENGTHS[-1] else {}
-    return (
-        {k: dict(m.coefficients) for k, m in best(own).items()},
-        {k: {n: m.orders[n] for n in own} for k, m in searched.items()},
-    )
+    own = {n: [orders[n]] for n in single.order_names}
+    coefficients = {k: dict(model.coefficients) for k, model in best(own).items()}
+    if p != LAST_P:
+        return coefficients, {}
+    near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
+    wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}
+    return coefficients, {k: {n: model.orders[n] for n in own} for k, model in best(wide).items()}

@@ -17,41 +17,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from ftlm.arm.flexible_link import PARAMETER_SETS
+from ftlm.arm.flexible_link import ORDER_OF, PARAMETER_SETS
 from ftlm.errors import ModelError
 from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.model.model import Model
 from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.plot.model_charts import bode_charts, response_frequencies
 from ftlm.report.html_report import estimates_table, grouped_findings
-from ftlm.report.typesetting import equation_html
+from ftlm.report.typesetting import equations_html
 from ftlm.reproduction import published_values as printed
+from ftlm.reproduction import stage as stage_module
 from ftlm.reproduction.checks import ClaimVerdict, deviation_text, table_3_coefficients
-from ftlm.reproduction.published_values import (
-    ANGLE_NAMES,
-    COEFFICIENT_LETTERS,
-    ORDER_LETTERS,
-    PRIOR_COVARIANCES,
-    WEAK_PRIOR,
-    page_text,
-    parameter_name,
-    prior_text,
-    read_texts,
-)
-from ftlm.reproduction.simulated_arm import letter_of
-from ftlm.reproduction.stage import (
-    COARSE_INCREMENT,
-    MULTI_INNOVATION_LABELS,
-    REFINED_CANDIDATES,
-    RIVAL_ALPHA,
-    TRACE_EVERY,
-    Candidate,
-    DroppedDerivative,
-    Stage,
-)
+from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, ORDER_LETTERS, page_text, parameter_name, prior_text
+from ftlm.reproduction.simulated_arm import ANGLE_NAMES, letter_of
+from ftlm.reproduction.stage import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
 from ftlm.structure.equation import format_equation
 from ftlm.svg.figure import Figure, StaticFigure
-from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
+from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, read_resource, write_page
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import (
@@ -73,7 +55,9 @@ if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
 OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
-_STRONG_PRIOR, _WEAK_PRIOR = (Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
+_STRONG_PRIOR, _WEAK_PRIOR = (
+    Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in printed.PRIOR_COVARIANCES
+)
 #: Column headings that replace the names beginning with @ in page.toml.
 COLUMN_HEADS: Mapping[str, Sequence[str]] = {
     "@numbers": tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS))),
@@ -98,23 +82,19 @@ def angle_chart(
     return LineChart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
 
-def reference_label(*, simulated: bool) -> str:
-    """Return the label of the reference line in charts: the simulated arm or the measurement."""
-    return "simulated arm" if simulated else "measured"
-
-
 def fit_chart(
-    models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
+    models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", reference: str = "measured"
 ) -> LineChart:
     """Return a chart of a measured (or reference) angle and its simulations by the models (label, comparison).
 
-    Simulated values far outside the range of the reference are omitted, and the caption reports this.
+    Simulated values far outside the range of the reference are omitted, and the caption reports this. `reference` is
+    the label of its line.
     """
     first = models[0][1]
-    reference, time = first.measured[output][0], pulse_times(first)
-    middle = float(np.mean(reference))
-    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(reference - middle)))
-    lines, remarks = [(reference_label(simulated=simulated), reference)], []
+    measured, time = first.measured[output][0], pulse_times(first)
+    middle = float(np.mean(measured))
+    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
+    lines, remarks = [(reference, measured)], []
     for label, comparison in models:
         response = comparison.simulated[output][0]
         with np.errstate(invalid="ignore"):
@@ -134,9 +114,9 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
     Each chart also has the angle of the simulated arm, scaled to the standard deviation that the paper implies.
     """
     charts: list[Figure] = []
-    for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
-        rows = [r for r in reproduction.ran if r.output == output]
-        last = rows[-1]
+    rows_by_output = printed_runs_by_output(reproduction)
+    for output in (o for o in rows_by_output if o.endswith("1")):
+        rows, last = rows_by_output[output], rows_by_output[output][-1]
         caption = page_text("printed_model_caption", table=3 + int(output[-2]), run=last)
         lines = [("simulated arm", last.arm), *((f"printed, p = {r.p}", r.response) for r in rows)]
         title = f"{symbol(output)}: the printed models under the paper's current"
@@ -147,14 +127,13 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
 def share_picture(ruling: ClaimVerdict) -> Markup:
     """Return a bar chart as SVG: fraction of cases in which a claim holds, per level of the first factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
-    height = 10 * len(levels) - 2
     words = "; ".join(f"{level + ': ' if level else ''}{holding} of {count}" for level, count, holding in levels)
-    out = [Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">').format(height, words)]
-    for k, (_, count, holding) in enumerate(levels):
-        filled = 88 * holding / max(count, 1)
-        out.append(Markup('<rect class="held" x="0" y="{}" width="{:.1f}" height="8"/>').format(10 * k, filled))
-        out.append(Markup('<rect x=".5" y="{}" width="87" height="7"/>').format(10 * k + 0.5))
-    return Markup("").join([*out, Markup("</svg>")])
+    bar = Markup(
+        '<rect class="held" x="0" y="{}" width="{:.1f}" height="8"/><rect x=".5" y="{}" width="87" height="7"/>'
+    )
+    bars = (bar.format(10 * k, 88 * h / max(count, 1), 10 * k + 0.5) for k, (_, count, h) in enumerate(levels))
+    picture = Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">{}</svg>')
+    return picture.format(10 * len(levels) - 2, words, Markup("").join(bars))
 
 
 def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
@@ -172,18 +151,17 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
 
-def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> LineChart:
+def derivative_chart(derived: DroppedDerivative, reference: str = "simulated arm") -> LineChart:
     """Return a chart of the deflection: reference, simulated by eqs. (14)-(15) of the paper, and by eqs. (22)-(25)."""
-    own = reference_label(simulated=simulated)
-    lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
+    lines = [(reference, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     nr = metrics(derived.derived, derived.published).nr
-    caption = page_text("derivative_caption", order=derived.order, nr=nr, own=own, **derived.correlations)
+    caption = page_text("derivative_caption", order=derived.order, nr=nr, own=reference, **derived.correlations)
     title = f"{symbol(derived.output)}: which way the link bends"
     return angle_chart(derived.time, lines, derived.output, title, caption)
 
 
 def _fits_chart(
-    models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
+    models: Mapping[str, Candidate], output: str, place: str, reference: str, *, sine: bool
 ) -> list[Figure]:
     """Return a list with one chart of an angle simulated by several models on one run; empty if the run is absent.
 
@@ -198,7 +176,7 @@ def _fits_chart(
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
         caption += f" {page_text('filtered_rows')}"
     title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
-    return [fit_chart(present, output, title, caption, simulated=simulated)]
+    return [fit_chart(present, output, title, caption, reference)]
 
 
 def _comparison_models(stage: Stage) -> dict[str, Candidate]:
@@ -207,13 +185,11 @@ def _comparison_models(stage: Stage) -> dict[str, Candidate]:
     They are the integer-order model of the manufacturer's manual, multi-innovation with innovation length 7, and output
     error. The first is simulated by Euler's method if the run starts at rest, and exactly otherwise.
     """
-    manual = "integer, Euler" if stage.traces else "integer, exact"
-    last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
-    labels = {"integer, manual": manual, last: last, "output error": "output error"}
-    return {heading: stage.candidates[label] for heading, label in labels.items()}
+    manual = stage.candidates["integer, Euler" if stage.traces else "integer, exact"]
+    return {"integer, manual": manual} | {n: stage.candidates[n] for n in (f"p = {printed.LAST_P}", "output error")}
 
 
-def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
+def stage_figures(stage: Stage, reference: str) -> list[Figure]:
     """Return the charts of a joint that correspond to Figures 4 to 6 (joint 1) or 7 to 9 (joint 2) of the paper."""
     first = 4 if stage.number == 1 else 7
     errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
@@ -226,23 +202,21 @@ def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
         number = f"{first + 2}({letter})"
-        figures += _fits_chart(_comparison_models(stage), output, number, sine=False, simulated=simulated)
+        figures += _fits_chart(_comparison_models(stage), output, number, reference, sine=False)
     return figures
 
 
 def _place(figure: int, output: str) -> str:
-    return f"{figure}({'abcd'[printed.ANGLE_NAMES.index(output)]})"
+    return f"{figure}({'abcd'[ANGLE_NAMES.index(output)]})"
 
 
 def sine_figures(reproduction: Reproduction) -> list[Figure]:
     """Return the charts that correspond to Figure 10 of the paper: simulations of every angle on the sine run."""
-    return [
-        figure
-        for stage, output in reproduction.angles
-        for figure in _fits_chart(
-            _comparison_models(stage), output, _place(10, output), sine=True, simulated=reproduction.simulated
-        )
-    ]
+    figures = []
+    for stage, output in reproduction.angles:
+        models, place = _comparison_models(stage), _place(10, output)
+        figures += _fits_chart(models, output, place, reproduction.reference_label, sine=True)
+    return figures
 
 
 def rival_figures(reproduction: Reproduction) -> list[Figure]:
@@ -252,20 +226,17 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
     """
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
-    for output, comparison in reproduction.rivals.items():
+    for output, comparison in reproduction.optimizer_comparisons.items():
         models = {names.get(n, n): c for n, c in comparison.models.items() if n != "differential evolution"}
-        has_validation = comparison.models["genetic"].validation is not None
-        figures += _fits_chart(
-            models, output, _place(11, output), sine=has_validation, simulated=reproduction.simulated
-        )
+        sine = comparison.models["genetic"].validation is not None
+        figures += _fits_chart(models, output, _place(11, output), reproduction.reference_label, sine=sine)
     return figures
 
 
 def flow_chart() -> Figure:
     """Return the flow chart of the method (Figure 2 of the paper), with drawings for wide and for narrow screens."""
-    files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
-    drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
-    return StaticFigure("Figure 2. From the physics to the identified model", *drawings)
+    wide, narrow = (read_resource(f"flow_chart_{screen}.svg", "ftlm.reproduction") for screen in ("wide", "narrow"))
+    return StaticFigure("Figure 2. From the physics to the identified model", Markup(wide), Markup(narrow))  # own files
 
 
 def make_table(
@@ -287,17 +258,14 @@ def make_table(
     **values
         Values of the placeholders in title and note.
     """
-    texts = read_texts("page")["tables"][key]
-    heads_by_name = {**COLUMN_HEADS, **(heads or {})}
-    columns = [head for name in texts["columns"] for head in heads_by_name.get(name, (name,))]
-    title, note = (
-        texts.get(name, "").format(printed_note=page_text("printed_note"), **values) for name in ("title", "note")
-    )
+    texts = printed.read_texts("page")["tables"][key]
+    heads = {**COLUMN_HEADS, **(heads or {})}
+    columns = [head for name in texts["columns"] for head in heads.get(name, (name,))]
+    values["printed_note"] = page_text("printed_note")
+    title, note = (texts.get(name, "").format(**values) for name in ("title", "note"))
     options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
     if isinstance(rows, Mapping):
-        groups: dict[str, list[Any]] = {
-            symbol_html(name) if name in ANGLE_NAMES else name: list(each) for name, each in rows.items()
-        }
+        groups = {symbol_html(n) if n in ANGLE_NAMES else n: list(each) for n, each in rows.items()}
         return Table.from_groups(title, columns, groups, note=note, **options)
     return Table(title, columns, list(rows), note=note, **options)
 
@@ -308,7 +276,7 @@ def make_section(key: str, *paragraphs: str, values: Mapping[str, Any] | None = 
     `values` replace the placeholders in these texts. `paragraphs` are appended, and `content` are other fields of
     :class:`Section`, such as figures and tables.
     """
-    texts = read_texts("page")["sections"][key]
+    texts = printed.read_texts("page")["sections"][key]
     templates = (texts["heading"], texts.get("fold", Section.fold), *texts.get("paragraphs", ()))
     heading, fold, *own = (template.format(**values or {}) for template in templates)
     return Section(heading, [*own, *paragraphs], fold=fold, **content)
@@ -330,8 +298,8 @@ def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, f
         letter = letter_of(term.name or "")
         if letter in COEFFICIENT_LETTERS:
             coefficients[letter] = float(term.coefficient) + 0.0
-        if letter in printed.ORDER_OF:
-            orders[printed.ORDER_OF[letter]] = term.order.constant
+        if letter in ORDER_OF:
+            orders[ORDER_OF[letter]] = term.order.constant
     return orders, coefficients
 
 
@@ -406,15 +374,11 @@ def fits_table(stage: Stage) -> Table:
 
 def description_tables() -> list[Table]:
     """Return the tables of the paper's symbols (its Table 1), and of the steps of its method with their functions."""
-    steps = [
-        [
-            f"{k}. {each['step']}",
-            Markup(", ").join(Markup("<code>{}</code>").format(f) for f in each["functions"].split(", ")),
-            each["how"],
-        ]
-        for k, each in enumerate(printed.read_paper_table("paper_procedure.csv"), 1)
-    ]
     symbols = [list(each.values()) for each in printed.read_paper_table("paper_symbols.csv")]
+    steps: list[list[Cell]] = []
+    for k, each in enumerate(printed.read_paper_table("paper_procedure.csv"), 1):
+        functions = (Markup("<code>{}</code>").format(f) for f in each["functions"].split(", "))
+        steps.append([f"{k}. {each['step']}", Markup(", ").join(functions), each["how"]])
     return [make_table("symbols", symbols), make_table("steps", steps)]
 
 
@@ -442,7 +406,7 @@ def saturation_table(reproduction: Reproduction) -> Table:
     def rows(stage: Stage, output: str) -> Iterator[list[Cell]]:
         name = parameter_name("a", output)
         of_p = {p: stage.candidates[f"p = {p}"].model for p in printed.INNOVATION_LENGTHS}
-        last = letters_of(of_p[printed.INNOVATION_LENGTHS[-1]], output)[0]
+        last = letters_of(of_p[printed.LAST_P], output)[0]
         x, c, _ = printed.printed_saturation(output)
         for p, model in of_p.items():
             alike = "yes" if letters_of(model, output)[0] == last else "no"
@@ -458,18 +422,15 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
     They correspond to Tables 6 and 7 of the paper. The third has the error, eq. (45), for each optimizer and seed.
     """
-    comparisons = reproduction.rivals
-    seeds = list(
-        dict.fromkeys(seed for comparison in comparisons.values() for seed in comparison.optimizers["genetic"].errors)
-    )
+    comparisons = reproduction.optimizer_comparisons
+    seeds = list(dict.fromkeys(seed for c in comparisons.values() for seed in c.optimizers["genetic"].errors))
     best: list[list[Cell]] = []
     for output, comparison in comparisons.items():
         head = Markup("{}, best of {} seeds").format(symbol_html(output), len(comparison.optimizers["genetic"].errors))
         best.append([head, *computed_cells(comparison.models["genetic"], output)])
         best.append(printed_cells(symbol_html(output), printed.GENETIC_ROWS[output], criteria=False))
-    labels = OPTIMIZER_LABELS | {
-        n: f"p = 7, K₀ = {prior_text(k)}" for n, k in zip(MULTI_INNOVATION_LABELS, PRIOR_COVARIANCES, strict=True)
-    }
+    priors = zip(MULTI_INNOVATION_LABELS, printed.PRIOR_COVARIANCES, strict=True)
+    labels = OPTIMIZER_LABELS | {n: f"p = {printed.LAST_P}, K₀ = {prior_text(k)}" for n, k in priors}
 
     def errors(output: str) -> Iterator[list[Cell]]:
         for label, candidate in comparisons[output].models.items():
@@ -488,7 +449,7 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
     return [
         make_table("genetic", best),
-        make_table("optimizers", {o: errors(o) for o in comparisons}, alpha=RIVAL_ALPHA),
+        make_table("optimizers", {o: errors(o) for o in comparisons}, alpha=stage_module.RIVAL_ALPHA),
         make_table("seeds", {o: errors_by_seed(o) for o in comparisons}, {"@seeds": [f"seed {s}" for s in seeds]}),
     ]
 
@@ -511,29 +472,32 @@ def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
             yield ["ours / printed", *ratios]
 
     tables = {symbol(o): reproduction.as_printed[o] for o in stage.outputs}
-    return make_table(
-        "as_printed",
-        {o: rows(o) for o in stage.outputs},
-        table=3 + stage.number,
-        settings="; ".join(
-            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms][0]})" for o, t in tables.items()
-        ),
-        scales=", ".join(f"{o} by {t.scale:.3g}" for o, t in tables.items()),
-    )
+    meanings = {o: printed.TERM_INTERPRETATIONS[t.interpretation.terms]["meaning"] for o, t in tables.items()}
+    settings = "; ".join(f"{o}: {t.interpretation} ({meanings[o]})" for o, t in tables.items())
+    scales = ", ".join(f"{o} by {t.scale:.3g}" for o, t in tables.items())
+    groups = {o: rows(o) for o in stage.outputs}
+    return make_table("as_printed", groups, table=3 + stage.number, settings=settings, scales=scales)
+
+
+def printed_runs_by_output(reproduction: Reproduction) -> dict[str, list[printed.PrintedModelRun]]:
+    """Return the simulations of the models printed in the paper, by angle."""
+    rows: dict[str, list[printed.PrintedModelRun]] = {}
+    for row in reproduction.printed_model_runs:
+        rows.setdefault(row.output, []).append(row)
+    return rows
 
 
 def printed_runs_table(reproduction: Reproduction) -> Table:
     """Return a table on simulations of the models printed in the paper: unstable poles, standard deviations, refits."""
 
-    def rows(output: str) -> Iterator[list[Cell]]:
-        for r in reproduction.ran:
-            if r.output == output:
-                back = [r.returned_coefficients.get(k, {}).get(parameter_name("a", output)) for k in PRIOR_COVARIANCES]
-                deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
-                printed_value = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
-                yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, printed_value, *back]
+    def cells(r: printed.PrintedModelRun) -> list[Cell]:
+        name = parameter_name("a", r.output)
+        refits = [r.returned_coefficients.get(k, {}).get(name) for k in printed.PRIOR_COVARIANCES]
+        deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
+        printed_value = printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"]
+        return [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, printed_value, *refits]
 
-    return make_table("printed_models", {o: rows(o) for o in dict.fromkeys(r.output for r in reproduction.ran)})
+    return make_table("printed_models", {o: map(cells, r) for o, r in printed_runs_by_output(reproduction).items()})
 
 
 def case_tables(reproduction: Reproduction) -> list[Table]:
@@ -543,16 +507,16 @@ def case_tables(reproduction: Reproduction) -> list[Table]:
     length. The second compares integer and free orders.
     """
     rows: dict[tuple[str, str, float], list[Cell]] = {}
-    for t in reproduction.panel.trials:
+    for t in reproduction.cases.trials:
         steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
         head = f"{t.arm}, {symbol(t.output)}, K₀ = {prior_text(t.prior)}"
         rows.setdefault((t.arm, t.output, t.prior), [head, *t.errors.values(), *steps, t.nr, t.manual])
     orders = (
         [f"{f.arm}, {symbol(o)}", f.integer_nr[o], f.free_nr[o], f.fractional_text]
-        for f in reproduction.panel.order_comparisons
+        for f in reproduction.cases.order_comparisons
         for o in f.free_nr
     )
-    return [make_table("trials", rows.values(), weak_prior=WEAK_PRIOR), make_table("order_comparisons", orders)]
+    return [make_table("trials", rows.values(), weak_prior=printed.WEAK_PRIOR), make_table("order_comparisons", orders)]
 
 
 def with_powers_of_ten(text: str) -> str:
@@ -563,25 +527,17 @@ def with_powers_of_ten(text: str) -> str:
 
 def joint_equations(model: Model) -> list[str]:
     """Return paragraphs with an introduction and with the equations of the model of a joint, as HTML."""
-    return [
-        page_text("equations"),
-        *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
-    ]
+    return [page_text("equations"), *equations_html(model)]
 
 
 def _verdict_section(reproduction: Reproduction) -> Section:
     """Return the section with one table row per checked claim, and with numbers and cases in a collapsed part."""
-    rows: list[list[Cell]] = [
-        [
-            with_powers_of_ten(c.claim),
-            Markup("<strong>{}</strong>").format(with_powers_of_ten(c.verdict)),
-            share_picture(c.ruling),
-            with_powers_of_ten(c.brief),
-        ]
-        for c in reproduction.checks
-    ]
-    claims = ((c.claim, c.computed, c.printed, c.rule) for c in reproduction.checks)
-    numbers = ([*map(with_powers_of_ten, texts)] for texts in claims)
+    found = reproduction.checks
+    rows: list[list[Cell]] = []
+    for check in found:
+        claim, verdict, brief = map(with_powers_of_ten, (check.claim, check.verdict, check.brief))
+        rows.append([claim, Markup("<strong>{}</strong>").format(verdict), share_picture(check.ruling), brief])
+    numbers = [[*map(with_powers_of_ten, (c.claim, c.computed, c.printed, c.rule))] for c in found]
     return make_section(
         "verdicts",
         tables=[make_table("verdicts", rows)],
@@ -601,7 +557,7 @@ def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
         "stage",
         *joint_equations(joint.model),
         values={"stage": number, "table": 3 + number, "warnings": ", warnings" if warned else ""},
-        figures=stage_figures(stage, simulated=reproduction.simulated),
+        figures=stage_figures(stage, reproduction.reference_label),
         folded_tables=tables,
     )
 
@@ -611,33 +567,25 @@ def _sections(reproduction: Reproduction) -> list[Section]:
 
     The sections on the sine run and on optimizers are omitted if there are no such results.
     """
-    simulated, stages = reproduction.simulated, list(reproduction.stages.values())
-    near = [
-        fit_chart(
-            [("printed orders", s.printed_orders.estimation)],
-            s.outputs[1],
-            page_text("printed_orders", angle=symbol(s.outputs[1]), table=3 + s.number),
-            simulated=simulated,
-        )
-        for s in stages
-    ]
-    weak = [
-        convergence_chart(t, f"{symbol(o)}: error (45), weak prior") for s in stages for o, t in s.weak_traces.items()
-    ]
-    landscapes = {s.number: s.landscape for s in stages if s.landscape is not None}
-    correlated = []
-    for n, each in landscapes.items():
-        first, second = map(symbol, each.names)
-        correlation = number(each.correlation, 3)
-        correlated.append(page_text("correlated_orders", stage=n, first=first, second=second, correlation=correlation))
-    joint = [s.candidates["output error"].model for s in stages]
-    bode = [
-        c
-        for m in joint
-        for c in bode_charts(m, response_frequencies(m, reproduction.square.step, reproduction.square.duration))
-    ]
-    sentences = [page_text("implied_deviations", ratios=deviation_text(reproduction))] if reproduction.ran else []
-    every = [
+    reference, stages = reproduction.reference_label, list(reproduction.stages.values())
+    near, weak, derived, landscapes, correlated, bode = [], [], [], [], [], []
+    for s in stages:
+        title = page_text("printed_orders", angle=symbol(s.outputs[1]), table=3 + s.number)
+        models = [("printed orders", s.printed_orders.estimation)]
+        near.append(fit_chart(models, s.outputs[1], title, reference=reference))
+        for output, traces in s.weak_traces.items():
+            weak.append(convergence_chart(traces, f"{symbol(output)}: error (45), weak prior"))
+        derived.append(derivative_chart(s.derived, reference))
+        if s.landscape is not None:
+            landscapes.append(s.landscape)
+            first, second = map(symbol, s.landscape.names)
+            words = {"first": first, "second": second, "correlation": number(s.landscape.correlation, 3)}
+            correlated.append(page_text("correlated_orders", stage=s.number, **words))
+        joint, run = s.candidates["output error"].model, reproduction.square
+        bode += bode_charts(joint, response_frequencies(joint, run.step, run.duration))
+    ran = reproduction.printed_model_runs
+    sentences = [page_text("implied_deviations", ratios=deviation_text(reproduction))] if ran else []
+    sections = [
         _verdict_section(reproduction),
         make_section(
             "printed_models",
@@ -649,17 +597,16 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         *(_stage_section(reproduction, stage) for stage in stages),
     ]
     if reproduction.sine is not None:
-        every.append(make_section("sine", figures=sine_figures(reproduction)))
-    if reproduction.rivals:
-        charts = rival_figures(reproduction)
-        every.append(make_section("optimizers", figures=charts, folded_tables=optimizer_tables(reproduction)))
-    derived = [derivative_chart(s.derived, simulated=simulated) for s in stages]
+        sections.append(make_section("sine", figures=sine_figures(reproduction)))
+    if reproduction.optimizer_comparisons:
+        tables = optimizer_tables(reproduction)
+        sections.append(make_section("optimizers", figures=rival_figures(reproduction), folded_tables=tables))
     return [
-        *every,
+        *sections,
         make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(reproduction)]),
         make_section("close_orders", figures=near),
         make_section("dropped_derivative", figures=derived),
-        make_section("landscape", *correlated, figures=[*landscapes.values()], small=True),
+        make_section("landscape", *correlated, figures=landscapes, small=True),
         make_section("frequency_response", figures=bode, small=True),
         make_section("parameters", folded_tables=parameter_tables()),
         make_section("description", figures=[flow_chart()], folded_tables=description_tables()),
@@ -672,14 +619,8 @@ def _runs_section(reproduction: Reproduction) -> Section:
     for run in reproduction.runs:
         currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
         rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
-    values = {
-        "m": next(iter(reproduction.stages.values())).candidates["p = 7"].estimation.m,
-        "increment": reproduction.order_grid.increment,
-        "alpha": reproduction.order_grid.alpha,
-        "trace_every": TRACE_EVERY,
-        "coarse_increment": COARSE_INCREMENT,
-        "refined_candidates": REFINED_CANDIDATES,
-    }
+    m = next(iter(reproduction.stages.values())).candidates[f"p = {printed.LAST_P}"].estimation.m
+    values = {"m": m, "order_grid": reproduction.order_grid, "settings": stage_module}
     return make_section("runs", *reproduction.notes, values=values, tables=[make_table("runs", rows)])
 
 
@@ -691,7 +632,7 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
     check_free(path, force=force)
     names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
     origin = page_text("simulated_origin") if reproduction.simulated else f"the runs {names},"
-    strongest = page_text("strongest", brief=reproduction.checks[0].brief) if reproduction.ran else ""
+    strongest = page_text("strongest", brief=reproduction.checks[0].brief) if reproduction.printed_model_runs else ""
     lead = page_text("lead", origin=origin, strongest=with_powers_of_ten(strongest))
     return write_page(path, title="The paper reproduced", sections=_sections(reproduction), lead=lead, force=force)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,24 +15,15 @@ from typing import Any
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
+from ftlm.model.model import Model
 from ftlm.order_search.options import OrderGrid
 from ftlm.progress import format_time_left
+from ftlm.reproduction import stage as computation
 from ftlm.reproduction.checks import Check, checks
 from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, page_text, run_printed_models
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
-from ftlm.reproduction.stage import (
-    GRID_ALPHA,
-    TRACE_EVERY,
-    Panel,
-    Preset,
-    Rival,
-    Stage,
-    StageWork,
-    panel_of,
-    published_structure,
-    simulated_panel,
-)
+from ftlm.reproduction.stage import Cases, OptimizerComparison, Preset, Stage, StageWork
 from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of_all
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
@@ -66,9 +57,9 @@ class Reproduction:
         Order grid of the searches.
     notes
         Texts on omitted or modified results, with reasons.
-    panel
+    cases
         Cases on which verdicts are based, for all arms and records and both prior covariances.
-    ran
+    printed_model_runs
         Simulations of the models printed in the paper, under the paper's current.
     as_printed
         Tables 4 and 5 of the paper, recomputed by its method, by angle.
@@ -80,8 +71,8 @@ class Reproduction:
     stages: dict[int, Stage]
     order_grid: OrderGrid
     notes: tuple[str, ...] = ()
-    panel: Panel = field(default_factory=Panel)
-    ran: tuple[PrintedModelRun, ...] = ()
+    cases: Cases = field(default_factory=Cases)
+    printed_model_runs: tuple[PrintedModelRun, ...] = ()
     as_printed: dict[str, AsPrinted] = field(default_factory=dict)
 
     @property
@@ -95,6 +86,11 @@ class Reproduction:
         return {n: truth_of(n) for n in self.stages} if self.simulated else {}
 
     @property
+    def reference_label(self) -> str:
+        """Label of the runs in charts: the simulated arm or the measurement."""
+        return "simulated arm" if self.simulated else "measured"
+
+    @property
     def runs(self) -> list[Run]:
         """Estimation run (square current), and validation run (sine current) if there is one."""
         return [self.square] if self.sine is None else [self.square, self.sine]
@@ -105,9 +101,9 @@ class Reproduction:
         return [(stage, output) for stage in self.stages.values() for output in stage.outputs]
 
     @property
-    def rivals(self) -> dict[str, Rival]:
+    def optimizer_comparisons(self) -> dict[str, OptimizerComparison]:
         """Optimizer comparisons of all joints, by output."""
-        return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
+        return {o: each for stage in self.stages.values() for o, each in stage.optimizer_comparisons.items()}
 
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the reproduction as one HTML file, and return its path.
@@ -149,11 +145,11 @@ class Reproduction:
         DataError
             If a file exists and `force` is False, or the folder cannot be written.
         """
-        where = Path(folder)
-        models = {
-            f"stage{n}-{slug(label)}.json": c.model for n, s in self.stages.items() for label, c in s.candidates.items()
-        }
-        models |= {f"{o}-{slug(label)}.json": c.model for o, r in self.rivals.items() for label, c in r.models.items()}
+        where, models = Path(folder), dict[str, Model]()
+        for number, stage in self.stages.items():
+            models |= {f"stage{number}-{slug(label)}.json": c.model for label, c in stage.candidates.items()}
+        for output, comparison in self.optimizer_comparisons.items():
+            models |= {f"{output}-{slug(label)}.json": c.model for label, c in comparison.models.items()}
         check_folder(where, [*ALWAYS_SAVED, *models], force=force)
         runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
         for name, run in runs.items():
@@ -171,7 +167,11 @@ class Reproduction:
             "simulated": self.simulated,
             "order_grid": attributes(self.order_grid, ("increment", "alpha")),
             "as it should be": json_value(self.stages),
-        } | attributes(self, ("checks", "as_printed", "ran", "panel", "notes"))
+            **attributes(self, ("checks", "as_printed")),
+            "ran": json_value(self.printed_model_runs),
+            "panel": json_value(self.cases),
+            "notes": json_value(self.notes),
+        }
 
 
 def slug(label: str) -> str:
@@ -247,9 +247,9 @@ def reproduce(
             "genetic: the order grid and the norm are those of the comparison; leave order_grid and norm out"
         )
     simulated = square is None
-    others, lattice = _other_arms(arms, records), OrderGrid(increment=increment, alpha=GRID_ALPHA)
+    others, grid = _other_arms(arms, records), OrderGrid(increment=increment, alpha=computation.GRID_ALPHA)
     for each in (increment, real_number("rivals_increment", rivals_increment)):
-        OrderGrid(increment=each, alpha=GRID_ALPHA).values(published_structure(1))
+        replace(grid, increment=each).values(computation.published_structure(1))
     if square is None and sine is not None:
         raise ModelError("a sine run is given without a square run; give both, or neither")
     omitted = []
@@ -260,6 +260,7 @@ def reproduce(
         omitted.append(page_text("rivals_omitted", reason=error))
         log(omitted[0])
     compared_increment = None if omitted else rivals_increment
+    preset = Preset(grid, rivals_increment=compared_increment, genetic=genetic, threads=threads)
     if square is None:
         log("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
@@ -268,53 +269,49 @@ def reproduce(
     seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=compared_increment)
     expected = estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))
     log(f"this takes {format_time_left(expected).removesuffix(' left')}")
-    preset = Preset(lattice, None, TRACE_EVERY, compared_increment)
-    seeds = [seed + k for k in range(records)]
-    run, other = square, sine
+    seeds, runs = [seed + k for k in range(records)], (square, sine)
 
     def compute_stage(number: StageNumber, steps: WorkerProgress) -> StageOutcome:
-        work = StageWork(number, run, other, preset, threads, log, steps, simulated=simulated)
-        stage = work.compute_stage(genetic)
+        work = StageWork(number, *runs, preset, log, steps, simulated)
+        stage = work.compute_stage()
         work.begin("the paper's printed models under its own current", "printed")
         rows = run_printed_models(number, threads)
         work.begin("verdicts, both ends of K0", "trials")
-        panel = panel_of(stage, run, MAIN_ARM if simulated else MEASURED_LABEL, seed, threads)
-        return StageOutcome(panel, stage, rows, as_printed(stage.outputs), work.notes)
+        arm = MAIN_ARM if simulated else MEASURED_LABEL
+        cases = computation.cases_of(stage, runs[0], arm, seed, threads)
+        return StageOutcome(cases, {number: stage}, tuple(rows), as_printed(stage.outputs), tuple(work.notes))
 
-    def compute_panel(arm: str, number: StageNumber, steps: WorkerProgress) -> StageOutcome:
+    def compute_cases(arm: str, number: StageNumber, steps: WorkerProgress) -> StageOutcome:
         log(f"verdicts: the arm “{arm}”, stage {number}")
         own = seeds[1:] if arm == MAIN_ARM else seeds
-        return StageOutcome(simulated_panel(number, arm, own, noise, preset, threads, genetic, steps))
+        return StageOutcome(computation.simulated_cases(number, arm, own, noise, preset, steps))
 
     jobs: list[Job] = [partial(compute_stage, n) for n in numbers]
-    jobs += [partial(compute_panel, a, n) for a in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
-    ended = run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress)
-    return Reproduction(
-        square,
-        sine,
-        simulated,
-        {m.stage.number: m.stage for m in ended if m.stage is not None},
-        lattice,
-        tuple(dict.fromkeys([*omitted, *(note for m in ended for note in m.notes)])),
-        Panel.union([m.panel for m in ended]),
-        tuple(row for m in ended for row in m.rows),
-        {output: part for m in ended for output, part in m.printed.items()},
-    )
+    jobs += [partial(compute_cases, a, n) for a in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
+    whole = StageOutcome(notes=tuple(omitted))
+    for outcome in run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress):
+        whole += outcome
+    notes = tuple(dict.fromkeys(whole.notes))
+    return Reproduction(square, sine, simulated, whole.stages, grid, notes, whole.cases, whole.rows, whole.printed)
 
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """Result of one job: cases for verdicts on one arm and joint.
+    """Result of one job, or the sum of several: cases for verdicts on one arm and joint.
 
     For the main arm or measured runs, it also has all results of the joint, simulations of the printed models,
     recomputed tables by angle, and notes. For other arms, it has only the cases.
     """
 
-    panel: Panel
-    stage: Stage | None = None
-    rows: Sequence[PrintedModelRun] = ()
-    printed: Mapping[str, AsPrinted] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    cases: Cases = field(default_factory=Cases)
+    stages: dict[int, Stage] = field(default_factory=dict)
+    rows: tuple[PrintedModelRun, ...] = ()
+    printed: dict[str, AsPrinted] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __add__(self, other: StageOutcome) -> StageOutcome:
+        stages, printed = {**self.stages, **other.stages}, {**self.printed, **other.printed}
+        return StageOutcome(self.cases + other.cases, stages, self.rows + other.rows, printed, self.notes + other.notes)
 
 
 #: Job of a worker thread, a function of the progress to which it reports.

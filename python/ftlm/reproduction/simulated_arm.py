@@ -17,47 +17,41 @@ from ftlm.utils.parameters import setting
 
 StageNumber = Literal[1, 2]
 STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
+#: Angles of the arm, in the order of the paper's indices n = 1 … 4.
+ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 #: Amplitudes [A] of the paper's motor currents, by shape of the signal.
 CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
 #: Parameters of the demonstration's arm: the manufacturer's effective coefficients, fractional damping, no friction.
 DEMO_PARAMETERS = ArmParameters.of("linear")
+#: Parameters of the manufacturer's arm, with fractional damping and friction.
+EFFECTIVE_PARAMETERS = PARAMETER_SETS["effective"]
 #: Default seed of the noise on the angles.
 DEFAULT_SEED = 1
 
 
-def _with_integer_orders(stage: StageParameters, *, friction: bool) -> StageParameters:
-    """Return the parameters of a joint with the manufacturer's integer orders, with or without its Coulomb friction."""
-    return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
-
-
 def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
-    effective = PARAMETER_SETS["effective"]
-    # In the manufacturer's parameters, link 1 has no damping.
-    first = replace(_with_integer_orders(effective.stage1, friction=friction), d=0.0)
-    return replace(
-        DEMO_PARAMETERS,
-        stage1=first,
-        stage2=_with_integer_orders(effective.stage2, friction=friction),
-        coupling=coupling,
-        name="whole orders",
+    """Return the arm with the manufacturer's integer orders, with or without its Coulomb friction."""
+    stage1, stage2 = (
+        replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
+        for stage in (EFFECTIVE_PARAMETERS.stage1, EFFECTIVE_PARAMETERS.stage2)
     )
+    # In the manufacturer's parameters, link 1 has no damping.
+    stage1 = replace(stage1, d=0.0)
+    return replace(DEMO_PARAMETERS, stage1=stage1, stage2=stage2, coupling=coupling, name="whole orders")
 
 
+#: Key of the demonstration's arm in `ARM_VARIANTS`.
+MAIN_ARM = "fractional"
 #: Simulated arms on which claims of the paper are tested: the arm of the demonstration, one with Coulomb friction and
 #: coupled joints, and both with integer orders. Strain gauges are exact, and the noise is equal on all angles.
 ARM_VARIANTS: dict[str, ArmParameters] = {
-    "fractional": DEMO_PARAMETERS,
+    MAIN_ARM: DEMO_PARAMETERS,
     "fractional, friction": replace(
-        DEMO_PARAMETERS,
-        stage1=PARAMETER_SETS["effective"].stage1,
-        stage2=PARAMETER_SETS["effective"].stage2,
-        coupling=1.0,
+        DEMO_PARAMETERS, stage1=EFFECTIVE_PARAMETERS.stage1, stage2=EFFECTIVE_PARAMETERS.stage2, coupling=1.0
     ),
     "whole orders": _integer_order_arm(friction=False, coupling=0.0),
     "whole orders, friction": _integer_order_arm(friction=True, coupling=1.0),
 }
-#: Key of the demonstration's arm in `ARM_VARIANTS`.
-MAIN_ARM = "fractional"
 #: Assumed parameters of the paper's arm: integer orders, friction, and uncoupled joints as in its equations.
 PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 
@@ -83,16 +77,19 @@ def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
     Model
         Model from the motor current to both angles of the joint.
     """
-    arm = parameters_of(stage)
-    orders = {n: v for n, v in arm.orders(stage).items() if form == "published" or n != f"alpha{2 * stage}"}
-    return link_model(
-        stage=1 if stage == 1 else 2, form=form, orders=orders, coefficients=arm.coefficients(stage, form)
-    )
+    arm, number = parameters_of(stage), STAGE_NUMBERS[0 if stage == 1 else 1]
+    orders = arm.orders(stage) if form == "published" else free_orders(stage)
+    return link_model(stage=number, form=form, orders=orders, coefficients=arm.coefficients(stage, form))
 
 
 def parameters_of(stage: int) -> StageParameters:
     """Return the parameters of joint 1 or 2 (stage) of the demonstration's arm."""
     return DEMO_PARAMETERS.stage1 if stage == 1 else DEMO_PARAMETERS.stage2
+
+
+def free_orders(stage: int) -> dict[str, float]:
+    """Return the free orders of one joint of the demonstration's arm; that of the deflection's equation is fixed."""
+    return {n: v for n, v in parameters_of(stage).orders(stage).items() if n != f"alpha{2 * stage}"}
 
 
 def truth_of(stage: int) -> dict[str, float]:
@@ -101,9 +98,8 @@ def truth_of(stage: int) -> dict[str, float]:
     The highest order of the deflection is not among them, because it is fixed at 2.
     """
     arm = parameters_of(stage)
-    orders = {n: v for n, v in arm.orders(stage).items() if n != f"alpha{2 * stage}"}
     hub = {f"{c}{2 * stage - 1}": float(getattr(arm, c)) for c in "abdg"}
-    return orders | hub | {f"j{stage}": arm.r - 1.0}
+    return free_orders(stage) | hub | {f"j{stage}": arm.r - 1.0}
 
 
 def demo_run(
@@ -148,22 +144,16 @@ def demo_run(
         raise ModelError(f"{setting('noise')} {noise} rad is not a standard deviation; give a number of at least 0")
     if shape not in CURRENT_AMPLITUDES_A:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
+    amplitude, rate = CURRENT_AMPLITUDES_A[shape], 1.0 / step
     recorded = record(
-        input=shape,
-        amplitude=CURRENT_AMPLITUDES_A[shape],
-        duration=duration,
-        limit=duration,
-        rate=1.0 / step,
-        seed=seed,
-        parameters=parameters,
+        input=shape, amplitude=amplitude, duration=duration, limit=duration, rate=rate, seed=seed, parameters=parameters
     )
     rng = np.random.default_rng([seed, list(CURRENT_AMPLITUDES_A).index(shape)])
-    angles = [f"theta{stage}{k}" for stage in (1, 2) for k in (1, 2)]
     return Run.from_arrays(
         step=step,
         inputs={name: recorded[name] for name in ("I1", "I2")},
-        outputs={name: recorded[name] + noise * rng.standard_normal(recorded.length) for name in angles},
-        units={"I1": "A", "I2": "A"} | dict.fromkeys(angles, "rad"),
+        outputs={name: recorded[name] + noise * rng.standard_normal(recorded.length) for name in ANGLE_NAMES},
+        units={"I1": "A", "I2": "A"} | dict.fromkeys(ANGLE_NAMES, "rad"),
         name=shape,
     )
 
@@ -183,7 +173,7 @@ def decimate_run(run: Run, every: int) -> Run:
         step=run.step * every,
         inputs={n: data[n] for n in run.inputs},
         outputs={n: data[n] for n in run.outputs},
-        units=dict(run.units),
-        intersample=dict(run.intersample),
+        units=run.units,
+        intersample=run.intersample,
         name=run.name,
     )

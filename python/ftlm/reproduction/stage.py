@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from ftlm.arm.flexible_link import Law, flexible_link, integer_order, link_model, order_law
+from ftlm.arm.flexible_link import flexible_link, integer_order, link_model, order_law
 from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.estimators import estimate_output_error
+from ftlm.estimation.fit import ProgressCallback
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import assess_fit, identify
@@ -31,22 +34,14 @@ from ftlm.order_search.options import OrderGrid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
-from ftlm.reproduction.published_values import (
-    INNOVATION_LENGTHS,
-    PRIOR_COVARIANCES,
-    SEARCH_OPTIONS,
-    WEAK_PRIOR,
-    best_orders,
-    last_orders,
-    neighboring_values,
-    page_text,
-)
+from ftlm.reproduction import published_values as printed
+from ftlm.reproduction.published_values import FIRST_P, INNOVATION_LENGTHS, LAST_P, PRIOR_COVARIANCES, page_text
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of, seeds_for
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Initial, Structure
 from ftlm.svg.charts import Landscape
 from ftlm.utils.formatting import attributes, json_value, symbol
 from ftlm.utils.validation import Floats, check_threads
@@ -80,12 +75,13 @@ COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
 INTEGER_FIT_SAMPLES = 1250
 
 
-def published_structure(stage: StageNumber, **changes: Any) -> Structure:
-    """Return the structure of a joint by eqs. (22)-(25) of the paper, uncoupled and from rest; `changes` set fields."""
-    structure = flexible_link(
-        stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
-    )
-    return replace(structure, **{"initial": "rest", **changes})
+#: Convergence of multi-innovation, by output and innovation length p.
+Traces = dict[str, dict[int, MultiInnovationTrace]]
+
+
+def published_structure(stage: StageNumber) -> Structure:
+    """Return the structure of a joint by eqs. (22)-(25) of the paper, uncoupled and from rest."""
+    return replace(flexible_link(stage=stage, form="published", coupling="measured", laws=()), initial="rest")
 
 
 def integer_orders(structure: Structure) -> Structure:
@@ -104,8 +100,6 @@ class Candidate:
 
     Parameters
     ----------
-    label
-        Label in tables, such as "p = 7" for multi-innovation with innovation length 7.
     model
         Model of both angles of the joint, or of one of them.
     estimation, validation
@@ -117,7 +111,6 @@ class Candidate:
         Identification of the model; None for a model that was not identified.
     """
 
-    label: str
     model: Model
     estimation: Comparison
     validation: Comparison | None
@@ -141,7 +134,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Rival:
+class OptimizerComparison:
     """Comparison of multi-innovation, genetic algorithm and differential evolution on one equation.
 
     Parameters
@@ -215,7 +208,7 @@ class Stage:
         Convergence of the multi-innovation recursion by output and innovation length p. `traces` have K0 = 1 and the
         best orders of each p. `weak_traces` have a weak prior and the orders of p = 7. Empty for a run that does not
         start at rest.
-    rivals
+    optimizer_comparisons
         Optimizer comparisons by output; empty without PyGAD or SciPy, or for a run that does not start at rest.
     printed_orders
         Model with the orders printed in the paper and least-squares coefficients on the estimation run.
@@ -228,9 +221,9 @@ class Stage:
 
     number: StageNumber
     candidates: dict[str, Candidate]
-    traces: dict[str, dict[int, MultiInnovationTrace]]
-    weak_traces: dict[str, dict[int, MultiInnovationTrace]]
-    rivals: dict[str, Rival]
+    traces: Traces
+    weak_traces: Traces
+    optimizer_comparisons: dict[str, OptimizerComparison]
     printed_orders: Candidate
     derived: DroppedDerivative
     landscape: Landscape | None
@@ -250,15 +243,9 @@ class Stage:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results of the joint as a dictionary for JSON."""
-        return {
-            "models": json_value(self.candidates),
-            "derived input order": attributes(self.derived, ("output", "order", "correlations")),
-        } | attributes(self, ("printed_orders", "weak", "rivals"))
-
-
-def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
-    """Return the order grid of the optimizer comparison, whose increment is at least `smallest`."""
-    return OrderGrid(increment=max(increment, smallest), alpha=RIVAL_ALPHA)
+        derived = attributes(self.derived, ("output", "order", "correlations"))
+        parts = {"models": json_value(self.candidates), "derived input order": derived}
+        return parts | attributes(self, ("printed_orders", "weak")) | {"rivals": json_value(self.optimizer_comparisons)}
 
 
 def compare_optimizers(
@@ -269,7 +256,7 @@ def compare_optimizers(
     *,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Rival:
+) -> OptimizerComparison:
     """Compare multi-innovation with a genetic algorithm and differential evolution.
 
     The models are not computed, so the field `models` of the result is empty.
@@ -295,21 +282,19 @@ def compare_optimizers(
         If PyGAD or SciPy is not installed, or the run does not start at rest.
     """
     # Reference values of a structure would influence the bounds of the optimizers.
-    without_reference = replace(single, reference={})
+    single = replace(single, reference={})
     work: dict[str, Any] = {"threads": threads, "progress": progress}
-    searches = {
-        k: best_orders(run, without_reference, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES
-    }
+    searches = {k: printed.best_orders(run, single, order_grid, LAST_P, k, **work) for k in PRIOR_COVARIANCES}
     count = searches[PRIOR_COVARIANCES[0]].candidates
     settings = optimizer or GeneticAlgorithm(seeds=seeds_for(count))
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
-    records = prepare([run], without_reference, None, power_of_two=True)
+    records = prepare([run], single, None, power_of_two=True)
     optimizers = {
-        "genetic": genetic_search(records, without_reference, settings, **work),
-        "differential evolution": differential_evolution_search(records, without_reference, settings, **work),
+        "genetic": genetic_search(records, single, settings, **work),
+        "differential evolution": differential_evolution_search(records, single, settings, **work),
     }
-    return Rival(count, order_grid.increment, settings.population, searches, optimizers)
+    return OptimizerComparison(count, order_grid.increment, settings.population, searches, optimizers)
 
 
 @dataclass(frozen=True)
@@ -366,12 +351,11 @@ class OptimizerErrors:
     optimizers: dict[str, dict[int, float]]
 
     @classmethod
-    def of(cls, arm: str, output: str, result: Rival) -> OptimizerErrors:
+    def of(cls, arm: str, output: str, result: OptimizerComparison) -> OptimizerErrors:
         """Return the errors of an optimizer comparison on one angle (`output`) of an arm."""
         grid = {k: search.score for k, search in result.order_grid.items()}
-        return cls(
-            arm, output, result.candidates, result.increment, grid, {n: r.errors for n, r in result.optimizers.items()}
-        )
+        errors = {name: run.errors for name, run in result.optimizers.items()}
+        return cls(arm, output, result.candidates, result.increment, grid, errors)
 
 
 @dataclass(frozen=True)
@@ -404,11 +388,11 @@ class OrderComparison:
     @classmethod
     def of(cls, arm: str, stage: int, integer: Candidate, free: Candidate) -> OrderComparison:
         """Return the comparison of two models; raise ModelError if the model with free orders was not identified."""
+        if free.result is None:
+            raise ModelError("the model with free orders was not identified; its orders have no intervals")
         before, after = ({} if c.validation is None else c.validation.fit for c in (integer, free))
         gains = {o: after[o] - before[o] for o in after if math.isfinite(after[o] - before[o])}
         nr, free_nr = ({o: f.nr for o, f in c.estimation.output_error.items()} for c in (integer, free))
-        if free.result is None:
-            raise ModelError(f"model {free.label} was not identified; its orders have no intervals")
         orders = {n: (v, *free.result.intervals[n]) for n, v in free.result.orders.items()}
         return cls(arm, stage, nr, free_nr, orders, gains, not are_usable(integer, free))
 
@@ -436,17 +420,15 @@ class OrderComparison:
 
 
 @dataclass(frozen=True)
-class Panel:
+class Cases:
     """All cases on which verdicts on claims are based: multi-innovation, other optimizers, integer and free orders."""
 
     trials: tuple[Trial, ...] = ()
     contests: tuple[OptimizerErrors, ...] = ()
     order_comparisons: tuple[OrderComparison, ...] = ()
 
-    @classmethod
-    def union(cls, parts: Sequence[Panel]) -> Panel:
-        """Return a panel with all cases of the given panels, in sequence."""
-        return cls(*(tuple(c for part in parts for c in getattr(part, each.name)) for each in fields(cls)))
+    def __add__(self, other: Cases) -> Cases:
+        return Cases(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
 
 
 def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
@@ -482,13 +464,13 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
     for output in structure.outputs:
         single, manual_nr = structure.equation(output), metrics(pulse_means(run[output], m), manual[output]).nr
         for prior in PRIOR_COVARIANCES:
-            best = {p: best_orders(run, single, grid, p, prior, threads=threads) for p in INNOVATION_LENGTHS}
-            last = best[INNOVATION_LENGTHS[-1]].model
+            best = {p: printed.best_orders(run, single, grid, p, prior, threads=threads) for p in INNOVATION_LENGTHS}
+            last = best[LAST_P].model
             traces = traces_of(run, single, dict.fromkeys(INNOVATION_LENGTHS, last), prior, TRACE_EVERY)
-            end = float(traces[INNOVATION_LENGTHS[0]].error[-1])
+            end = float(traces[FIRST_P].error[-1])
             steps = {p: convergence_step(t, end) for p, t in traces.items()}
             nr = compare_means(last, run).output_error[output].nr
-            errors = {p: s.score for p, s in best.items()}
+            errors = {p: search.score for p, search in best.items()}
             trials.append(Trial(arm, seed, output, prior, errors, steps, nr, manual_nr))
     return trials
 
@@ -500,22 +482,16 @@ def traces_of(
 
     `prior` is the prior covariance, and `every` the number of recursion steps between two stored values.
     """
+    options: dict[str, Any] = {"prior_covariance": prior, "row_basis": "haar", "every": every}
     traces = {}
     for p, model in models.items():
         structure = single.with_orders({n: model.orders[n] for n in single.order_names})
-        options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, "row_basis": "haar"}
-        traces[p] = multi_innovation_trace(run, structure, every=every, **options)
+        traces[p] = multi_innovation_trace(run, structure, innovation_length=p, **options)
     return traces
 
 
 def compare_orders(
-    stage: StageNumber,
-    square: Run,
-    arm: str,
-    threads: int | None,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    validation: Run,
+    stage: StageNumber, square: Run, arm: str, *, validation: Run, threads: int | None, progress: ProgressCallback
 ) -> OrderComparison:
     """Fit a joint of a simulated arm with integer and with free orders, and compare both fits on a validation run.
 
@@ -529,134 +505,120 @@ def compare_orders(
     structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
     own, other = (run.select(list(structure.signals)) for run in (square, validation))
     run = decimate_run(own, ROW_STRIDE)
-    # Coefficients of fits with integer orders may overflow on an arm with fractional orders.
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        fits = [
-            identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
-            for item in (integer_orders(structure), structure)
-        ]
     m, candidates = default_m([own], power_of_two=True), []
-    for fit in fits:
+    for item in (integer_orders(structure), structure):
+        # Coefficients of fits with integer orders may overflow on an arm with fractional orders.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            fit = identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
         model = replace(fit.model, m=m)
-        candidates.append(Candidate("", model, compare_means(model, own), compare_means(model, other), {}, fit))
+        candidates.append(Candidate(model, compare_means(model, own), compare_means(model, other), {}, fit))
     return OrderComparison.of(arm, stage, *candidates)
 
 
-def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
+def cases_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Cases:
     """Return the cases for verdicts from the results of one joint; trials are omitted for a run not from rest."""
-    freed = OrderComparison.of(
-        arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
-    )
+    models = stage.candidates["integer, identified"], stage.candidates["output error"]
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
-    return Panel(tuple(trials), tuple(OptimizerErrors.of(arm, o, r) for o, r in stage.rivals.items()), (freed,))
+    contests = (OptimizerErrors.of(arm, o, comparison) for o, comparison in stage.optimizer_comparisons.items())
+    return Cases(tuple(trials), tuple(contests), (OrderComparison.of(arm, stage.number, *models),))
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings in which the full reproduction and the short demonstration differ."""
+    """Settings of all steps, with those in which the full reproduction and the short demonstration differ."""
 
     order_grid: OrderGrid
-    top: int | None  # rows of each order search, followed by an identification's statistics; None for a search alone
-    trace_every: int  # recursion steps between two points of a convergence curve
-    # Increment of the order grid of the optimizer comparison; None for no comparison.
-    rivals_increment: float | None = CONTEST_STEP
+    top: int | None = None  # rows of each order search, followed by an identification; None for a search alone
+    trace_every: int = TRACE_EVERY  # recursion steps between two points of a convergence curve
+    rivals_increment: float | None = CONTEST_STEP  # minimum increment of the optimizer comparison; None for none
+    genetic: GeneticAlgorithm | None = None  # settings of the optimizer comparison; None for default settings
+    threads: int | None = None
+
+    @property
+    def rivals_order_grid(self) -> OrderGrid | None:
+        """Order grid of the optimizer comparison; None without one."""
+        if self.rivals_increment is None:
+            return None
+        return OrderGrid(increment=max(self.order_grid.increment, self.rivals_increment), alpha=RIVAL_ALPHA)
 
     def seconds_of(self, step: str) -> float:
         """Return the expected processor time [s] of the step with this name, at the order increments of this preset."""
         return seconds_of(step, self.order_grid.increment, self.rivals_increment)
 
 
-def simulated_panel(
-    stage: StageNumber,
-    arm: str,
-    seeds: Sequence[int],
-    noise: float,
-    preset: Preset,
-    threads: int | None,
-    genetic: GeneticAlgorithm | None = None,
-    steps: WorkerProgress | None = None,
-) -> Panel:
+def simulated_cases(
+    stage: StageNumber, arm: str, seeds: Sequence[int], noise: float, preset: Preset, progress: WorkerProgress
+) -> Cases:
     """Return the cases for verdicts on one joint of one simulated arm, from one record per seed of the noise.
 
     Comparisons of optimizers and of orders use only the first record. They are omitted for the main arm, because
-    :func:`panel_of` returns them.
+    :func:`cases_of` returns them.
     """
-    trials: list[Trial] = []
-    contests: list[OptimizerErrors] = []
-    freed: list[OrderComparison] = []
-
-    def begin(step: str) -> None:
-        if steps is not None:
-            steps.begin(preset.seconds_of(step))
-
+    cases, structure = Cases(), published_structure(stage)
+    work: dict[str, Any] = {"threads": preset.threads, "progress": progress}
     for seed in seeds:
-        run, validation = (
-            demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine")
-        )
-        begin("trials")
-        trials += trials_of(stage, run, arm, seed, threads)
+        recording = partial(demo_run, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
+        run, validation = recording("square"), recording("sine")
+        progress.begin(preset.seconds_of("trials"))
+        cases += Cases(tuple(trials_of(stage, run, arm, seed, preset.threads)))
         if arm == MAIN_ARM or seed != seeds[0]:
             continue
-        structure = published_structure(stage)
-        own = run.select(list(structure.signals))
-        if preset.rivals_increment is not None:
-            grid = rivals_order_grid(preset.order_grid.increment, preset.rivals_increment)
+        own, grid = run.select(list(structure.signals)), preset.rivals_order_grid
+        if grid is not None:
             for output in structure.outputs:
-                begin("rivals")
-                single = structure.equation(output)
-                comparison = compare_optimizers(own, single, grid, genetic, threads=threads, progress=steps)
-                contests.append(OptimizerErrors.of(arm, output, comparison))
-        begin("freed")
-        freed.append(compare_orders(stage, run, arm, threads, steps, validation=validation))
-    return Panel(tuple(trials), tuple(contests), tuple(freed))
+                progress.begin(preset.seconds_of("rivals"))
+                comparison = compare_optimizers(own, structure.equation(output), grid, preset.genetic, **work)
+                cases += Cases(contests=(OptimizerErrors.of(arm, output, comparison),))
+        progress.begin(preset.seconds_of("freed"))
+        cases += Cases(order_comparisons=(compare_orders(stage, run, arm, validation=validation, **work),))
+    return cases
 
 
 @dataclass
 class StageWork:
     """Computation of all results of one joint (stage) of the arm.
 
-    `square` is the estimation run and `sine` the validation run, or None. `log` is called with a line of text at each
-    step. `notes` collect texts on omitted or modified results.
+    `square` and `sine` are the runs of both joints for estimation and for validation; the latter may be None. `log` is
+    called with a line of text at each step. If `simulated`, the runs are simulated from rest, so that initial
+    conditions are known. `notes` collect texts on omitted or modified results.
     """
 
     number: StageNumber
     square: Run
     sine: Run | None
     preset: Preset
-    threads: int | None
     log: Callable[[str], None]
-    progress: Callable[[int, int], None] | None
-    notes: list[str] = field(default_factory=list)
-    # Whether the runs are simulated from rest, so that initial conditions are known.
+    progress: WorkerProgress
     simulated: bool = False
+    notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        measured, link = published_structure(self.number), partial(flexible_link, stage=self.number)
+        own = list(measured.signals)
+        self.estimation_run = self.square.select(own)
+        self.validation_run = None if self.sine is None else self.sine.select(own)
+        moving = not self.simulated and not starts_at_rest(self.estimation_run, measured)
+        # With the ten powers of t of other initial terms, the few terms of an equation would be nearly dependent.
+        initial: Initial = "rest" if self.simulated else "caputo" if moving else "auto"
         # Structures: uncoupled equations of the paper, the same under the paper's laws, and the simulated arm.
-        self.measured = published_structure(self.number)
-        laws: tuple[Law, ...] = ("orders", "coefficients")
-        self.published = flexible_link(stage=self.number, form="published", coupling="simulated", laws=laws)
-        self.coupled = flexible_link(stage=self.number, form="lagrange", coupling="simulated", laws=laws)
-        own = list(self.measured.signals)
-        self.on = self.square.select(own)
-        self.off = None if self.sine is None else self.sine.select(own)
-        if self.simulated:
-            self.published, self.coupled = (replace(s, initial="rest") for s in (self.published, self.coupled))
-        elif not starts_at_rest(self.on, self.measured):
-            # With the ten powers of t of other initial terms, the few terms of an equation would be nearly dependent.
-            self.measured, self.published, self.coupled = (
-                replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
-            )
+        self.measured = replace(measured, initial="caputo") if moving else measured
+        self.published = replace(link(form="published", coupling="simulated"), initial=initial)
+        self.coupled = replace(link(form="lagrange", coupling="simulated"), initial=initial)
 
     def begin(self, words: str, step: str) -> None:
         """Log the description `words` of the next step, and pass its expected processor time to `progress`."""
         self.log(f"stage {self.number}: {words}")
-        if isinstance(self.progress, WorkerProgress):
-            self.progress.begin(self.preset.seconds_of(step))
+        self.progress.begin(self.preset.seconds_of(step))
 
-    def compute_stage(self, genetic: GeneticAlgorithm | None) -> Stage:
-        """Compute all results of the paper's section 5 for the joint; `genetic` is None for default settings."""
-        exact = self.manual("integer, exact")
-        candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
+    @property
+    def work(self) -> dict[str, Any]:
+        """Number of threads and progress callback, as arguments of searches and fits."""
+        return {"threads": self.preset.threads, "progress": self.progress}
+
+    def compute_stage(self) -> Stage:
+        """Compute all results of the paper's section 5 for the joint."""
+        exact = self.manual()
+        candidates = {"integer, Euler": self.euler_candidate(exact), "integer, exact": exact}
         whole = integer_orders(self.coupled)
         candidates["integer, identified"] = self.best("integer, identified", whole, "whole orders", "whole orders")
         candidates |= self.searches()
@@ -665,78 +627,74 @@ class StageWork:
         label = "published, output error"
         candidates[label] = self.best(label, self.published, "free orders, (22)–(25)", "published", joint.model)
         self.begin("convergence", "traces")
-        traces: dict[str, dict[int, MultiInnovationTrace]] = {}
-        weak: dict[str, dict[int, MultiInnovationTrace]] = {}
+        traces, weak_traces = Traces(), Traces()
         if self.measured.initial == "rest":
             models = {p: candidates[f"p = {p}"].model for p in INNOVATION_LENGTHS}
             traces = self.traces(models)
-            weak = self.traces(dict.fromkeys(models, models[INNOVATION_LENGTHS[-1]]), WEAK_PRIOR)
+            weak_traces = self.traces(dict.fromkeys(models, models[LAST_P]), printed.WEAK_PRIOR)
         else:
-            self.notes.append(page_text("moving_start", run=self.on.name))
-        rivals = self.rivals(genetic)
+            self.notes.append(page_text("moving_start", run=self.estimation_run.name))
+        comparisons = self.compare_optimizers()
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
         landscape = None
         if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
-        return Stage(self.number, candidates, traces, weak, rivals, self.printed_orders(), derived, landscape)
+        near = self.printed_orders()
+        return Stage(self.number, candidates, traces, weak_traces, comparisons, near, derived, landscape)
 
-    def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
+    def candidate(self, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with its errors on both runs; a coupled model is also simulated from the currents alone."""
         # The error of the paper is a sum over its block pulses, so its value depends on their number.
-        model = replace(model, m=default_m([self.on], power_of_two=True))
-        runs = [run for run in (self.on, self.off) if run is not None]
-        on, *off = (compare_means(model, run) for run in runs)
+        model = replace(model, m=default_m([self.estimation_run], power_of_two=True))
+        runs = [run for run in (self.estimation_run, self.validation_run) if run is not None]
+        estimation, *validation = (compare_means(model, run) for run in runs)
         alone = {}
         if len(model.equations) > 1:
             coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
             alone = {run.name: compare_means(coupled, run).output_error for run in runs}
-        return Candidate(label, model, on, off[0] if off else None, alone, result)
+        return Candidate(model, estimation, next(iter(validation), None), alone, result)
 
-    def identify_candidate(
-        self, label: str, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD
-    ) -> Candidate:
+    def identify_candidate(self, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD) -> Candidate:
         """Identify a model from a run, by default by output error, and return it with its errors on both runs."""
-        result = identify(run, structure, method=method, threads=self.threads, progress=self.progress)
-        return self.candidate(label, result.model, result)
+        result = identify(run, structure, method=method, **self.work)
+        return self.candidate(result.model, result)
 
-    def manual(self, label: str) -> Candidate:
+    def manual(self) -> Candidate:
         """Return the integer-order model of the manufacturer's manual, with its errors on both runs."""
-        return self.candidate(label, link_model(stage=self.number, form="published"))
+        return self.candidate(link_model(stage=self.number, form="published"))
 
-    def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
+    def euler_candidate(self, exact: Candidate) -> Candidate:
         """Return the candidate `exact` with the errors of simulations by explicit Euler, the method of the paper."""
-
-        def by_euler(run: Run, comparison: Comparison) -> Comparison:
-            means = euler_means(exact.model, run, comparison.m)
-            errors = {n: metrics(comparison.measured[n][0], mean) for n, mean in means.items()}
-            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, comparison.equation_error, errors)]
-            return replace(comparison, simulated=simulated, output_error=errors, per_run=parts, findings=())
-
-        on, off = by_euler(self.on, exact.estimation), None
-        alone = {self.on.name: on.output_error}
-        if self.off is not None and exact.validation is not None:
-            off = by_euler(self.off, exact.validation)
-            alone[self.off.name] = off.output_error
-        return replace(exact, label=label, estimation=on, validation=off, input_driven=alone)
+        compared, alone = [], {}
+        for run, by_pulses in ((self.estimation_run, exact.estimation), (self.validation_run, exact.validation)):
+            if run is None or by_pulses is None:
+                continue
+            means = euler_means(exact.model, run, by_pulses.m)
+            errors = alone[run.name] = {n: metrics(by_pulses.measured[n][0], mean) for n, mean in means.items()}
+            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, by_pulses.equation_error, errors)]
+            compared.append(replace(by_pulses, simulated=simulated, output_error=errors, per_run=parts, findings=()))
+        estimation, validation = compared[0], compared[1] if exact.validation is not None else None
+        return replace(exact, estimation=estimation, validation=validation, input_driven=alone)
 
     def searches(self) -> dict[str, Candidate]:
         """Return the best models on the order grid, by label: multi-innovation with each p, and least squares.
 
         p is the innovation length.
         """
-        kinds: dict[str, tuple[str, dict[str, Any]]] = {
-            f"p = {p}": ("multi-innovation", {"innovation_length": p, "prior_covariance": PRIOR_COVARIANCES[0]})
-            for p in INNOVATION_LENGTHS
+        recursion = {"coefficients": "multi-innovation", "prior_covariance": PRIOR_COVARIANCES[0]}
+        kinds: dict[str, dict[str, Any]] = {
+            **{f"p = {p}": {"innovation_length": p, **recursion} for p in INNOVATION_LENGTHS},
+            "least squares": {"coefficients": "least-squares"},
         }
-        candidates, grid = {}, self.preset.order_grid
-        for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
+        candidates, grid, top = {}, self.preset.order_grid, self.preset.top
+        for label, options in kinds.items():
             self.begin(f"orders on the grid, {label}", "search")
-            if self.preset.top is None:
-                candidates[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
+            if top is None:
+                candidates[label] = self.search_candidate(label, grid, **options)
             else:
-                method = method_with_options(coefficients, {"order_grid": grid, "top": self.preset.top, **options})
-                candidates[label] = self.identify_candidate(label, self.on, self.measured, method)
+                method = method_with_options(options.pop("coefficients"), {"order_grid": grid, "top": top, **options})
+                candidates[label] = self.identify_candidate(self.estimation_run, self.measured, method)
         return candidates
 
     def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
@@ -746,20 +704,19 @@ class StageWork:
         """
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
-        for output in self.measured.outputs:
-            single = self.measured.equation(output)
+        for single in map(self.measured.equation, self.measured.outputs):
             own = replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n in single.order_names})
-            best = self._best_orders(single, own, {**SEARCH_OPTIONS, **options})
+            best = self._best_orders(single, own, {**printed.SEARCH_OPTIONS, **options})
             orders |= best.orders
             coefficients |= best.coefficients
         structure = self.measured.with_orders(orders).with_coefficients(coefficients)
-        units = {n: u for n, u in self.on.units.items() if n in structure.signals}
-        about = {"origin": label, "run": self.on.name}
-        return self.candidate(label, Model(structure, orders=orders, units=units, about=about))
+        run = self.estimation_run
+        about = {"origin": label, "run": run.name}
+        return self.candidate(Model(structure, orders=orders, units=run.units, about=about))
 
     def printed_orders(self) -> Candidate:
         """Return the model with least-squares coefficients at the orders that the paper prints for p = 7."""
-        axes = {n: [v] for output in self.measured.outputs for n, v in last_orders(output).items()}
+        axes = {n: [v] for n, v in printed.printed_numbers(self.number, LAST_P)[0].items()}
         grid = replace(self.preset.order_grid, orders=axes)
         return self.search_candidate("printed orders", grid, coefficients="least-squares")
 
@@ -770,33 +727,31 @@ class StageWork:
         of a zero output, so no candidate can be excluded by a bound on its error. The fine grid is therefore searched
         only around the best candidate of a coarser grid.
         """
-        work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
+        run, work = self.estimation_run, {**self.work, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
-        is_expensive = own_terms > 1 and options.get("coefficients") == "multi-innovation"
+        is_expensive = own_terms > 1 and options["coefficients"] == "multi-innovation"
         if not (is_expensive and own.increment < COARSE_INCREMENT and not own.orders):
-            return rank_orders(self.on, single, own, top=1, **work)
-        values, coarse = own.values(single), replace(own, increment=COARSE_INCREMENT)
-        ends = []
-        for row in rank_orders(self.on, single, coarse, top=REFINED_CANDIDATES, **work).table:
-            near = {
-                n: [v for v in values[n] if abs(v - at) < 2 * COARSE_INCREMENT - 1e-9] for n, at in row.orders.items()
-            }
-            ends.append(rank_orders(self.on, single, replace(own, orders=near), top=1, **work))
-        return min(ends, key=lambda end: end.score)
+            return rank_orders(run, single, own, top=1, **work)
+        values, ends, radius = own.values(single), [], 2 * COARSE_INCREMENT - 1e-9
+        coarse = replace(own, increment=COARSE_INCREMENT)
+        for row in rank_orders(run, single, coarse, top=REFINED_CANDIDATES, **work).table:
+            near = {n: [v for v in values[n] if abs(v - at) < radius] for n, at in row.orders.items()}
+            ends.append(rank_orders(run, single, replace(own, orders=near), top=1, **work))
+        return min(ends, key=attrgetter("score"))
 
     def instrumental(self, start: Candidate) -> Candidate:
         """Return the best model of an order search by instrumental variables around the orders of the model `start`."""
         self.begin("orders by instrumental variables", "instrumental")
-        grid = self.preset.order_grid
-        axes = {}
+        grid, axes = self.preset.order_grid, {}
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
-            axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
+            near = printed.neighboring_values(value, grid.increment, steps)
+            axes[name] = [v for v in near if 0 <= v <= grid.alpha[1]]
         method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=1)
-        return self.identify_candidate("instrumental variables", self.on, self.measured, method)
+        return self.identify_candidate(self.estimation_run, self.measured, method)
 
     def joint(
-        self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
+        self, structure: Structure, words: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
         """Return a model of both equations fitted by output error, with its errors on both runs.
 
@@ -804,7 +759,7 @@ class StageWork:
         is a model by eqs. (14)-(15) of the paper whose parameters give the initial guess for eqs. (22)-(25).
         """
         self.begin(words, step)
-        run = self.on
+        run = self.estimation_run
         if step == "whole orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
             run = decimate_run(run, run.length // INTEGER_FIT_SAMPLES)
         elif run.length > MAX_FULL_SAMPLES:
@@ -812,19 +767,20 @@ class StageWork:
             self.notes.append(page_text("decimated", run=run, every=every, step=every * run.step))
             run = decimate_run(run, every)
         if near is None:
-            return self.identify_candidate(label, run, structure)
+            return self.identify_candidate(run, structure)
         # Only standard errors of the published form are used. From automatic initial guesses, rounding decides which
         # optimum is found. The parameters of (14)-(15) lead to the optimum whose residuals are the noise.
-        begin = self.published_values(near)
-        if not self.simulated:
-            try:
-                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic", start=begin))
-            except ModelError:
-                # The initial guess is outside the parameter bounds of (22)-(25).
-                return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic"))
-        task, options = Task((run,), structure), (None, check_threads(self.threads), self.progress)
-        result = assess_fit(estimate_output_error(task, *options, intervals="quadratic", begin=begin, alone=True))
-        return self.candidate(label, result.model, result)
+        guess = self.published_values(near)
+        if self.simulated:
+            task, options = Task((run,), structure), (None, check_threads(self.preset.threads), self.progress)
+            fit = estimate_output_error(task, *options, intervals="quadratic", begin=guess, alone=True)
+            result = assess_fit(fit)
+            return self.candidate(result.model, result)
+        try:
+            return self.identify_candidate(run, structure, OutputError(intervals="quadratic", start=guess))
+        except ModelError:
+            # The initial guess is outside the parameter bounds of (22)-(25).
+            return self.identify_candidate(run, structure, OutputError(intervals="quadratic"))
 
     def best(
         self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
@@ -836,46 +792,41 @@ class StageWork:
         """
         words = f"{what}, by output error"
         try:
-            return self.joint(label, structure, words, step, near)
+            return self.joint(structure, words, step, near)
         except ConvergenceError as error:
             self.notes.append(page_text("measured_coupling", stage=self.number, label=label, error=error))
-        return self.joint(label, replace(structure, coupling="measured"), words, step, near)
+        return self.joint(replace(structure, coupling="measured"), words, step, near)
 
-    def traces(
-        self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
-    ) -> dict[str, dict[int, MultiInnovationTrace]]:
+    def traces(self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]) -> Traces:
         """Return the convergence of multi-innovation by output and innovation length p, at the orders of `models`."""
-        parts = {o: self.measured.equation(o) for o in self.measured.outputs}
-        return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
+        run, every = self.estimation_run, self.preset.trace_every
+        return {o: traces_of(run, self.measured.equation(o), models, prior, every) for o in self.measured.outputs}
 
-    def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
+    def compare_optimizers(self) -> dict[str, OptimizerComparison]:
         """Return comparisons of multi-innovation with other optimizers, by output.
 
         The result is empty if the preset omits the comparisons. It is also empty if a comparison is impossible; a note
         then states the reason.
         """
-        if self.preset.rivals_increment is None:
+        run, grid, comparisons = self.estimation_run, self.preset.rivals_order_grid, {}
+        if grid is None:
             return {}
-        grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
-        rivals = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             self.begin(f"the rivals on {output}", "rivals")
             try:
-                comparison = compare_optimizers(
-                    self.on, single, grid, genetic, threads=self.threads, progress=self.progress
-                )
+                comparison = compare_optimizers(run, single, grid, self.preset.genetic, **self.work)
             except ModelError as error:
                 self.notes.append(page_text("rivals_omitted", reason=error))
                 return {}
-            best = dict(zip(MULTI_INNOVATION_LABELS, comparison.order_grid.values(), strict=True))
-            ends: list[tuple[str, GeneticRun | SearchResult]] = [*comparison.optimizers.items(), *best.items()]
-            models = {
-                name: Model(single.with_orders(end.orders).with_coefficients(end.coefficients), orders=dict(end.orders))
-                for name, end in ends
-            }
-            rivals[output] = replace(comparison, models={n: self.candidate(n, model) for n, model in models.items()})
-        return rivals
+            searches = dict(zip(MULTI_INNOVATION_LABELS, comparison.order_grid.values(), strict=True))
+            ends: dict[str, GeneticRun | SearchResult] = {**comparison.optimizers, **searches}
+            models = {}
+            for label, end in ends.items():
+                structure = single.with_orders(end.orders).with_coefficients(end.coefficients)
+                models[label] = self.candidate(Model(structure, orders=dict(end.orders)))
+            comparisons[output] = replace(comparison, models=models)
+        return comparisons
 
     def in_published_form(self, model: Model) -> Model:
         """Return the model by eqs. (22)-(25) of the paper that corresponds to a model by eqs. (14)-(15).
@@ -883,16 +834,14 @@ class StageWork:
         Equations (22)-(25) drop a derivative.
         """
         h, d = self.number * 2 - 1, self.number * 2
-        values = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
-        values |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
-        values |= {f"{c}{d}": -values[f"{c}{h}"] for c in "bg"}
-        values |= {f"{c}{d}": values[f"{c}{d}"] - values[f"{c}{h}"] for c in "ad"}
+        hub = {c: model.coefficients[f"{c}{h}"] for c in "abdg"}
+        link = {"b": -hub["b"], "g": -hub["g"]} | {c: model.coefficients[f"{c}{d}"] - hub[c] for c in "ad"}
         highest = {e.output: e.order.constant for e in model.equations}
         other = link_model(
             stage=self.number,
             form="published",
             orders={**model.orders, f"alpha{d}": highest[self.measured.outputs[1]]},
-            coefficients=values,
+            coefficients={f"{c}{k}": v for k, values in ((h, hub), (d, link)) for c, v in values.items()},
             coupling=model.structure.coupling,
         )
         return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
@@ -907,10 +856,10 @@ class StageWork:
 
     def dropped_derivative(self, model: Model) -> DroppedDerivative:
         """Simulate the deflection by eqs. (14)-(15) and (22)-(25) of the paper, with the parameters of `model`."""
-        output, other = self.measured.outputs[1], self.in_published_form(model)
-        whole, published = (compare_means(m, self.on) for m in (model, other))
+        run, output, other = self.estimation_run, self.measured.outputs[1], self.in_published_form(model)
+        whole, published = (compare_means(m, run) for m in (model, other))
         drive = f"I{self.number}"
-        current = pulse_means(self.on[drive], whole.m, hold=self.on.intersample[drive] == "zoh")
+        current = pulse_means(run[drive], whole.m, hold=run.intersample[drive] == "zoh")
         order = order_law(self.number, "derived")["input"].at(other.orders)
         responses = whole.measured[output][0], published.simulated[output][0], whole.simulated[output][0]
         return DroppedDerivative(output, order, pulse_times(whole), current, *responses)
