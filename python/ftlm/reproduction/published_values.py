@@ -71,6 +71,11 @@ class PublishedRow:
     nr: float = math.nan
 
     @property
+    def a(self) -> float:
+        """Coefficient a."""
+        return self.coefficients["a"]
+
+    @property
     def criteria(self) -> tuple[float, float, float]:
         """Sum of absolute errors, RMSE and normalized residual NR: eqs. (45), (46) and (47) of the paper."""
         return self.error, self.rmse, self.nr
@@ -149,7 +154,7 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
     tuple of float
         x, c, and the largest relative error of the curve at p = 3 and 5.
     """
-    first, *between, last = ((p, row.coefficients["a"]) for p, row in FRACTIONAL_ROWS[output].items())
+    first, *between, last = ((p, row.a) for p, row in FRACTIONAL_ROWS[output].items())
     # 1/a = 1/x + (c/x)/p is a line in 1/p.
     slope = (1 / first[1] - 1 / last[1]) / (1 / first[0] - 1 / last[0])
     x = 1 / (1 / first[1] - slope / first[0])
@@ -441,7 +446,7 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
     """
     logs = []
     for p, row in rows.items():
-        ratio = row.coefficients["a"] / table[p].coefficients["a"]
+        ratio = row.coefficients["a"] / table[p].a
         logs.append(abs(math.log(ratio)) if ratio > 0 else math.log(10.0) + abs(math.log(abs(ratio) or 1e-12)))
         logs.append(abs(math.log(row.equation.nr / table[p].nr)))
     return sum(logs) / len(logs)
@@ -509,6 +514,16 @@ class PrintedModelRun:
     arm: Floats
     returned_coefficients: dict[float, dict[str, float]]
     orders: dict[float, dict[str, float]]
+
+    @property
+    def row(self) -> PublishedRow:
+        """Row of the paper's Table 4 or 5 with the printed model."""
+        return FRACTIONAL_ROWS[self.output][self.p]
+
+    @property
+    def returned_a(self) -> dict[float, float]:
+        """Coefficient a among the returned coefficients, by prior covariance K0."""
+        return {k: values[parameter_name("a", self.output)] for k, values in self.returned_coefficients.items()}
 
     @property
     def deviation_ratio(self) -> float:

@@ -411,7 +411,7 @@ def saturation_table(reproduction: Reproduction) -> Table:
         for p, model in of_p.items():
             alike = "yes" if letters_of(model, output)[0] == last else "no"
             weak = stage.weak[output][p][name] if stage.weak else None
-            printed_value = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
+            printed_value = printed.FRACTIONAL_ROWS[output][p].a
             yield [f"p = {p}", model.coefficients[name], alike, weak, printed_value, x * p / (p + c)]
 
     return make_table("saturation", {output: rows(stage, output) for stage, output in reproduction.angles})
@@ -491,11 +491,9 @@ def printed_runs_table(reproduction: Reproduction) -> Table:
     """Return a table on simulations of the models printed in the paper: unstable poles, standard deviations, refits."""
 
     def cells(r: printed.PrintedModelRun) -> list[Cell]:
-        name = parameter_name("a", r.output)
-        refits = [r.returned_coefficients.get(k, {}).get(name) for k in printed.PRIOR_COVARIANCES]
         deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
-        printed_value = printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"]
-        return [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, printed_value, *refits]
+        refits = map(r.returned_a.get, printed.PRIOR_COVARIANCES)
+        return [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, r.row.a, *refits]
 
     return make_table("printed_models", {o: map(cells, r) for o, r in printed_runs_by_output(reproduction).items()})
 
