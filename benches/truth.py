@@ -107,9 +107,9 @@ def bias(names: Iterable[str]) -> Iterator[str]:
         split = len(problem.orders)
         before: np.ndarray | None = None
         for every in (1, 2, 4, 8, 16):
-            prepared = [sample_run(run, problem, weights, every=every)]
+            prepared = [sample_run(run, problem, weights, pulses_per_sample=every)]
             start = Iterate(true[:split], true[split:], "truth", {})
-            end = minimize_cost(problem, prepared, start, evaluations=60, plain=True)
+            end = minimize_cost(problem, prepared, start, evaluations=60, linear_scale=True)
             jacobian = np.asarray(end.outcome["jacobian"])
             size = np.linalg.norm(jacobian, axis=1)
             scaled = jacobian / size[:, None]

@@ -113,7 +113,7 @@ class ProfileLikelihood:
         if joint.step_converged and joint.refinement > 1:
             # Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
             with contextlib.suppress(FtlmError):
-                coarse = replace(grid, every=joint.refinement // 2)
+                coarse = replace(grid, pulses_per_sample=joint.refinement // 2)
                 likelihood = cls.at(coarse, joint.finest_grid_values, np.zeros(len(problem.names)))
                 near = np.maximum(
                     MAX_OPTIMUM_SHIFT_ERRORS * likelihood.errors,
@@ -128,7 +128,7 @@ class ProfileLikelihood:
     @classmethod
     def at(cls, grid: Objective, values: Floats, shift: Floats) -> ProfileLikelihood:
         """Return the profile likelihood around the optimum reached from a point."""
-        best = grid.minimize(_attempt(grid, values), MAX_REFIT_EVALUATIONS, plain=True)
+        best = grid.minimize(_attempt(grid, values), MAX_REFIT_EVALUATIONS, linear_scale=True)
         bread = covariance_of(np.asarray(best.outcome["jacobian"]), [], 1.0)
         spread = np.diag(covariance(best, grid))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -322,7 +322,9 @@ class ProfileLikelihood:
         return self._minimize(i, values, 1, REFIT_TOLERANCE)
 
     def _minimize(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Iterate:
-        return self.grid.minimize(_attempt(self.grid, values), evaluations, plain=True, fixed=i, tolerance=tolerance)
+        return self.grid.minimize(
+            _attempt(self.grid, values), evaluations, linear_scale=True, fixed=i, tolerance=tolerance
+        )
 
 
 #: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.

@@ -90,7 +90,7 @@ def score_at(monkeypatch, point, ground, runs):
 def test_the_products_say_what_scipy_says(runs, monkeypatch):
     """At given own coefficients: every subset fitted on one run and judged on the other one, and fitted on both."""
     every = base_models(NestedStructures(ftlm.equation(WORDS, initial="rest")), tuple(runs))
-    ground = next(g for g in every if len(g.own) == 2)
+    ground = next(g for g in every if len(g.output_coefficients) == 2)
     point = (math.log(5.0), math.log(0.3))
     own = ground.coefficients(point)
     assert own == pytest.approx({"a": -25.0, "d": -1.5})
@@ -146,7 +146,7 @@ def test_a_term_at_several_orders_is_one_at_a_time(runs, monkeypatch):
     inside = NestedStructures(
         ftlm.equation(words, initial="rest", orders={"g0": (0.0, 1.0, 0.1), "g1": (1.0, 2.0, 0.1)})
     )
-    ground = next(g for g in base_models(inside, tuple(runs)) if len(g.own) == 2)
+    ground = next(g for g in base_models(inside, tuple(runs)) if len(g.output_coefficients) == 2)
     assert [(c.coefficient, c.order) for c in ground.columns] == [
         ("c0", 0.0),
         ("c0", 1.0),

@@ -54,7 +54,7 @@ def test_costs_are_those_of_residuals_after_a_linear_step(fit):
 
     def at(values, evaluations):
         orders, coefficients, inputs = problem.split(values.tolist())
-        return grid.minimize(Iterate(orders, coefficients, "", {}, inputs), evaluations, plain=True)
+        return grid.minimize(Iterate(orders, coefficients, "", {}, inputs), evaluations, linear_scale=True)
 
     best = at(joint.values, 20)
     pair = [problem.names.index(n) for n in found.names]

@@ -94,9 +94,9 @@ def test_an_input_that_is_linear_in_between_is_delayed_to_second_order():
     for every in (1, 2, 4):
         problem = FreeProblem.of(structure())
         run = late_run(DELAY, 200, 0, is_constant=False)
-        prepared = [sample_run(run, problem, [1.0], every=every)]
+        prepared = [sample_run(run, problem, [1.0], pulses_per_sample=every)]
         start = Iterate([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
-        end = minimize_cost(problem, prepared, start, evaluations=40, plain=True)
+        end = minimize_cost(problem, prepared, start, evaluations=40, linear_scale=True)
         errors.append(abs(end.inputs[0] - DELAY))
     assert errors[0] < 0.02 * plants.clean_run("3T").step
     assert errors[2] < errors[0] / 6

@@ -256,7 +256,11 @@ def test_colored_noise_alone_starts_no_multistart(monkeypatch):
     fit = extensions.fit_output_error
 
     def counted(runs, structure, **options):
-        if options.get("start") is None and options.get("near") is None and "load" not in structure.coefficient_names:
+        if (
+            options.get("start") is None
+            and options.get("initial_fit") is None
+            and "load" not in structure.coefficient_names
+        ):
             automatic.append(structure)
         return fit(runs, structure, **options)
 

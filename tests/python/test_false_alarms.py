@@ -60,7 +60,7 @@ def test_noise_that_grows_with_the_input_does_not_follow_it():
         rng = np.random.default_rng([seed, 7])
         u = ordinary.drawn_input("bursts", 600, rng)
         white = [u * rng.standard_normal(600)]
-        failed += _independence(white, [u], NoiseModel.fit(white, [u], 25), 25, first=0).failed
+        failed += _independence(white, [u], NoiseModel.fit(white, [u], 25), 25, first_lag=0).failed
     # With the variance of equal noise 64 of 200 fail.
     assert failed <= 12
 

@@ -185,7 +185,7 @@ def test_slopes_of_a_term_above_its_equation_are_those_of_differences(behind):
 
     def at(orders, evaluations):
         start = Iterate(list(orders), [-4.0, 2.0], "here", {})
-        return grid.minimize(start, evaluations, plain=True, fixed=[2, 3]).outcome
+        return grid.minimize(start, evaluations, linear_scale=True, fixed=[2, 3]).outcome
 
     there, shift = at(point, 1), 1e-4
     residuals = np.asarray(there["residuals"])

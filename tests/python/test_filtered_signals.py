@@ -340,18 +340,18 @@ def test_slopes_beside_a_filter_in_motion_are_those_of_finite_differences():
     t, rng = np.arange(241) * 0.004, np.random.default_rng(1)
     outputs = {n: np.sin(9.0 * t + k) + rng.normal(size=t.size) for k, n in enumerate(("theta11", "theta12"))}
     run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": np.sign(np.sin(7.0 * t))}, outputs=outputs)
-    grid = Objective(problem, [run], [1.0, 3.0], every=2)
+    grid = Objective(problem, [run], [1.0, 3.0], pulses_per_sample=2)
     names = [*problem.orders, *problem.coefficients]
     point, count = np.array([(orders | numbers)[n] for n in names]), len(orders)
 
     def at(values):
         attempt = Iterate(list(values[:count]), list(values[count:]), "here", {})
-        return grid.minimize(attempt, 1, plain=True).outcome
+        return grid.minimize(attempt, 1, linear_scale=True).outcome
 
     base = at(point)
     # The hub's filter holds nothing, for it has none.
     bare = replace(grid, problem=FreeProblem.of(replace(structure, sensor_filter=None)))
-    without = bare.minimize(Iterate(list(point[:count]), list(point[count:]), "here", {}), 1, plain=True).outcome
+    without = bare.minimize(Iterate(list(point[:count]), list(point[count:]), "here", {}), 1, linear_scale=True).outcome
     held = [len(begun) for begun in base["initial"][0]], [len(begun) for begun in without["initial"][0]]
     assert [a - b for a, b in zip(*held, strict=True)] == [0, 2]
     weights = np.linalg.norm(base["jacobian"], axis=1)

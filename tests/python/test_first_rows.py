@@ -654,7 +654,7 @@ def test_residuals_of_a_warm_start_are_in_units_of_its_noise():
     run, structure = run_of(u, y, 0.05), ftlm.equation(WORDS)
     joint = ftlm.identify(run, structure).joint
     noisy = {**joint.noise, "y": 1.009 * joint.noise["y"]}
-    near = fit_output_error([run], replace(structure, initial="rest"), near=replace(joint, noise=noisy))
+    near = fit_output_error([run], replace(structure, initial="rest"), initial_fit=replace(joint, noise=noisy))
     assert np.sqrt(np.mean(near.residuals[0]["y"] ** 2)) == pytest.approx(1.0, rel=1e-9)
 
 

@@ -18,7 +18,12 @@ import motion
 import oracles
 from ftlm import cli
 from ftlm.simulation.discretization import prepare, record
-from ftlm.simulation.initial_conditions import history, misfit, misfit_of_fits, resolve_initial_conditions
+from ftlm.simulation.initial_conditions import (
+    history,
+    huber_loss_excess,
+    loss_excess_of_fits,
+    resolve_initial_conditions,
+)
 from ftlm.simulation.output_samples import with_initial_conditions
 from ftlm.structure.structure import History
 
@@ -345,10 +350,10 @@ def test_squares_have_a_say_in_what_a_history_is_worth():
     # What lies far out hardly counts by Huber's measure, and in squares as much as it lies.
     few = many.copy()
     few[::200] += 40.0
-    by_huber, together = misfit([few], [many], [100.0]), misfit_of_fits([few], [many], [100.0])
+    by_huber, together = huber_loss_excess([few], [many], [100.0]), loss_excess_of_fits([few], [many], [100.0])
     squares = np.sum(few**2 - many**2) / np.mean(many**2)
     assert by_huber < 0.25 * squares
     assert together == pytest.approx(0.25 * squares)
-    assert misfit_of_fits([many], [many], [100.0]) == 0.0
-    assert misfit_of_fits([1e-16 * few], [0.0 * many], [100.0]) == 0.0
-    assert misfit_of_fits([few], [0.0 * many], [100.0]) == np.inf
+    assert loss_excess_of_fits([many], [many], [100.0]) == 0.0
+    assert loss_excess_of_fits([1e-16 * few], [0.0 * many], [100.0]) == 0.0
+    assert loss_excess_of_fits([few], [0.0 * many], [100.0]) == np.inf

@@ -287,7 +287,7 @@ def test_the_jacobian_above_alpha_is_that_of_finite_differences() -> None:
     run = with_noise(clean_run(1, "multisine"), 40, [1]).window(None, 0.6)
     for coupling in ("simulated", "measured"):
         problem = FreeProblem.of(replace(ftlm.flexible_link(coupling=coupling), initial="rest"))
-        prepared = [sample_run(run, problem, [1.0, 10.0], every=2)]
+        prepared = [sample_run(run, problem, [1.0, 10.0], pulses_per_sample=2)]
         named = {"alpha1": 1.93, "gamma1": 0.9, "beta2": 0.23, "mu2": 0.7}
         named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "j1": 0.5}
         names = [*problem.orders, *problem.coefficients]

@@ -228,13 +228,13 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial):
     )
     problem = FreeProblem.of(structure)
     grid = Objective(problem, [run], [1.0] * len(structure.outputs))
-    first = grid.minimize(start_from_values(problem, values), 1, plain=True)
+    first = grid.minimize(start_from_values(problem, values), 1, linear_scale=True)
     states = first.outcome["states"]
 
     def residuals(values):
         place = start_from_values(problem, dict(zip(problem.names, values, strict=True)))
         place.outcome["states"] = states
-        return np.asarray(grid.minimize(place, 0, plain=True).outcome["residuals"])
+        return np.asarray(grid.minimize(place, 0, linear_scale=True).outcome["residuals"])
 
     jacobian = np.asarray(first.outcome["jacobian"])
     base = first.values
@@ -248,7 +248,7 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial):
             for by in (1e-5, -1e-5):
                 place = start_from_values(problem, dict(zip(problem.names, base, strict=True)))
                 place.outcome["states"] = [[v + by * (i == k) for i, v in enumerate(states[0])]]
-                sides.append(np.asarray(grid.minimize(place, 0, plain=True).outcome["residuals"]))
+                sides.append(np.asarray(grid.minimize(place, 0, linear_scale=True).outcome["residuals"]))
             columns.append((sides[0] - sides[1]) / 2e-5)
         basis = np.linalg.qr(np.stack(columns, 1))[0]
     for k, column in enumerate(jacobian):

@@ -59,10 +59,10 @@ def test_derivatives_of_pulse_means():
     middles = (edges[1:] + edges[:-1]) / 2
     for order, exact in ((1.0, 3 * middles**2), (0.5, 6 / 3.3233509704478426 * middles**2.5)):
         for smooth in (False, True):
-            found = differentiate(means, order, step, smooth=smooth)
+            found = differentiate(means, order, step, local_smoothing=smooth)
             assert np.abs(found - exact)[2:].max() < 2e-3
     noisy = means + 0.1 * np.random.default_rng(0).standard_normal(m)
-    raw, smooth = (differentiate(noisy, 1.0, step, smooth=s) - 3 * middles**2 for s in (False, True))
+    raw, smooth = (differentiate(noisy, 1.0, step, local_smoothing=s) - 3 * middles**2 for s in (False, True))
     assert np.std(smooth) < 0.2 * np.std(raw)
 
 
@@ -70,12 +70,14 @@ def test_of_raw_and_smooth_velocities_the_better_free_run_decides(runs):
     structure, settings = at_true_orders("drag"), SearchSettings(coefficients="least-squares")
     chosen = estimate_coefficients([runs["drag"]], structure, settings, None)
     smooth, raw = (
-        _estimate_coefficients([runs["drag"]], structure, settings, None, smooth=s)[0] for s in (True, False)
+        _estimate_coefficients([runs["drag"]], structure, settings, None, local_smoothing=s)[0] for s in (True, False)
     )
     assert chosen.values == smooth.values != raw.values
     coarse = runs["drag"].resample(0.2)
     chosen = estimate_coefficients([coarse], structure, settings, None)
-    ways = [_estimate_coefficients([coarse], structure, settings, None, smooth=s)[0].values for s in (True, False)]
+    ways = [
+        _estimate_coefficients([coarse], structure, settings, None, local_smoothing=s)[0].values for s in (True, False)
+    ]
     # Windows of 31 points are too wide here.
     assert chosen.values == ways[1] != ways[0]
 

@@ -381,7 +381,7 @@ def test_the_test_for_an_offset_keeps_its_level(kind):
     found = []
     for seed in range(60):
         run, structure, truth = loops.offset_run(kind, 0.0, seed)
-        found.append(offset_test([run], replace(structure, initial="rest"), truth, every=2))
+        found.append(offset_test([run], replace(structure, initial="rest"), truth, pulses_per_sample=2))
     assert sum(t.exceeds() for t in found) <= 4
     assert {t.degrees for t in found} == {1}
     assert np.mean([t.statistic for t in found]) == pytest.approx(1.0, abs=0.55)
@@ -391,7 +391,7 @@ def test_the_test_for_an_offset_is_that_of_dense_regression():
     # The oracle: sensitivities of the free run by differences, noise of known white colour.
     run, truth = fractional_run(2, 0.005, noise=0.05), {"a": 0.7, "b": 1.4}
     structure = ftlm.equation("D^0.8 y = -a y + b u", initial="rest")
-    found = offset_test([run], structure, truth, every=4)
+    found = offset_test([run], structure, truth, pulses_per_sample=4)
     steps = 4 * (run.length - 1)
     duration = run.duration
 

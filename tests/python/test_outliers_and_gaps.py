@@ -305,7 +305,7 @@ def test_the_slope_at_times_of_their_own_is_that_of_the_residuals() -> None:
     run, _ = irregular(5, 0.01)
     structure = ftlm.equation("D^alpha y = c D^nu y + a y + b u + d D^alpha u", initial="rest")
     problem = FreeProblem.of(structure)
-    grid = Objective(problem, [run], [30.0], every=2)
+    grid = Objective(problem, [run], [30.0], pulses_per_sample=2)
 
     def at(values: np.ndarray) -> dict[str, object]:
         orders, coefficients, _ = problem.split(values.tolist())

@@ -60,7 +60,7 @@ def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, init
     run = arm_run(1, 301, 1e-3, 0)
     words = "caputo" if initial[0] else "rest"
     problem = FreeProblem.of(replace(ftlm.flexible_link(form="published", stage=1, coupling=coupling), initial=words))
-    prepared = [sample_run(run, problem, [1.0, 10.0], every=2)]
+    prepared = [sample_run(run, problem, [1.0, 10.0], pulses_per_sample=2)]
     # Away from whole differences of orders, where initial terms merge.
     named = {"alpha1": 1.93, "alpha2": 1.91, "gamma1": 0.9, "beta2": 0.13, "mu2": 0.8}
     named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "r1": 1.5}

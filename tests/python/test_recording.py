@@ -119,7 +119,7 @@ def test_a_fit_compares_the_samples_of_the_definition(name, initial, gaps, own):
         found, expected = (
             problem.core.minimize([given], start, True, [], 1, 1e-9, False)
             for given in (
-                sample_run(run, problem, weights, every=every, decimation=decimation),
+                sample_run(run, problem, weights, pulses_per_sample=every, decimation=decimation),
                 oracle.experiment(run, structure, every=every, decimation=decimation),
             )
         )

@@ -419,7 +419,7 @@ def test_coloured_noise_under_slow_inputs_raises_no_alarm():
             for shape in SLOW_INPUTS.values():
                 u = shape(t)
                 model = NoiseModel.fit([noise], [u], 25)
-                failed += residual_tests._independence([noise], [u], model, 25, first=0).failed
+                failed += residual_tests._independence([noise], [u], model, 25, first_lag=0).failed
                 tried += 1
     assert failed <= 0.03 * tried
 

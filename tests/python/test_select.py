@@ -228,7 +228,7 @@ def test_long_records_are_fitted_by_those_alone_that_may_lead():
     assert prescreen([motor(0)], starts, 2, work) == [0, 1, 2, 3]
     rubbing = ftlm.equation("D^2 y = d D y + a y + b u - fc*sign(D y)")
     assert prescreen(runs, [*starts, (rubbing, [{**at, "fc": 0.1}])], 2, work) == [0, 1, 2, 3, 4]
-    assert work.done_count == work.known_count == 0
+    assert work.done_count == work.announced_count == 0
 
 
 def test_a_run_of_its_own_judges(runs):
@@ -448,7 +448,7 @@ def test_fits_on_threads_end_with_the_flag(runs):
 def test_many_candidates_are_told_how_long_they_take(runs):
     ticks = iter([0.0, 3.0])
 
-    def judge(name, structure, joint, *, fine):
+    def judge(name, structure, joint, *, is_final):
         return Trial(name, structure, 1, failed="not asked")
 
     work = CandidateEvaluator(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))

@@ -268,7 +268,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
     for what in questions:
         with Store(tmp_path / f"{what}.ftlm", request) as kept:
             ask(kept, what)
-            answers[what] = next(iter(kept._answers.items()))
+            answers[what] = next(iter(kept._results.items()))
     for what, (key, _) in answers.items():
         others = {n: answer for n, (_, answer) in answers.items() if n != what}
         if what != "a fit":

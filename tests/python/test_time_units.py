@@ -65,7 +65,7 @@ def test_a_descent_takes_the_same_steps_in_any_unit(plain):
         here = start | {n: v for n, v in in_seconds(start, 1.0 / scale).items()}
         grid = Objective(problem, [lag(1, scale)], [20.0])
         attempt = Iterate([here[n] for n in problem.orders], [here[n] for n in problem.coefficients], "", {})
-        ended.append(minimize_cost(problem, grid.experiments, attempt, evaluations=6, plain=plain))
+        ended.append(minimize_cost(problem, grid.experiments, attempt, evaluations=6, linear_scale=plain))
     for other in ended[1:]:
         assert other.orders == pytest.approx(ended[0].orders, abs=1e-7)
         assert other.outcome["cost"] == pytest.approx(ended[0].outcome["cost"], rel=1e-9)

@@ -118,12 +118,12 @@ def test_a_steady_descent_stays_where_free_runs_die_away() -> None:
     grid = Objective(problem, [swing(0.2)], [1.0 / 0.001])
     held = Objective(problem, [swing(0.2)], [1.0 / 0.001], prefer_stable=True)
     start = Iterate([], [-25.0, -0.1, 1.0], "near", {})
-    free, kept = grid.minimize(start, 60, plain=True), held.minimize(start, 60, plain=True)
+    free, kept = grid.minimize(start, 60, linear_scale=True), held.minimize(start, 60, linear_scale=True)
     assert grows(free)
     assert not grows(kept)
     assert free.cost_per_residual < kept.cost_per_residual < held.minimize(start, 1).cost_per_residual
     # From where it grows, it may leave.
-    assert grows(held.minimize(free, 20, plain=True))
+    assert grows(held.minimize(free, 20, linear_scale=True))
 
 
 def arm_run(name: str, thin: int) -> ftlm.Run:

@@ -31,10 +31,10 @@ from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Floats
 
 
-def _comment(text: str, mark: str) -> str:
-    """Return a text as comment lines that begin with `mark`; each line of the text becomes a comment."""
+def _comment(text: str, prefix: str) -> str:
+    """Return a text as comment lines that begin with `prefix`; each line of the text becomes a comment."""
     lines = re.split(r"[\r\n\u2028\u2029\x0b\x0c\x85]+", text)
-    return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
+    return "\n".join(f"{prefix} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
 
 @check_arguments
@@ -101,21 +101,21 @@ def matlab_text(model: Model) -> str:
     names: set[str] = set()
     for output in transfer.outputs:
         for signal in transfer.inputs:
-            top = transfer.numerators[output, signal]
-            if not top:
+            numerator = transfer.numerators[output, signal]
+            if not numerator:
                 continue
             name = f"G_{identifier(output)}_{identifier(signal)}"
             while name in names:
                 name += "_"
             names.add(name)
-            bottom = transfer.denominator[output]
+            denominator = transfer.denominator[output]
             lines += [
                 "",
                 _comment(f"{output} from {signal}", "%"),
-                f"{name}.b = {vector([c for c, _ in top])};",
-                f"{name}.nb = {vector([p for _, p in top])};",
-                f"{name}.a = {vector([c for c, _ in bottom])};",
-                f"{name}.na = {vector([p for _, p in bottom])};",
+                f"{name}.b = {vector([c for c, _ in numerator])};",
+                f"{name}.nb = {vector([p for _, p in numerator])};",
+                f"{name}.a = {vector([c for c, _ in denominator])};",
+                f"{name}.na = {vector([p for _, p in denominator])};",
                 f"{name}.delay = {transfer.delay[signal]:.17g};",
                 "if exist('fotf', 'file')",
                 f"  {name} = fotf({name}.a, {name}.na, {name}.b, {name}.nb, {name}.delay);",
@@ -142,7 +142,7 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
     ModelError
         In the cases of :func:`approximate`; python-control need not be installed.
     """
-    near = approximate(model, band=band, order=order)
+    approximation = approximate(model, band=band, order=order)
 
     def matrix(values: Floats) -> str:
         rows = ",\n    ".join(repr([float(v) for v in row]) for row in values)
@@ -151,15 +151,16 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
         *(_comment(format_equation(e, model.structure.describe_inputs(".6g")), "#") for e in model.equations),
-        *(_comment(line, "#") for line in str(near).splitlines()),
+        *(_comment(line, "#") for line in str(approximation).splitlines()),
         "import control",
         "import numpy as np",
         "",
-        f"A = {matrix(near.a)}",
-        f"B = {matrix(near.b)}",
-        f"C = {matrix(near.c)}",
-        f"D = {matrix(near.d)}",
-        f"system = control.ss(A, B, C, D, inputs={list(near.inputs)!r}, outputs={list(near.outputs)!r}, "
+        f"A = {matrix(approximation.a)}",
+        f"B = {matrix(approximation.b)}",
+        f"C = {matrix(approximation.c)}",
+        f"D = {matrix(approximation.d)}",
+        f"system = control.ss(A, B, C, D, inputs={list(approximation.inputs)!r}, "
+        f"outputs={list(approximation.outputs)!r}, "
         f"name={identifier(model.structure.name)!r})",
     ]
     return "\n".join(lines) + "\n"
@@ -227,12 +228,16 @@ def to_tf(model: Model) -> Any:
     control = python_control()
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
-    filtered, top, bottom = _output_filter(model, transfer.inputs)
+    filtered, filter_numerator, filter_denominator = _output_filter(model, transfer.inputs)
     tops, bottoms = [], []
     for output in transfer.outputs:
-        through, under = (top, bottom) if output in filtered else (np.ones(1), np.ones(1))
-        denominator = np.convolve(_coefficients(transfer.denominator[output]), under)
-        tops.append([np.convolve(_coefficients(transfer.numerators[output, u]), through) for u in transfer.inputs])
+        output_numerator, output_denominator = (
+            (filter_numerator, filter_denominator) if output in filtered else (np.ones(1), np.ones(1))
+        )
+        denominator = np.convolve(_coefficients(transfer.denominator[output]), output_denominator)
+        tops.append(
+            [np.convolve(_coefficients(transfer.numerators[output, u]), output_numerator) for u in transfer.inputs]
+        )
         bottoms.append([denominator] * len(transfer.inputs))
     names = {"inputs": list(transfer.inputs), "outputs": list(transfer.outputs)}
     system = control.TransferFunction(tops, bottoms, name=identifier(model.structure.name), **names)
@@ -273,20 +278,31 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
     control = python_control()
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
-    orders = {o.constant for item in model.equations for o in item.orders}
+    orders = {o.constant for equation in model.equations for o in equation.orders}
     _coefficients([(1.0, order) for order in sorted(orders)])
     inputs = response_inputs(model, coupled=True)
-    filtered, top, bottom = _output_filter(model, inputs)
+    filtered, filter_numerator, filter_denominator = _output_filter(model, inputs)
     a, b, c, d = state_space_matrices(model, {}, (1.0, 1.0), 1)
     for i, name in enumerate(model.outputs):
         if name in filtered:
-            a, b, c, d = _filter_output(a, b, c, d, i, np.pad(top, (bottom.size - top.size, 0)), bottom)
+            a, b, c, d = _filter_output(
+                a,
+                b,
+                c,
+                d,
+                i,
+                np.pad(filter_numerator, (filter_denominator.size - filter_numerator.size, 0)),
+                filter_denominator,
+            )
     delay = {name: model.structure.delay.get(name, 0.0) for name in inputs}
     if step is not None:
         interval = check_step(step, "step")
-        early = next((name for name, seconds in delay.items() if seconds < 0.0), None)
-        if early is not None:
-            raise ModelError(f"{early} acts {-delay[early]:g} s before its sample; shift its rows, and identify again")
+        advanced_input = next((name for name, seconds in delay.items() if seconds < 0.0), None)
+        if advanced_input is not None:
+            raise ModelError(
+                f"{advanced_input} acts {-delay[advanced_input]:g} s before its sample; shift its rows, and "
+                "identify again"
+            )
         a, b, c, d = _sample_system(a, b, c, d, [delay[name] for name in inputs], interval)
     names = {"inputs": list(inputs), "outputs": list(model.outputs), "name": identifier(model.structure.name)}
     if step is not None:
@@ -330,16 +346,16 @@ def _filter_output(
     `output` is the index of the output. `numerator` and `denominator` are the coefficients of the filter in descending
     powers, and have the same length.
     """
-    count, own = denominator.size - 1, a.shape[0]
+    count, filter_states = denominator.size - 1, a.shape[0]
     numerator, denominator = numerator / denominator[0], denominator / denominator[0]
     shift = np.eye(count, k=1)
     shift[:, :1] -= denominator[1:, None]
     fed = (numerator[1:] - denominator[1:] * numerator[0])[:, None]
-    a = np.block([[a, np.zeros((own, count))], [fed @ c[output : output + 1], shift]])
+    a = np.block([[a, np.zeros((filter_states, count))], [fed @ c[output : output + 1], shift]])
     b = np.vstack([b, fed @ d[output : output + 1]])
     c = np.hstack([c, np.zeros((c.shape[0], count))])
     c[output], d[output] = numerator[0] * c[output], numerator[0] * d[output]
-    c[output, own : own + 1] += 1.0
+    c[output, filter_states : filter_states + 1] += 1.0
     return a, b, c, d
 
 
@@ -358,28 +374,32 @@ def _sample_system(
 
         `column` is the input matrix of this input, shape (states, 1).
         """
-        whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
-        return whole[:-1, :-1], whole[:-1, -1:]
+        exponential = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
+        return exponential[:-1, :-1], exponential[:-1, -1:]
 
     count, inputs = a.shape[0], b.shape[1]
-    whole = [math.floor(delay / step + WHOLE_DELAY_TOLERANCE) for delay in delays]
-    parts = [max(delay - k * step, 0.0) for delay, k in zip(delays, whole, strict=True)]
-    lengths = [k + (part > WHOLE_DELAY_TOLERANCE * step) for k, part in zip(whole, parts, strict=True)]
-    size = count + sum(lengths)
+    whole_steps = [math.floor(delay / step + WHOLE_DELAY_TOLERANCE) for delay in delays]
+    fractions = [max(delay - k * step, 0.0) for delay, k in zip(delays, whole_steps, strict=True)]
+    lengths = [
+        k + (fraction > WHOLE_DELAY_TOLERANCE * step) for k, fraction in zip(whole_steps, fractions, strict=True)
+    ]
+    state_count = count + sum(lengths)
     # The columns are the states, past values of each input, and the inputs at this sample.
-    motion, read = np.zeros((size, size + inputs)), np.zeros((c.shape[0], size + inputs))
-    motion[:count, :count], read[:, :count] = hold(np.zeros((count, 1)), step)[0], c
-    first = count
+    motion, output_map = np.zeros((state_count, state_count + inputs)), np.zeros((c.shape[0], state_count + inputs))
+    motion[:count, :count], output_map[:, :count] = hold(np.zeros((count, 1)), step)[0], c
+    state = count
     for j, length in enumerate(lengths):
-        column, late = b[:, j : j + 1], length > whole[j]
-        column_indices = [size + j, *range(first, first + length)]
-        motion[:count, [column_indices[whole[j]]]] += hold(column, step - parts[j] if late else step)[1]
-        read[:, column_indices[-1]] += d[:, j]
-        if late:
-            motion[:count, [column_indices[-1]]] += hold(column, step - parts[j])[0] @ hold(column, parts[j])[1]
+        column, has_full_delay = b[:, j : j + 1], length > whole_steps[j]
+        column_indices = [state_count + j, *range(state, state + length)]
+        motion[:count, [column_indices[whole_steps[j]]]] += hold(
+            column, step - fractions[j] if has_full_delay else step
+        )[1]
+        output_map[:, column_indices[-1]] += d[:, j]
+        if has_full_delay:
+            motion[:count, [column_indices[-1]]] += hold(column, step - fractions[j])[0] @ hold(column, fractions[j])[1]
         motion[column_indices[1:], column_indices[:-1]] = 1.0
-        first += length
-    return motion[:, :size], motion[:, size:], read[:, :size], read[:, size:]
+        state += length
+    return motion[:, :state_count], motion[:, state_count:], output_map[:, :state_count], output_map[:, state_count:]
 
 
 def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
@@ -407,25 +427,25 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
             "system"
         )
     if hasattr(system, "A"):
-        parts = _from_state_space(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
+        polynomials = _from_state_space(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
     elif hasattr(system, "num") and hasattr(system, "den"):
-        parts = _from_fractions(system.num, system.den)
+        polynomials = _from_fractions(system.num, system.den)
     else:
         raise ModelError(
             f"{type(system).__name__} is not a system of python-control with equations; for a measured response use "
             "ftlm.FrequencyData.from_arrays"
         )
-    signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(parts[0][1]))
-    results = _names("outputs", outputs, getattr(system, "output_labels", None), len(parts))
+    signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(polynomials[0][1]))
+    results = _names("outputs", outputs, getattr(system, "output_labels", None), len(polynomials))
     twice = sorted(set(signals) & set(results))
     if twice:
         raise ModelError(
             f"{', '.join(twice)}: each is the name of both an input and an output; pass {parameter('inputs')} and "
             f"{parameter('outputs')} with other names"
         )
-    rows = zip(results, parts, strict=True)
+    rows = zip(results, polynomials, strict=True)
     return equation(
-        "\n".join(_equation_text(name, signals, *part) for name, part in rows),
+        "\n".join(_equation_text(name, signals, *polynomial) for name, polynomial in rows),
         coupling="measured",
         delay=_input_delays(system, signals),
     )
@@ -447,26 +467,26 @@ def _input_delays(system: Any, signals: Sequence[str]) -> dict[str, float]:
     return {name: float(delays[label]) for label, name in zip(labels, signals, strict=True) if delays.get(label)}
 
 
-def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
+def _equation_text(output: str, inputs: Sequence[str], denominator: Floats, numerators: Sequence[Floats]) -> str:
     """Return an equation D^n y = … as text, from a monic denominator and a numerator for each input.
 
     Polynomials have their highest power first. Raise ModelError if the order n is not from 1 to 10, a numerator has a
     higher order, or all numerators are 0.
     """
-    order = bottom.size - 1
+    order = denominator.size - 1
     if not 0 < order <= MAX_ORDER:
         raise ModelError(
             f"the equation of {output} would be of order {order}; an equation has an order from 1 to {MAX_ORDER:g}"
         )
-    terms = [(-c, output, order - k) for k, c in enumerate(bottom) if k > 0]
-    for name, top in zip(inputs, tops, strict=True):
-        if top.size > bottom.size:
+    terms = [(-c, output, order - k) for k, c in enumerate(denominator) if k > 0]
+    for name, numerator in zip(inputs, numerators, strict=True):
+        if numerator.size > denominator.size:
             raise ModelError(f"{output} from {name} has more zeros than poles; add a fast pole")
-        terms += [(c, name, top.size - 1 - k) for k, c in enumerate(top)]
-    words = [f"{float(c)!r} D^{k} {name}" for c, name, k in terms if c]
+        terms += [(c, name, numerator.size - 1 - k) for k, c in enumerate(numerator)]
+    term_texts = [f"{float(c)!r} D^{k} {name}" for c, name, k in terms if c]
     if not any(name != output for c, name, _ in terms if c):
         raise ModelError(f"no input affects {output}; leave this output out")
-    return f"D^{order} {output} = " + " + ".join(words).replace("+ -", "- ")
+    return f"D^{order} {output} = " + " + ".join(term_texts).replace("+ -", "- ")
 
 
 def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
@@ -475,18 +495,22 @@ def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]
     `tops` and `bottoms` are numerators and denominators by output and input, with the highest power first.
     """
     fractions = []
-    for top, bottom in zip(tops, bottoms, strict=True):
-        own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
-        distinct: list[Floats] = []
-        for d in (d / d[0] for d in own):
-            if not any(d.size == denominator.size and np.array_equal(d, denominator) for denominator in distinct):
-                distinct.append(d)
-        common = functools.reduce(np.convolve, distinct, np.ones(1))
+    for numerator_row, denominator_row in zip(tops, bottoms, strict=True):
+        denominators = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in denominator_row]
+        distinct_denominators: list[Floats] = []
+        for d in (d / d[0] for d in denominators):
+            if not any(
+                d.size == denominator.size and np.array_equal(d, denominator) for denominator in distinct_denominators
+            ):
+                distinct_denominators.append(d)
+        common = functools.reduce(np.convolve, distinct_denominators, np.ones(1))
         numerators = []
-        for n, d in zip(top, own, strict=True):
-            rest = [denominator for denominator in distinct if not np.array_equal(denominator, d / d[0])]
+        for n, d in zip(numerator_row, denominators, strict=True):
+            other_factors = [
+                denominator for denominator in distinct_denominators if not np.array_equal(denominator, d / d[0])
+            ]
             values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
-            numerators.append(functools.reduce(np.convolve, rest, values) if values.size else np.zeros(1))
+            numerators.append(functools.reduce(np.convolve, other_factors, values) if values.size else np.zeros(1))
         fractions.append((common, numerators))
     return fractions
 
@@ -494,42 +518,42 @@ def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]
 def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
     """Return, for each output, the monic denominator and the numerators of all inputs (Faddeev-LeVerrier algorithm)."""
     count = a.shape[0]
-    bottom, powers = [1.0], [np.eye(count)]
+    denominator, powers = [1.0], [np.eye(count)]
     for k in range(1, count + 1):
         product = a @ powers[-1]
-        bottom.append(-float(np.trace(product)) / k)
-        powers.append(product + bottom[-1] * np.eye(count))
+        denominator.append(-float(np.trace(product)) / k)
+        powers.append(product + denominator[-1] * np.eye(count))
     scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
     fractions = []
     for i, row in enumerate(c):
         tops = []
         for j in range(b.shape[1]):
-            top = d[i, j] * np.array(bottom)
-            top[1:] += [float(row @ p @ b[:, j]) for p in powers[:count]]
+            numerator = d[i, j] * np.array(denominator)
+            numerator[1:] += [float(row @ p @ b[:, j]) for p in powers[:count]]
             if d[i, j] == 0.0:
-                size = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
-                answers = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
-                rows = [k for k, v in enumerate(answers) if v > MARKOV_TOLERANCE * size * scale**k]
-                top[: 1 + (rows[0] if rows else count)] = 0.0
-            tops.append(top)
-        fractions.append((np.array(bottom), tops))
+                row_scale = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
+                markov_magnitudes = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
+                rows = [k for k, v in enumerate(markov_magnitudes) if v > MARKOV_TOLERANCE * row_scale * scale**k]
+                numerator[: 1 + (rows[0] if rows else count)] = 0.0
+            tops.append(numerator)
+        fractions.append((np.array(denominator), tops))
     return fractions
 
 
-def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
+def _names(kind: str, names_argument: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
     """Return the names of `count` signals from the argument, or else from the labels of the system.
 
-    The label u[0] becomes u0, or u if there is only one signal. `what` is "inputs" or "outputs". Raise ModelError for a
+    The label u[0] becomes u0, or u if there is only one signal. `kind` is "inputs" or "outputs". Raise ModelError for a
     wrong number of names.
     """
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
             raise ModelError(
-                f"{what}: {plural(len(names), 'name', 'are')} given, but the system has {count}; give "
+                f"{kind}: {plural(len(names), 'name', 'are')} given, but the system has {count}; give "
                 f"{plural(count, 'name')}"
             )
         return names
-    names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
-    plain = [_LABEL_PATTERN.fullmatch(n) for n in names]
-    return [n if m is None else m[1] + (m[2] if count > 1 else "") for n, m in zip(names, plain, strict=True)]
+    names = list(labels) if labels else [f"{kind[0]}[{k}]" for k in range(count)]
+    label_matches = [_LABEL_PATTERN.fullmatch(n) for n in names]
+    return [n if m is None else m[1] + (m[2] if count > 1 else "") for n, m in zip(names, label_matches, strict=True)]

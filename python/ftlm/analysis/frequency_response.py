@@ -32,11 +32,12 @@ CANCELLATION_TOLERANCE = 1e-13
 DERIVATIVE_STEP_RATIO = 1e-6
 
 
-def check_no_input_nonlinearity(model: Model, what: str) -> None:
-    """Raise ModelError if an input has a saturation or a dead zone; `what` names the linear analysis."""
+def check_no_input_nonlinearity(model: Model, operation: str) -> None:
+    """Raise ModelError if an input has a saturation or a dead zone; `operation` names the linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
-            f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {what} cannot represent; "
+            f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {operation} cannot "
+            "represent; "
             "use simulations (simulate, compare), or a model of the equation without it"
         )
 
@@ -48,26 +49,26 @@ def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
     """
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
-    read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
-    return tuple(dict.fromkeys(s for s in model.structure.signals if s in read))
+    input_names = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
+    return tuple(dict.fromkeys(s for s in model.structure.signals if s in input_names))
 
 
-def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
+def equation_polynomials(equation: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
     """Return the polynomials in s of an equation: a list for the outputs `names`, and a dictionary for other signals.
 
     Terms of the outputs are moved to the left-hand side. Raise ModelError for friction or a non-linear term.
     """
-    check_linear([item], "a frequency response")
+    check_linear([equation], "a frequency response")
     polynomials: list[Polynomial] = [{} for _ in names]
-    right: dict[str, Polynomial] = {}
-    polynomials[names.index(item.output)][item.order.constant] = 1.0
-    for term in item.terms:
+    input_polynomials: dict[str, Polynomial] = {}
+    polynomials[names.index(equation.output)][equation.order.constant] = 1.0
+    for term in equation.terms:
         value = {term.order.constant: float(term.fixed or 0.0)}
         if term.signal in names:
             add_polynomial(polynomials[names.index(term.signal)], value, -1.0)
         else:
-            add_polynomial(right.setdefault(term.signal, {}), value)
-    return polynomials, right
+            add_polynomial(input_polynomials.setdefault(term.signal, {}), value)
+    return polynomials, input_polynomials
 
 
 def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
@@ -77,7 +78,7 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
     """
     n = len(matrix)
     out: Polynomial = {}
-    size: Polynomial = {}
+    magnitudes: Polynomial = {}
     for order in itertools.permutations(range(n)):
         sign = 1.0
         for i, j in itertools.combinations(range(n), 2):
@@ -86,8 +87,8 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
         for i, j in enumerate(order):
             product = multiply_polynomials(product, matrix[i][j])
         add_polynomial(out, product, sign)
-        add_polynomial(size, {p: abs(v) for p, v in product.items()})
-    return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLATION_TOLERANCE * size[p]}
+        add_polynomial(magnitudes, {p: abs(v) for p, v in product.items()})
+    return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLATION_TOLERANCE * magnitudes[p]}
 
 
 @dataclass(frozen=True)
@@ -148,17 +149,17 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
         items = [e for e in model.equations if e.output in names]
         rows = [equation_polynomials(e, names) for e in items]
         matrix = [lhs for lhs, _ in rows]
-        bottom = determinant(matrix)
-        if not bottom:
+        common_denominator = determinant(matrix)
+        if not common_denominator:
             raise ModelError(
                 f"the equations of {', '.join(names)} are linearly dependent (determinant 0); change one of them"
             )
         for j, output in enumerate(names):
-            denominator[output] = _coefficient_pairs(bottom)
+            denominator[output] = _coefficient_pairs(common_denominator)
             for signal in inputs:
-                column = [right.get(signal, {}) for _, right in rows]
-                replaced = [[*row[:j], column[i], *row[j + 1 :]] for i, row in enumerate(matrix)]
-                numerators[output, signal] = _coefficient_pairs(determinant(replaced))
+                column = [input_polynomials.get(signal, {}) for _, input_polynomials in rows]
+                replaced_matrix = [[*row[:j], column[i], *row[j + 1 :]] for i, row in enumerate(matrix)]
+                numerators[output, signal] = _coefficient_pairs(determinant(replaced_matrix))
     delay = {s: model.structure.delay.get(s, 0.0) for s in inputs}
     return TransferFunctions(model.outputs, inputs, denominator, numerators, delay)
 
@@ -207,11 +208,11 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     omega = as_floats("w", w)
     if omega.ndim != 1 or omega.size == 0:
         raise DataError(f"w has shape {omega.shape}; give a vector of frequencies in rad/s")
-    bad = ~(np.isfinite(omega) & (omega >= 0))
-    if np.any(bad):
-        at = int(np.argmax(bad))
+    is_invalid = ~(np.isfinite(omega) & (omega >= 0))
+    if np.any(is_invalid):
+        at = int(np.argmax(is_invalid))
         raise DataError(
-            f"w is {omega[at]} at index {at} ({int(np.sum(bad))} such values in all); give finite frequencies "
+            f"w is {omega[at]} at index {at} ({int(np.sum(is_invalid))} such values in all); give finite frequencies "
             "of at least 0 rad/s"
         )
     inputs = response_inputs(model, coupled=coupled)
@@ -221,13 +222,13 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
         items = [e for e in model.equations if e.output in names]
         a = np.zeros((omega.size, len(names), len(names)), dtype=np.complex128)
         b = np.zeros((omega.size, len(names), len(inputs)), dtype=np.complex128)
-        for i, item in enumerate(items):
-            lhs, right = equation_polynomials(item, names)
+        for i, equation in enumerate(items):
+            lhs, input_polynomials = equation_polynomials(equation, names)
             # Division by s^alpha at high frequencies avoids overflow.
-            scale = np.maximum(omega, 1.0) ** -item.order.constant
+            scale = np.maximum(omega, 1.0) ** -equation.order.constant
             for j, polynomial in enumerate(lhs):
                 a[:, i, j] = scale * value_at(polynomial, s)
-            for signal, polynomial in right.items():
+            for signal, polynomial in input_polynomials.items():
                 b[:, i, inputs.index(signal)] = scale * value_at(polynomial, s)
         singular = np.abs(np.linalg.det(a)) == 0
         a[singular] = np.eye(len(names))
@@ -253,11 +254,11 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
     """Return the values of a polynomial with real powers at complex frequencies s, in the shape of s."""
-    total = np.zeros(s.shape, dtype=np.complex128)
+    sum_of_terms = np.zeros(s.shape, dtype=np.complex128)
     for power, coefficient in polynomial.items():
         with np.errstate(divide="ignore", invalid="ignore"):
-            total += coefficient * (np.ones_like(s) if power == 0 else s**power)
-    return total
+            sum_of_terms += coefficient * (np.ones_like(s) if power == 0 else s**power)
+    return sum_of_terms
 
 
 @check_arguments
@@ -287,13 +288,15 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
             "this model has no covariance, so its response has no uncertainty; identify it with "
             f"{parameter('method', 'output-error')}, and without a term whose interval is infinite"
         )
-    centre = frequency_response(model, w, coupling=coupling)
-    derivative = np.zeros((len(matrix), *centre.shape), dtype=np.complex128)
-    for k, step, above, below in shifted_models(model, np.any(matrix != 0, axis=1), DERIVATIVE_STEP_RATIO):
-        higher, lower = (frequency_response(shifted, w, coupling=coupling) for shifted in (above, below))
+    nominal = frequency_response(model, w, coupling=coupling)
+    derivative = np.zeros((len(matrix), *nominal.shape), dtype=np.complex128)
+    for k, step, upper_model, lower_model in shifted_models(model, np.any(matrix != 0, axis=1), DERIVATIVE_STEP_RATIO):
+        higher, lower = (frequency_response(shifted, w, coupling=coupling) for shifted in (upper_model, lower_model))
         with np.errstate(divide="ignore", invalid="ignore"):
-            derivative[k] = (higher - lower) / (2 * step) / centre
-    variances = [np.einsum("i...,ij,j...->...", part, matrix, part) for part in (derivative.real, derivative.imag)]
+            derivative[k] = (higher - lower) / (2 * step) / nominal
+    variances = [
+        np.einsum("i...,ij,j...->...", component, matrix, component) for component in (derivative.real, derivative.imag)
+    ]
     gain, phase = (np.sqrt(np.maximum(v, 0.0)) for v in variances)
     return gain, phase
 
@@ -312,27 +315,33 @@ def parameter_vector(model: Model) -> Floats:
     coefficient of a term includes its known factor. The input parameters are those of ``Structure.fixed_inputs``:
     delays, saturations and dead zones.
     """
-    numbers: list[float] = []
-    for item in model.equations:
-        numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
-        numbers += [] if item.friction is None else item.friction.numbers
-    return np.array([*numbers, *model.structure.fixed_inputs.values()])
+    parameters: list[float] = []
+    for equation in model.equations:
+        parameters += [
+            equation.order.constant,
+            *(v for t in equation.terms for v in (t.order.constant, float(t.fixed or 0.0))),
+        ]
+        parameters += [] if equation.friction is None else equation.friction.numbers
+    return np.array([*parameters, *model.structure.fixed_inputs.values()])
 
 
-def with_parameter_vector(model: Model, numbers: Floats) -> Model:
+def with_parameter_vector(model: Model, parameters: Floats) -> Model:
     """Return the model with parameters from a vector, in the sequence of :func:`parameter_vector`."""
-    at = iter(numbers.tolist())
+    at = iter(parameters.tolist())
     equations = []
-    for item in model.equations:
-        alpha = replace(item.order, constant=next(at))
+    for equation in model.equations:
+        alpha = replace(equation.order, constant=next(at))
         # Keyword arguments are evaluated in this sequence: the order first, then the coefficient.
         terms = [
-            replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
+            replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor)
+            for t in equation.terms
         ]
         friction = (
-            None if item.friction is None else item.friction.with_numbers([next(at) for _ in item.friction.numbers])
+            None
+            if equation.friction is None
+            else equation.friction.with_numbers([next(at) for _ in equation.friction.numbers])
         )
-        equations.append(_replace_unchecked(item, alpha, tuple(terms), friction))
+        equations.append(_replace_unchecked(equation, alpha, tuple(terms), friction))
     structure = replace(model.structure, equations=tuple(equations))
     return replace(model, structure=structure.with_inputs({name: next(at) for name in structure.fixed_inputs}))
 
@@ -350,14 +359,16 @@ def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Ite
         yield k, step, with_parameter_vector(model, values + shift), with_parameter_vector(model, values - shift)
 
 
-def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], friction: Friction | None) -> Equation:
+def _replace_unchecked(
+    equation: Equation, order: Order, terms: tuple[Term, ...], friction: Friction | None
+) -> Equation:
     """Return an equation with other orders, terms and friction, without range checks.
 
     Numerical derivatives at a limit of the range require orders beyond the limit.
     """
-    new = copy.copy(item)
-    vars(new).update(order=order, terms=terms, coulomb=UNSET if friction is None else friction)
-    return new
+    copied = copy.copy(equation)
+    vars(copied).update(order=order, terms=terms, coulomb=UNSET if friction is None else friction)
+    return copied
 
 
 def linear_part(model: Model) -> Model:
@@ -366,15 +377,15 @@ def linear_part(model: Model) -> Model:
     The result describes small deviations under three conditions. Velocities on which friction acts neither are 0 nor
     change sign. They are well above the Stribeck speed. Inputs are between dead zone and saturation.
     """
-    structure, keep = model.structure, list[bool]()
-    for item in model.equations:
-        keep += [True] * (1 + 2 * len(item.terms))
-        keep += [False] * (0 if item.friction is None else len(item.friction.numbers))
-    keep += [True] * len(structure.delay) + [False] * (len(structure.fixed_inputs) - len(structure.delay))
+    structure, is_linear = model.structure, list[bool]()
+    for equation in model.equations:
+        is_linear += [True] * (1 + 2 * len(equation.terms))
+        is_linear += [False] * (0 if equation.friction is None else len(equation.friction.numbers))
+    is_linear += [True] * len(structure.delay) + [False] * (len(structure.fixed_inputs) - len(structure.delay))
     equations = tuple(replace(e, coulomb=UNSET) for e in structure.equations)
     matrix, estimate = covariance_of(model), model.estimate
     if matrix is not None and estimate is not None:
-        rows = tuple(tuple(row) for row in matrix[np.ix_(keep, keep)].tolist())
+        rows = tuple(tuple(row) for row in matrix[np.ix_(is_linear, is_linear)].tolist())
         estimate = msgspec.structs.replace(estimate, covariance=rows)
     return replace(
         model, structure=replace(structure, equations=equations, input_nonlinearities=UNSET), estimate=estimate
@@ -423,8 +434,8 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     out = np.zeros((len(model.outputs), len(inputs), t.size))
     for k, name in enumerate(inputs):
         drive = {n: np.full(t.size, float(n == name)) for n in inputs}
-        rest = {n: np.zeros(t.size) for n in model.outputs}
-        run = Run.from_arrays(step=step, inputs=drive, outputs=rest, name=f"unit step of {name}")
+        zero_outputs = {n: np.zeros(t.size) for n in model.outputs}
+        run = Run.from_arrays(step=step, inputs=drive, outputs=zero_outputs, name=f"unit step of {name}")
         stepped = simulate(together, run, tolerance=tolerance)
         for i, output in enumerate(model.outputs):
             out[i, k] = stepped[output]

@@ -30,10 +30,10 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Ratio:
-    """Transfer function: numerator `top` and denominator `bottom` with real powers of s, and a delay [s]."""
+    """Transfer function: numerator `numerator` and denominator `denominator` with real powers of s, and a delay [s]."""
 
-    top: Polynomial
-    bottom: Polynomial
+    numerator: Polynomial
+    denominator: Polynomial
     delay: float
 
     def model(self, output: str, signal: str, *, improper_order: float = 0.0) -> Model:
@@ -43,18 +43,22 @@ class Ratio:
         if it exceeds this limit, if the numerator or denominator is 0, or if the order of the denominator is not in (0,
         10].
         """
-        bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
-        if not bottom or not top:
+        denominator, numerator = (
+            {p: c for p, c in polynomial.items() if c != 0.0} for polynomial in (self.denominator, self.numerator)
+        )
+        if not denominator or not numerator:
             raise ModelError(
-                f"the {'denominator' if top else 'numerator'} is 0, so the result is not a model; change an operand"
+                f"the {'denominator' if numerator else 'numerator'} is 0, so the result is not a model; change an "
+                "operand"
             )
         # Powers below 0 are integrals of a signal; a multiplication by a power of s removes them from the equation.
-        shift = -min(0.0, *bottom, *top)
-        highest = max(bottom)
-        order, gain = highest + shift, bottom[highest]
-        if max(top) > highest + improper_order:
+        shift = -min(0.0, *denominator, *numerator)
+        highest = max(denominator)
+        order, gain = highest + shift, denominator[highest]
+        if max(numerator) > highest + improper_order:
             raise ModelError(
-                f"the numerator is of order {max(top) + shift:g} and the denominator of order {order:g}, so a step "
+                f"the numerator is of order {max(numerator) + shift:g} and the denominator of order {order:g}, so a "
+                "step "
                 "would give an infinite output; add a fast pole, or identify it from frequency responses with "
                 "identify_frequency"
             )
@@ -62,11 +66,11 @@ class Ratio:
             raise ModelError(
                 f"the denominator is of order {order:g}; an equation has an order above 0, at most {MAX_ORDER:g}"
             )
-        terms = [(-c / gain, output, p + shift) for p, c in bottom.items() if p != highest]
-        terms += [(c / gain, signal, p + shift) for p, c in top.items()]
-        words = " + ".join(f"{c!r} D^{p!r} {name}" for c, name, p in terms).replace("+ -", "- ")
+        terms = [(-c / gain, output, p + shift) for p, c in denominator.items() if p != highest]
+        terms += [(c / gain, signal, p + shift) for p, c in numerator.items()]
+        right_side = " + ".join(f"{c!r} D^{p!r} {name}" for c, name, p in terms).replace("+ -", "- ")
         delay = {signal: self.delay} if self.delay else None
-        return Model(equation(f"D^{order!r} {output} = {words}", delay=delay))
+        return Model(equation(f"D^{order!r} {output} = {right_side}", delay=delay))
 
 
 @check_arguments
@@ -132,7 +136,7 @@ def _polynomial(name: str, values_argument: Any) -> Polynomial:
         and len(values) == 2
         and not any(isinstance(v, (Real, tuple)) for v in values)
     ):
-        coefficients, powers = (list(side) for side in values)
+        coefficients, powers = (list(numbers) for numbers in values)
         if len(coefficients) != len(powers):
             raise ModelError(
                 f"{name} has {plural(len(coefficients), 'coefficient')} and {plural(len(powers), 'power')}; "
@@ -153,33 +157,37 @@ def _polynomial(name: str, values_argument: Any) -> Polynomial:
     return out
 
 
-def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
+def _ratio(model: Model, operation: str) -> tuple[Ratio, str, str]:
     """Return (transfer function, output name, input name) of a linear model with one output and one input.
 
-    `what` names the operation in messages. Raise ModelError for other models.
+    `operation` names the operation in messages. Raise ModelError for other models.
     """
-    check_no_input_nonlinearity(model, what)
+    check_no_input_nonlinearity(model, operation)
     if model.structure.has_friction or model.structure.sensor_filter is not None:
         raise ModelError(
-            f"{what} requires a linear model without friction and sensor filter; leave these out of the equation"
+            f"{operation} requires a linear model without friction and sensor filter; leave these out of the equation"
         )
     transfer = transfer_functions(model)
     if len(transfer.outputs) != 1 or len(transfer.inputs) != 1:
         raise ModelError(
-            f"{what} requires a model with one output and one input; this model has {', '.join(transfer.outputs)} from "
+            f"{operation} requires a model with one output and one input; this model has "
+            f"{', '.join(transfer.outputs)} from "
             f"{', '.join(transfer.inputs) or 'no input'}"
         )
     (output,), (signal,) = transfer.outputs, transfer.inputs
-    top = {p: c for c, p in transfer.numerators[output, signal]}
-    bottom = {p: c for c, p in transfer.denominator[output]}
-    return Ratio(top, bottom, transfer.delay[signal]), output, signal
+    numerator = {p: c for c, p in transfer.numerators[output, signal]}
+    denominator = {p: c for c, p in transfer.denominator[output]}
+    return Ratio(numerator, denominator, transfer.delay[signal]), output, signal
 
 
 def series(first: Model, second: Model) -> Model:
     """Return the series connection of `first` followed by `second`; see :meth:`ftlm.Model.series`."""
     (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
-    top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
-    return Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
+    numerator, denominator = (
+        multiply_polynomials(a.numerator, b.numerator),
+        multiply_polynomials(a.denominator, b.denominator),
+    )
+    return Ratio(numerator, denominator, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
 def combine(operator: str, left: Model | float, right: Model | float, what: str | None = None) -> Model:
@@ -189,7 +197,9 @@ def combine(operator: str, left: Model | float, right: Model | float, what: str 
     acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
     :meth:`ftlm.Model.parallel` and :meth:`ftlm.Model.inverse`.
     """
-    (a, output, _), (b, _, signal) = (_operand(side, what or f"the operator {operator}") for side in (left, right))
+    (a, output, _), (b, _, signal) = (
+        _operand(operand, what or f"the operator {operator}") for operand in (left, right)
+    )
     if operator in "+-" and a.delay != b.delay:
         raise ModelError(
             f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
@@ -198,22 +208,29 @@ def combine(operator: str, left: Model | float, right: Model | float, what: str 
     if operator == "/" and b.delay:
         raise ModelError(f"the divisor has a delay of {b.delay:g} s, so its inverse is not causal; leave the delay out")
     if operator == "/":
-        b = Ratio(b.bottom, b.top, 0.0)
-    top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
+        b = Ratio(b.denominator, b.numerator, 0.0)
+    numerator, denominator = (
+        multiply_polynomials(a.numerator, b.numerator),
+        multiply_polynomials(a.denominator, b.denominator),
+    )
     delay = a.delay + b.delay
     if operator in "+-":
-        top, delay = multiply_polynomials(a.top, b.bottom), a.delay
-        add_polynomial(top, multiply_polynomials(b.top, a.bottom), 1.0 if operator == "+" else -1.0)
+        numerator, delay = multiply_polynomials(a.numerator, b.denominator), a.delay
+        add_polynomial(numerator, multiply_polynomials(b.numerator, a.denominator), 1.0 if operator == "+" else -1.0)
     if not isinstance(left, Model):
         output = _operand(right, "")[1]
     if not isinstance(right, Model) or operator != "*":
         signal = _operand(left if isinstance(left, Model) else right, "")[2]
-    return Ratio(top, bottom, delay).model(_distinct_name(output, signal), signal)
+    return Ratio(numerator, denominator, delay).model(_distinct_name(output, signal), signal)
 
 
-def _operand(side: Model | float, what: str) -> tuple[Ratio, str, str]:
+def _operand(operand: Model | float, operation: str) -> tuple[Ratio, str, str]:
     """Return (transfer function, output name, input name) of a model; for a number, a gain without signals."""
-    return _ratio(side, what) if isinstance(side, Model) else (Ratio({0.0: float(side)}, {0.0: 1.0}, 0.0), "", "")
+    return (
+        _ratio(operand, operation)
+        if isinstance(operand, Model)
+        else (Ratio({0.0: float(operand)}, {0.0: 1.0}, 0.0), "", "")
+    )
 
 
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:
@@ -229,17 +246,17 @@ def feedback(forward: Model, back: Model | float, sign: int) -> Model:
             f"the loop has a delay of {a.delay + b.delay:g} s, and a closed loop with a delay is not an equation; use "
             "frequency_response of both, or ftlm.control"
         )
-    bottom = multiply_polynomials(a.bottom, b.bottom)
-    add_polynomial(bottom, multiply_polynomials(a.top, b.top), -float(sign))
-    return Ratio(multiply_polynomials(a.top, b.bottom), bottom, 0.0).model(output, signal)
+    denominator = multiply_polynomials(a.denominator, b.denominator)
+    add_polynomial(denominator, multiply_polynomials(a.numerator, b.numerator), -float(sign))
+    return Ratio(multiply_polynomials(a.numerator, b.denominator), denominator, 0.0).model(output, signal)
 
 
 def inverse(model: Model) -> Model:
     """Return the model with output and input exchanged; see :meth:`ftlm.Model.inverse`."""
-    own, output, signal = _ratio(model, "an inverse")
-    if own.delay:
-        raise ModelError(f"the inverse would need the output {own.delay:g} s in advance; leave the delay out")
-    return Ratio(own.bottom, own.top, 0.0).model(signal, output)
+    ratio, output, signal = _ratio(model, "an inverse")
+    if ratio.delay:
+        raise ModelError(f"the inverse would need the output {ratio.delay:g} s in advance; leave the delay out")
+    return Ratio(ratio.denominator, ratio.numerator, 0.0).model(signal, output)
 
 
 def _distinct_name(output: str, signal: str) -> str:
@@ -261,7 +278,7 @@ def linearize(model: Model, at: Mapping[str, float]) -> Model:
                 f"give its value with {parameter('at')}"
             )
     values = {c: point.get(c, 0.0) for c in channels}
-    equations = tuple(_linearized_equation(item, values) for item in model.equations)
+    equations = tuple(_linearized_equation(equation, values) for equation in model.equations)
     return replace(model, structure=replace(model.structure, equations=equations), estimate=None)
 
 
@@ -273,33 +290,37 @@ def _channel_of(name: str) -> Channel:
     return parsed.signal, parsed.value
 
 
-def _linearized_equation(item: Equation, values: Mapping[Channel, float]) -> Equation:
+def _linearized_equation(equation: Equation, values: Mapping[Channel, float]) -> Equation:
     """Return an equation with every non-linear term replaced by its first-order terms, without constants.
 
     `values` is the operating point. Raise ModelError if a term has no derivative there, or the highest derivative
     cancels.
     """
-    if not item.nonlinear_terms:
-        return item
-    terms = [t for t in item.terms if t.nonlinear is None]
+    if not equation.nonlinear_terms:
+        return equation
+    terms = [t for t in equation.terms if t.nonlinear is None]
     slopes: dict[tuple[str, Order], float] = {}
-    for term in item.nonlinear_terms:
+    for term in equation.nonlinear_terms:
         shape = term.nonlinear
         assert shape is not None
         for (signal, order), slope in shape.gradient(values).items():
             if not math.isfinite(slope):
-                where = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in shape.channels)
-                raise ModelError(f"{shape} has no derivative at {where}; choose another operating point")
-            place = signal, Order(round(term.order.constant + order, 9))
-            slopes[place] = slopes.get(place, 0.0) + float(term.fixed or 0.0) * float(slope)
-    leading = 1.0 - slopes.pop((item.output, item.order), 0.0)
-    if abs(leading) <= CANCELLATION_TOLERANCE:
-        raise ModelError(f"the highest derivative of {item.output} cancels at this operating point; choose another one")
+                point_text = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in shape.channels)
+                raise ModelError(f"{shape} has no derivative at {point_text}; choose another operating point")
+            column = signal, Order(round(term.order.constant + order, 9))
+            slopes[column] = slopes.get(column, 0.0) + float(term.fixed or 0.0) * float(slope)
+    leading_coefficient = 1.0 - slopes.pop((equation.output, equation.order), 0.0)
+    if abs(leading_coefficient) <= CANCELLATION_TOLERANCE:
+        raise ModelError(
+            f"the highest derivative of {equation.output} cancels at this operating point; choose another one"
+        )
     for k, term in enumerate(terms):
         if (term.signal, term.order) in slopes:
             value = float(term.fixed or 0.0) + slopes.pop((term.signal, term.order))
             terms[k] = Term(term.signal, term.order, value)
-    terms += [Term(signal, order, slope) for (signal, order), slope in slopes.items() if slope or signal != item.output]
-    if leading != 1.0:
-        terms = [Term(t.signal, t.order, float(t.fixed or 0.0) / leading) for t in terms]
-    return replace(item, terms=tuple(terms))
+    terms += [
+        Term(signal, order, slope) for (signal, order), slope in slopes.items() if slope or signal != equation.output
+    ]
+    if leading_coefficient != 1.0:
+        terms = [Term(t.signal, t.order, float(t.fixed or 0.0) / leading_coefficient) for t in terms]
+    return replace(equation, terms=tuple(terms))

@@ -79,19 +79,19 @@ class Stability:
         return self.stable
 
     def __str__(self) -> str:
-        why = []
+        reasons = []
         if self.unstable_poles > 0:
             count = int(self.unstable_poles)
-            why.append(f"{count} pole{'s' if count > 1 else ''} with a positive real part")
+            reasons.append(f"{count} pole{'s' if count > 1 else ''} with a positive real part")
         if self.on_axis:
-            why.append("a pole on the imaginary axis")
+            reasons.append("a pole on the imaginary axis")
         if self.origin_order > 0:
-            why.append(f"it integrates its input with order {self.origin_order:g}")
-        verdict = "stable" if self.stable else f"not stable: {', '.join(why)}"
-        how = self.method
+            reasons.append(f"it integrates its input with order {self.origin_order:g}")
+        verdict = "stable" if self.stable else f"not stable: {', '.join(reasons)}"
+        method_text = self.method
         if self.method == "poles" and self.base:
-            how = "poles in s" if self.base == 1.0 else f"poles in s^{self.base:g}"
-        return f"{verdict} ({how})"
+            method_text = "poles in s" if self.base == 1.0 else f"poles in s^{self.base:g}"
+        return f"{verdict} ({method_text})"
 
 
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
@@ -127,18 +127,23 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     if highest - lowest < POWER_TOLERANCE:
         return base or 1.0, np.empty(0, dtype=np.complex128)
     degree = round((highest - lowest) / base)
-    sizes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
-    if lowest not in sizes or highest not in sizes:
+    log_magnitudes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
+    if lowest not in log_magnitudes or highest not in log_magnitudes:
         return None
     # With frequencies relative to their geometric mean, all coefficients have similar magnitudes.
-    unit = (sizes[lowest] - sizes[highest]) / (highest - lowest)
-    logs = {power: size - sizes[highest] + unit * (power - highest) for power, size in sizes.items()}
+    unit = (log_magnitudes[lowest] - log_magnitudes[highest]) / (highest - lowest)
+    logs = {
+        power: log_magnitude - log_magnitudes[highest] + unit * (power - highest)
+        for power, log_magnitude in log_magnitudes.items()
+    }
     if max(abs(unit), *logs.values()) > MAX_LOG_FREQUENCY:
         return None
     coefficients = np.zeros(degree + 1)
-    for power, size in logs.items():
+    for power, log_magnitude in logs.items():
         at = degree - round((power - lowest) / base)
-        coefficients[at] = math.copysign(math.exp(size), polynomial[power] / math.copysign(1.0, polynomial[highest]))
+        coefficients[at] = math.copysign(
+            math.exp(log_magnitude), polynomial[power] / math.copysign(1.0, polynomial[highest])
+        )
     return base, np.asarray(np.roots(coefficients) * math.exp(unit * base), dtype=np.complex128)
 
 
@@ -171,8 +176,8 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     eigenvalues of its companion matrix. Otherwise Newton's method in ln s finds the roots, and the argument principle
     verifies their number.
     """
-    every = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_roots(p, "poles")]
-    return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+    all_poles = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_roots(p, "poles")]
+    return np.array(sorted(all_poles, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
 @check_arguments
@@ -199,22 +204,22 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
     """
     transfer = transfer_functions(model)
     pair = []
-    for what, argument, choices in (("output", output, transfer.outputs), ("input", input, transfer.inputs)):
+    for kind, argument, choices in (("output", output, transfer.outputs), ("input", input, transfer.inputs)):
         if argument is None and len(choices) != 1:
-            raise ModelError(f"the model has the {what}s {', '.join(choices)}; name one with {parameter(what)}")
+            raise ModelError(f"the model has the {kind}s {', '.join(choices)}; name one with {parameter(kind)}")
         name = choices[0] if argument is None else argument
         if name not in choices:
-            raise ModelError(f"{what} {name!r} is not in the model; known: {', '.join(choices)}")
+            raise ModelError(f"{kind} {name!r} is not in the model; known: {', '.join(choices)}")
         pair.append(name)
     numerator = {power: value for value, power in transfer.numerators[pair[0], pair[1]]}
     roots = _principal_roots(numerator, "zeros") if numerator else []
     return np.array(sorted(roots, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
-def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
+def _principal_roots(polynomial: Polynomial, kind: str) -> list[complex]:
     """Return the roots of a sum of c s^p on the principal Riemann sheet, with their conjugates.
 
-    `what` is "poles" or "zeros" in messages. Raise ModelError if roots overflow or some were not found.
+    `kind` is "poles" or "zeros" in messages. Raise ModelError if roots overflow or some were not found.
     """
     upper = zeros_of(polynomial, math.pi)
     if not _has_integer_spacing(polynomial):
@@ -222,15 +227,15 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
     if any(abs(w.real) > MAX_LOG_FREQUENCY for w in upper):
         decades = int(MAX_LOG_FREQUENCY / math.log(10))
         raise ModelError(
-            f"the {what} overflow, outside of 1e-{decades} to 1e{decades} rad/s; change the unit of time "
+            f"the {kind} overflow, outside of 1e-{decades} to 1e{decades} rad/s; change the unit of time "
             "or the coefficients"
         )
     poles = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
     if roots_in_base(polynomial) is None:
-        expected, on_cut = right_zeros(polynomial, math.pi)
-        if not on_cut and len(poles) != expected:
+        expected, has_root_on_cut = right_zeros(polynomial, math.pi)
+        if not has_root_on_cut and len(poles) != expected:
             raise ModelError(
-                f"only {len(poles)} of {expected:.0f} {what} were found (number by the argument principle); round the "
+                f"only {len(poles)} of {expected:.0f} {kind} were found (number by the argument principle); round the "
                 "orders to multiples of 0.01"
             )
     return poles
@@ -279,30 +284,34 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     and p_max and p_min are the highest and lowest power of s in D. Delays of inputs do not affect stability.
     """
     coupled = is_coupled(coupling)
-    unstable, on_axis, method = 0.0, False, "poles"
+    unstable, has_root_on_axis, method = 0.0, False, "poles"
     polynomials = characteristic(model, coupled=coupled)
     for polynomial in polynomials:
         roots = roots_in_base(polynomial)
         if roots is not None:
-            own_base, values = roots
-            margin = np.abs(np.angle(values)) - own_base * math.pi / 2
+            base_of_polynomial, values = roots
+            margin = np.abs(np.angle(values)) - base_of_polynomial * math.pi / 2
             # Companion matrices give simple roots to about 1e-9; roots within 1e-7 rad of the axis count as on it.
-            on_axis |= bool(np.any(np.abs(margin) <= 1e-7))
+            has_root_on_axis |= bool(np.any(np.abs(margin) <= 1e-7))
             unstable += float(np.sum(margin < -1e-7))
         else:
-            count, near = right_zeros(polynomial)
-            unstable, on_axis, method = unstable + count, on_axis or near, "argument principle"
+            count, is_near_axis = right_zeros(polynomial)
+            unstable, has_root_on_axis, method = (
+                unstable + count,
+                has_root_on_axis or is_near_axis,
+                "argument principle",
+            )
     transfer = transfer_functions(model, coupling=coupling)
     origin = 0.0
     for output, pairs in transfer.denominator.items():
         lowest = min(p for _, p in pairs)
         for signal in transfer.inputs:
-            top = [p for _, p in transfer.numerators[output, signal]]
-            origin = max(origin, round(lowest - min(top), 9)) if top else origin
+            numerator_orders = [p for _, p in transfer.numerators[output, signal]]
+            origin = max(origin, round(lowest - min(numerator_orders), 9)) if numerator_orders else origin
     every_power = [p - min(polynomial) for polynomial in polynomials for p in polynomial]
     base = common_base(every_power) if method == "poles" else None
-    good = unstable == 0 and not on_axis and origin <= 0
-    return Stability(good, unstable, max(origin, 0.0), on_axis, method, base)
+    good = unstable == 0 and not has_root_on_axis and origin <= 0
+    return Stability(good, unstable, max(origin, 0.0), has_root_on_axis, method, base)
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
@@ -320,14 +329,14 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
 
     def other_terms_ratio(at: float, omega: float) -> float:
         """Return, at s = omega, the sum of the magnitudes of all other terms relative to the term with power `at`."""
-        sizes = np.abs(values) * omega ** (powers - at)
-        return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
+        magnitudes = np.abs(values) * omega ** (powers - at)
+        return float((np.sum(magnitudes) - abs(polynomial[at])) / abs(polynomial[at]))
 
     try:
-        centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+        center = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
     except OverflowError:  # coefficients that differ much, with powers that differ little
-        centre = math.exp(OVERFLOW_LOG_FREQUENCY)
-    low, high = centre, centre
+        center = math.exp(OVERFLOW_LOG_FREQUENCY)
+    low, high = center, center
     while other_terms_ratio(lowest, low) > DOMINANCE_RATIO and low > 1e-300:
         low /= 10
     while other_terms_ratio(highest, high) > DOMINANCE_RATIO and high < 1e300:
@@ -341,26 +350,26 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
         """
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
-        sizes = np.exp(exponents - shift)
-        turns = np.exp(1j * (powers * angle + np.where(values < 0, math.pi, 0.0)))
-        total = np.sum(sizes, axis=0)
-        return np.asarray(np.einsum("j,jk->k", turns, sizes) / total), total
+        magnitudes = np.exp(exponents - shift)
+        phasors = np.exp(1j * (powers * angle + np.where(values < 0, math.pi, 0.0)))
+        magnitude_sum = np.sum(magnitudes, axis=0)
+        return np.asarray(np.einsum("j,jk->k", phasors, magnitudes) / magnitude_sum), magnitude_sum
 
     points, _ = curve(log_omega)
     while log_omega.size < MAX_NYQUIST_POINTS:
-        turn = np.abs(np.angle(points[1:] * np.conj(points[:-1])))
-        wide = np.flatnonzero(turn > MAX_TURN_RAD)
-        if not wide.size or float(np.min(np.abs(points))) < AXIS_TOLERANCE:
+        phase_steps = np.abs(np.angle(points[1:] * np.conj(points[:-1])))
+        coarse_intervals = np.flatnonzero(phase_steps > MAX_TURN_RAD)
+        if not coarse_intervals.size or float(np.min(np.abs(points))) < AXIS_TOLERANCE:
             break
-        middle = (log_omega[wide] + log_omega[wide + 1]) / 2
-        if np.any(np.diff(np.concatenate([log_omega[wide], middle]).reshape(2, -1), axis=0) <= 0):
+        midpoints = (log_omega[coarse_intervals] + log_omega[coarse_intervals + 1]) / 2
+        if np.any(np.diff(np.concatenate([log_omega[coarse_intervals], midpoints]).reshape(2, -1), axis=0) <= 0):
             break
-        log_omega = np.sort(np.concatenate([log_omega, middle]))
+        log_omega = np.sort(np.concatenate([log_omega, midpoints]))
         points, _ = curve(log_omega)
-    near = float(np.min(np.abs(points))) < AXIS_TOLERANCE
-    turned = float(np.sum(np.angle(points[1:] * np.conj(points[:-1]))))
-    count = (highest - lowest) * angle / math.pi - turned / math.pi
-    if near or abs(count - round(count)) > 0.1:
+    is_near_axis = float(np.min(np.abs(points))) < AXIS_TOLERANCE
+    phase_change = float(np.sum(np.angle(points[1:] * np.conj(points[:-1]))))
+    count = (highest - lowest) * angle / math.pi - phase_change / math.pi
+    if is_near_axis or abs(count - round(count)) > 0.1:
         return math.nan, True
     return float(max(round(count), 0)), False
 
@@ -425,13 +434,13 @@ class Mode:
         return self.damping < 0
 
     def __str__(self) -> str:
-        end = ", grows" if self.unstable else ""
+        growth_text = ", grows" if self.unstable else ""
         if not self.oscillatory:
-            return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{end}"
+            return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{growth_text}"
         hertz = self.frequency / (2 * math.pi)
         return (
             f"{with_error(self.frequency, self.frequency_error)} rad/s ({hertz:.3g} Hz), damping "
-            f"{with_error(self.damping, self.damping_error)}{end}"
+            f"{with_error(self.damping, self.damping_error)}{growth_text}"
         )
 
 
@@ -470,35 +479,44 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
         # A pole that underflows counts as a pole at the origin. A pole that overflows has no visible effect.
         sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
-        spreads = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
-        result += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
+        deviations = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
+        result += [_mode(w, deviation) for w, deviation in zip(sheet, deviations, strict=True)]
     return tuple(sorted(result, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
 
-def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
+def _mode(w: complex, deviation: tuple[float, float, float] | None) -> Mode:
     """Return the mode of a zero s of the characteristic function, given as w = ln s.
 
-    `spread` contains the standard deviations of Re w, Im w and ln abs(Re s); None without a covariance.
+    `deviation` contains the standard deviations of Re w, Im w and ln abs(Re s); None without a covariance.
     """
-    size, angle = math.exp(w.real), w.imag
+    magnitude, angle = math.exp(w.real), w.imag
     # A poorly determined pole may be far from the real axis although its interval includes it, so the limit is fixed.
     half_width = min(
-        NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD
+        NORMAL_95 * (0.0 if deviation is None or not math.isfinite(deviation[1]) else deviation[1]), REAL_AXIS_ANGLE_RAD
     )
     if angle >= math.pi - max(half_width, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
         sign = 1.0 if angle <= DISTINCT_ZERO_TOLERANCE else -1.0
-        error = None if spread is None else spread[0]
-        scaled = (None, None) if error is None else (size * error, error / size)
-        return Mode(complex(sign * size), size, -sign, 1.0 / size, False, scaled[0], None, scaled[1])
-    slow, damping = abs(size * math.cos(angle)), -math.cos(angle)
+        error = None if deviation is None else deviation[0]
+        scaled = (None, None) if error is None else (magnitude * error, error / magnitude)
+        return Mode(complex(sign * magnitude), magnitude, -sign, 1.0 / magnitude, False, scaled[0], None, scaled[1])
+    decay_rate, damping = abs(magnitude * math.cos(angle)), -math.cos(angle)
     if abs(damping) <= DISTINCT_ZERO_TOLERANCE:
-        slow, damping = 0.0, 0.0
-    pole = size * complex(math.cos(angle), math.sin(angle))
-    constant = 1.0 / slow if slow > 0 else math.inf
-    if spread is None:
-        return Mode(pole, size, damping, constant, True)
-    radial, turn, share = spread
-    return Mode(pole, size, damping, constant, True, size * radial, abs(math.sin(angle)) * turn, constant * share)
+        decay_rate, damping = 0.0, 0.0
+    pole = magnitude * complex(math.cos(angle), math.sin(angle))
+    constant = 1.0 / decay_rate if decay_rate > 0 else math.inf
+    if deviation is None:
+        return Mode(pole, magnitude, damping, constant, True)
+    radial, frequency_deviation, damping_deviation = deviation
+    return Mode(
+        pole,
+        magnitude,
+        damping,
+        constant,
+        True,
+        magnitude * radial,
+        abs(math.sin(angle)) * frequency_deviation,
+        constant * damping_deviation,
+    )
 
 
 def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
@@ -509,8 +527,8 @@ def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)
-    first = min((w.imag for w in zeros), default=0.0)
-    return [w for w in zeros if w.imag <= max(MAX_SHEET_ANGLE_RAD, first) + REAL_AXIS_ANGLE_RAD]
+    lowest_argument = min((w.imag for w in zeros), default=0.0)
+    return [w for w in zeros if w.imag <= max(MAX_SHEET_ANGLE_RAD, lowest_argument) + REAL_AXIS_ANGLE_RAD]
 
 
 def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
@@ -519,16 +537,16 @@ def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_A
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < POWER_TOLERANCE:
         return []
-    exact = roots_in_base(polynomial)
-    if exact is not None:
-        base, roots = exact
+    exact_roots = roots_in_base(polynomial)
+    if exact_roots is not None:
+        base, roots = exact_roots
         roots = roots[np.abs(roots) > 0]
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
         # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
-        inside = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= max_argument)]
+        is_in_sector = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= max_argument)]
         if abs(base - 1) < POWER_TOLERANCE:
-            inside = inside[inside.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
-        return sorted(inside.tolist(), key=lambda z: (z.real, z.imag))
+            is_in_sector = is_in_sector[is_in_sector.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
+        return sorted(is_in_sector.tolist(), key=lambda z: (z.real, z.imag))
     values = np.array(list(polynomial.values()))
     roots_so_far: list[complex] = []
     seeds = [_two_term_zeros(powers, values, max_argument)]
@@ -538,7 +556,7 @@ def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_A
         seeds.append(_rounded_order_zeros(polynomial, base, max_argument))
     for z in _newton_zeros(np.concatenate(seeds), powers, values):
         if -DISTINCT_ZERO_TOLERANCE <= z.imag <= max_argument and all(
-            abs(z - other) > DISTINCT_ZERO_TOLERANCE for other in roots_so_far
+            abs(z - known_root) > DISTINCT_ZERO_TOLERANCE for known_root in roots_so_far
         ):
             roots_so_far.append(complex(z.real, max(z.imag, 0.0)))
     return sorted(roots_so_far, key=lambda z: (z.real, z.imag))
@@ -548,8 +566,8 @@ def _rounded_order_zeros(polynomial: Polynomial, base: float, max_argument: floa
     """Return initial guesses for zeros, as ln s: the zeros after rounding the orders to multiples of a base."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
-        near = round(round(power / base) * base, 9)
-        rounded[near] = rounded.get(near, 0.0) + value
+        multiple = round(round(power / base) * base, 9)
+        rounded[multiple] = rounded.get(multiple, 0.0) + value
     base_roots = roots_in_base({p: v for p, v in rounded.items() if v != 0.0}) if len(rounded) > 1 else None
     if base_roots is None or not base_roots[1].size:
         return np.empty(0, dtype=np.complex128)
@@ -568,12 +586,12 @@ def _two_term_zeros(powers: Floats, values: Floats, max_argument: float) -> Comp
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
         difference = powers[j] - powers[i]
-        turn = np.angle(-values[i] / values[j] + 0j)
+        phase = np.angle(-values[i] / values[j] + 0j)
         angles = (
-            turn + 2 * math.pi * np.arange(-1, math.ceil(max_argument * abs(difference) / math.pi) + 1)
+            phase + 2 * math.pi * np.arange(-1, math.ceil(max_argument * abs(difference) / math.pi) + 1)
         ) / difference
-        size = math.log(abs(values[i] / values[j])) / difference
-        out += [complex(size, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= max_argument]
+        log_magnitude = math.log(abs(values[i] / values[j])) / difference
+        out += [complex(log_magnitude, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= max_argument]
     return np.array(out, dtype=np.complex128)
 
 
@@ -617,8 +635,8 @@ def _standard_deviations(
     if matrix is None or not zeros.size:
         return [None] * zeros.size
     slopes = np.zeros((len(matrix), zeros.size), dtype=np.complex128)
-    own = characteristic(model, coupled=coupled)[at]
-    _, unit = _terms(zeros, np.array(list(own)), np.array(list(own.values())))
+    polynomial_of_pole = characteristic(model, coupled=coupled)[at]
+    _, unit = _terms(zeros, np.array(list(polynomial_of_pole)), np.array(list(polynomial_of_pole.values())))
 
     def value(shifted: Model) -> tuple[Complex, Complex]:
         """Return D and dD / d ln s of a model with changed parameters at the zeros, relative to the largest term."""
@@ -630,15 +648,15 @@ def _standard_deviations(
 
     _, slope = value(model)
     for k, step, *models in shifted_models(model, np.any(matrix != 0, axis=1), POLE_DERIVATIVE_STEP_RATIO):
-        (above, _), (below, _) = map(value, models)
+        (upper, _), (lower, _) = map(value, models)
         with np.errstate(divide="ignore", invalid="ignore"):
-            slopes[k] = -(above - below) / (2 * step) / slope
+            slopes[k] = -(upper - lower) / (2 * step) / slope
     with np.errstate(invalid="ignore"):
-        along = slopes.real - np.tan(zeros.imag) * slopes.imag
-        parts = (slopes.real, slopes.imag, along)
-        variances = [np.einsum("ik,ij,jk->k", part, matrix, part) for part in parts]
-        spreads = [np.sqrt(np.maximum(v, 0.0)).tolist() for v in variances]
-    return list(zip(*spreads, strict=True))
+        damping_slopes = slopes.real - np.tan(zeros.imag) * slopes.imag
+        components = (slopes.real, slopes.imag, damping_slopes)
+        variances = [np.einsum("ik,ij,jk->k", component, matrix, component) for component in components]
+        standard_deviations = [np.sqrt(np.maximum(v, 0.0)).tolist() for v in variances]
+    return list(zip(*standard_deviations, strict=True))
 
 
 @dataclass(frozen=True)
@@ -698,17 +716,17 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
     if matrix is not None:
         slopes = {pair: np.zeros((2, len(matrix))) for pair in pairs}
         for k, step, *models in shifted_models(model, np.any(matrix != 0, axis=1), POLE_DERIVATIVE_STEP_RATIO):
-            above, below = map(_final_values, models)
+            upper, lower = map(_final_values, models)
             for pair, slope in slopes.items():
-                slope[:, k] = np.subtract(above[pair], below[pair]) / (2 * step)
-        for pair, (turn, slope) in slopes.items():
-            variances = [float(v @ matrix @ v) for v in (turn, slope)]
+                slope[:, k] = np.subtract(upper[pair], lower[pair]) / (2 * step)
+        for pair, (power_difference, slope) in slopes.items():
+            variances = [float(v @ matrix @ v) for v in (power_difference, slope)]
             errors[pair] = (math.sqrt(max(variances[0], 0.0)), math.sqrt(max(variances[1], 0.0)))
     out = []
     for (output, signal), (order, rate) in pairs.items():
         gain = rate if abs(order) < PRINTED_ORDER_TOLERANCE else 0.0 if order < 0 else math.copysign(math.inf, rate)
-        turned, error = errors.get((output, signal), (None, None))
-        out.append(SteadyState(output, signal, gain, error, order, rate, turned))
+        power_error, error = errors.get((output, signal), (None, None))
+        out.append(SteadyState(output, signal, gain, error, order, rate, power_error))
     return tuple(out)
 
 
@@ -718,16 +736,18 @@ def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
     sensor = model.structure.sensor_filter
     out = {}
     for output in transfer.outputs:
-        below, lowest = transfer.denominator[output][-1]
+        denominator_coefficient, lowest = transfer.denominator[output][-1]
         for signal in transfer.inputs:
             if not transfer.numerators[output, signal]:
                 continue
-            above, power = transfer.numerators[output, signal][-1]
-            order, rate = lowest - power, above / below
+            numerator_coefficient, power = transfer.numerators[output, signal][-1]
+            order, rate = lowest - power, numerator_coefficient / denominator_coefficient
             if sensor is not None and (output in sensor.signals) != (signal in sensor.signals):
-                (p, a), (q, b) = (min((o, c) for c, o in part) for part in (sensor.numerator, sensor.denominator))
-                side = 1 if output in sensor.signals else -1
-                order, rate = order + side * (q - p), rate * (a / b) ** side
+                (p, a), (q, b) = (
+                    min((o, c) for c, o in polynomial) for polynomial in (sensor.numerator, sensor.denominator)
+                )
+                exponent_sign = 1 if output in sensor.signals else -1
+                order, rate = order + exponent_sign * (q - p), rate * (a / b) ** exponent_sign
             out[output, signal] = (0.0 if abs(order) < POWER_TOLERANCE else order, rate)
     return out
 

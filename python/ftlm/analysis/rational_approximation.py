@@ -39,8 +39,8 @@ PADE_ACCURATE_ANGLE = 5.7
 
 def identifier(name: str) -> str:
     """Return a name converted to an identifier that is valid in MATLAB, Python and python-control."""
-    plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
-    return plain if plain and plain[0].isalpha() else f"x_{plain}"
+    valid_name = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
+    return valid_name if valid_name and valid_name[0].isalpha() else f"x_{valid_name}"
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
     gain = high**power
     # Each residue is a product of quotients, without the polynomials of numerator and denominator.
     differences = zeros[None, :] - roots[:, None]
-    others = roots[None, :] - roots[:, None]
-    np.fill_diagonal(others, 1.0)
-    residues = gain * np.prod(differences / others, axis=1)
+    root_differences = roots[None, :] - roots[:, None]
+    np.fill_diagonal(root_differences, 1.0)
+    residues = gain * np.prod(differences / root_differences, axis=1)
     return roots, residues, gain
 
 
@@ -157,12 +157,12 @@ def _filter_signal(
     `states` contains the time derivative of each state. The derivatives of the new filter states are appended to it.
     """
     roots, residues, gain = oustaloup(power, band, order)
-    parts = [(gain, signal)]
+    summands = [(gain, signal)]
     for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
-        own: _Signal = {("state", len(states)): 1.0}
-        states.append(_sum([(pole, signal), (-pole, own)]))
-        parts.append((residue / pole, own))
-    return _sum(parts)
+        state_signal: _Signal = {("state", len(states)): 1.0}
+        states.append(_sum([(pole, signal), (-pole, state_signal)]))
+        summands.append((residue / pole, state_signal))
+    return _sum(summands)
 
 
 def _delay_input(states: list[_Signal], source: int, delay: float) -> _Signal:
@@ -173,14 +173,22 @@ def _delay_input(states: list[_Signal], source: int, delay: float) -> _Signal:
     # Numerator and denominator are sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k with x = -s tau and x = s tau.
     f, n = math.factorial, PADE_ORDER
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
-    below = [c[k] * delay**k / (c[n] * delay**n) for k in range(n)]
+    denominator = [c[k] * delay**k / (c[n] * delay**n) for k in range(n)]
     direct = (-1.0) ** n
-    above = [(-1.0) ** k * below[k] - direct * below[k] for k in range(n)]
+    numerator = [(-1.0) ** k * denominator[k] - direct * denominator[k] for k in range(n)]
     first = len(states)
     last = first + n - 1
     for k in range(n):
-        before: _Signal = {("state", first + k - 1): 1.0} if k else {}
-        states.append(_sum([(1.0, {("state", last): -below[k]}), (1.0, before), (above[k], {("input", source): 1.0})]))
+        previous_state: _Signal = {("state", first + k - 1): 1.0} if k else {}
+        states.append(
+            _sum(
+                [
+                    (1.0, {("state", last): -denominator[k]}),
+                    (1.0, previous_state),
+                    (numerator[k], {("input", source): 1.0}),
+                ]
+            )
+        )
     return {("state", last): 1.0, ("input", source): direct}
 
 
@@ -220,10 +228,11 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay
-    leading = next((name for name, delay in delays.items() if delay < 0.0), None)
-    if leading is not None:
+    advanced_input = next((name for name, delay in delays.items() if delay < 0.0), None)
+    if advanced_input is not None:
         raise ModelError(
-            f"{leading} acts {-delays[leading]:g} s before it is logged, and no linear system responds before its "
+            f"{advanced_input} acts {-delays[advanced_input]:g} s before it is logged, and no linear system "
+            "responds before its "
             "input; shift the rows of that input, and identify again"
         )
     extended_band = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)
@@ -264,38 +273,40 @@ def state_space_matrices(
     # of an equation form one chain, to which all terms are added (observer form). No integrator is unstable by itself,
     # and the model is exact at steady state and far below the band.
     filters: dict[tuple[str, float], _Signal] = {}
-    read: list[_Signal] = []
-    for item in model.equations:
+    output_signals: list[_Signal] = []
+    for equation in model.equations:
         by_level: dict[int, list[tuple[float, _Signal]]] = {}
-        for term in item.terms:
-            eta = round(item.order.constant - term.order.constant, 9)
-            whole = math.ceil(eta)
-            if whole < 0:
+        for term in equation.terms:
+            eta = round(equation.order.constant - term.order.constant, 9)
+            integer_order = math.ceil(eta)
+            if integer_order < 0:
                 raise ModelError(
-                    f"order {term.order.constant:g} of {term.signal} is {-eta:g} above alpha = {item.order.constant:g} "
-                    f"of {item.output}: a state-space system has no derivative of its input; use frequency_response()"
+                    f"order {term.order.constant:g} of {term.signal} is {-eta:g} above alpha = "
+                    f"{equation.order.constant:g} "
+                    f"of {equation.output}: a state-space system has no derivative of its input; use "
+                    "frequency_response()"
                 )
-            key = (term.signal, round(whole - eta, 9))
+            key = (term.signal, round(integer_order - eta, 9))
             if key not in filters:
                 source = sources[term.signal]
                 filters[key] = _filter_signal(states, source, key[1], extended_band, count) if key[1] > 0 else source
-            by_level.setdefault(whole, []).append((float(term.fixed or 0.0), filters[key]))
+            by_level.setdefault(integer_order, []).append((float(term.fixed or 0.0), filters[key]))
         previous_integrator: _Signal = {}
         for level in range(max(by_level), 0, -1):
             states.append(_sum([*by_level.get(level, []), (1.0, previous_integrator)]))
             previous_integrator = {("state", len(states) - 1): 1.0}
-        read.append(_sum([(1.0, previous_integrator), *by_level.get(0, [])]))
+        output_signals.append(_sum([(1.0, previous_integrator), *by_level.get(0, [])]))
     widths = {"state": len(states), "input": len(inputs), "output": len(outputs)}
     a, b, feedback = (_dense(states, kind, width) for kind, width in widths.items())
-    reads, direct, loop = (_dense(read, kind, width) for kind, width in widths.items())
-    solved = np.eye(len(outputs)) - loop
-    if abs(float(np.linalg.det(solved))) < 1e-12:
+    output_matrix, direct, loop = (_dense(output_signals, kind, width) for kind, width in widths.items())
+    loop_matrix = np.eye(len(outputs)) - loop
+    if abs(float(np.linalg.det(loop_matrix))) < 1e-12:
         raise ModelError(
             f"the equations of {', '.join(outputs)} cannot be solved for these outputs, because they form an "
             "algebraic loop; change an equation"
         )
-    c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
-    d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)
+    c: Floats = np.asarray(np.linalg.solve(loop_matrix, output_matrix), dtype=np.float64)
+    d: Floats = np.asarray(np.linalg.solve(loop_matrix, direct), dtype=np.float64)
     return a + feedback @ c, b + feedback @ d, c, d
 
 
@@ -303,48 +314,49 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     """Return the approximation with its gain and phase errors, stability and warnings set."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
-    exact = frequency_response(model, omega, sensor=False)
+    exact_response = frequency_response(model, omega, sensor=False)
     approximated = system.frequency_response(omega)
     gain, phase = {}, {}
     for i, output in enumerate(system.outputs):
         for j, signal in enumerate(system.inputs):
-            if not np.any(exact[i, j]):
+            if not np.any(exact_response[i, j]):
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
-                quotient = approximated[i, j] / exact[i, j]
+                quotient = approximated[i, j] / exact_response[i, j]
                 gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
                 phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
     roots = np.linalg.eigvals(system.a)
     stable = bool(np.all(roots.real < -ORIGIN_POLE_RATIO * low))
-    words = []
+    texts = []
     worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
     if not (worst_gain <= MAX_GAIN_ERROR_DB and worst_phase <= MAX_PHASE_ERROR_DEGREES):
-        words.append(
+        texts.append(
             f"from {low:g} to {high:g} rad/s the error of the approximation is up to {worst_gain:.2g} dB "
             f"and {worst_phase:.2g} degrees, so smaller gain and phase margins are meaningless; "
             + _error_cause(model, system)
         )
     sensor = model.structure.sensor_filter
     if sensor is not None:
-        words.append(
+        texts.append(
             f"the sensor filter of {', '.join(sensor.signals)} is not in the system; multiply its transfer function by "
             "that of the filter"
         )
     if stability(model).unstable_poles != np.sum(roots.real > ORIGIN_POLE_RATIO * low):
-        words.append(
+        texts.append(
             "the approximation and the model have different numbers of unstable poles, so its stability margins do not "
             "apply to the model; raise order, or move the band"
         )
-    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
+    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(texts))
 
 
 def _error_cause(model: Model, system: Approximation) -> str:
     """Return text on the cause of large errors of an approximation, with the remedy."""
-    late = {name: delay for name, delay in model.structure.delay.items() if delay}
-    if late and system.band[1] * max(late.values()) > PADE_ACCURATE_ANGLE:
-        name = max(late, key=lambda n: late[n])
+    nonzero_delays = {name: delay for name, delay in model.structure.delay.items() if delay}
+    if nonzero_delays and system.band[1] * max(nonzero_delays.values()) > PADE_ACCURATE_ANGLE:
+        name = max(nonzero_delays, key=lambda n: nonzero_delays[n])
         return (
-            f"the delay of {name}, {late[name]:g} s, is left out above {PADE_ACCURATE_ANGLE / late[name]:.3g} rad/s, "
+            f"the delay of {name}, {nonzero_delays[name]:g} s, is left out above "
+            f"{PADE_ACCURATE_ANGLE / nonzero_delays[name]:.3g} rad/s, "
             f"where its Padé approximation of order {PADE_ORDER} ends; lower the upper end of the band, or use "
             "frequency_response, which is exact"
         )
@@ -358,9 +370,9 @@ def _exact_band(model: Model) -> tuple[float, float]:
     """Return a frequency band [rad/s] for a system that needs no approximation; raise ModelError for other models."""
     orders = (o.constant for e in model.equations for o in e.orders)
     fractional = next((order for order in orders if not order.is_integer()), None)
-    late = next((name for name, delay in model.structure.delay.items() if delay), None)
-    if fractional is not None or late is not None:
-        reason = f"order {fractional:g}" if fractional is not None else f"the delay of {late}"
+    delayed_input = next((name for name, delay in model.structure.delay.items() if delay), None)
+    if fractional is not None or delayed_input is not None:
+        reason = f"order {fractional:g}" if fractional is not None else f"the delay of {delayed_input}"
         raise ModelError(
             f"{reason} is approximated within a frequency band; give the band in rad/s, as in "
             f"{parameter('band', (0.1, 100))}"
@@ -400,17 +412,17 @@ def to_control(model: Model, *, band: tuple[float, float] | None = None, order: 
     control = python_control()
     if band is None:
         band = _exact_band(model)
-    near = approximate(model, band=band, order=order)
-    for words in near.warnings:
-        warn_caller(words)
+    approximation = approximate(model, band=band, order=order)
+    for text in approximation.warnings:
+        warn_caller(text)
     system = control.ss(
-        near.a,
-        near.b,
-        near.c,
-        near.d,
-        inputs=list(near.inputs),
-        outputs=list(near.outputs),
+        approximation.a,
+        approximation.b,
+        approximation.c,
+        approximation.d,
+        inputs=list(approximation.inputs),
+        outputs=list(approximation.outputs),
         name=identifier(model.structure.name),
     )
-    system.approximation = near
+    system.approximation = approximation
     return system

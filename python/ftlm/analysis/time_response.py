@@ -96,13 +96,13 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
         span = settling_time(model) if model.structure.is_linear else 10.0
         time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
     instants = as_floats("time", time)
-    centre = step_response(model, instants)
+    nominal = step_response(model, instants)
     deviation = _deviation(model, instants, impulse=kind == "impulse")
     if kind == "impulse":
-        centre = np.diff(centre) / (instants[1] - instants[0])
+        nominal = np.diff(nominal) / (instants[1] - instants[0])
         instants = (instants[1:] + instants[:-1]) / 2
     finals = _final_values(model) if kind == "step" else {}
-    return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, centre, deviation, finals)
+    return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, nominal, deviation, finals)
 
 
 def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float | None]]:
@@ -119,32 +119,33 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     The response is simulated for small parameter changes along each eigenvector of the covariance. The result is None
     without a finite covariance, with friction, or if a changed model is not valid.
     """
-    matrix, numbers = covariance_of(model), parameter_vector(model)
+    matrix, parameters = covariance_of(model), parameter_vector(model)
     if matrix is None or model.structure.has_friction:
         return None
-    if matrix.shape != (numbers.size, numbers.size) or not np.all(np.isfinite(matrix)):
+    if matrix.shape != (parameters.size, parameters.size) or not np.all(np.isfinite(matrix)):
         return None
-    size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    rows = np.flatnonzero(size > 0)
+    deviations = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    rows = np.flatnonzero(deviations > 0)
     if not rows.size:
         return None
-    scaled = matrix[np.ix_(rows, rows)] / np.outer(size[rows], size[rows])
+    scaled = matrix[np.ix_(rows, rows)] / np.outer(deviations[rows], deviations[rows])
     weights, directions = np.linalg.eigh(scaled)
-    total: Floats = np.zeros(1)
+    variance: Floats = np.zeros(1)
     # A model without an estimate is simulated without an uncertainty band.
     bare = replace(model, estimate=None)
     for weight, direction in zip(weights.tolist(), directions.T, strict=True):
         if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
             continue
-        shift = np.zeros(numbers.size)
-        shift[rows] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * size[rows]
+        shift = np.zeros(parameters.size)
+        shift[rows] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * deviations[rows]
         try:
-            above, below = (
-                step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)
+            upper, lower = (
+                step_response(with_parameter_vector(bare, parameters + increment), time)
+                for increment in (shift, -shift)
             )
         except FtlmError:
             # The model with parameters changed by a tenth of a standard deviation is not valid.
             return None
-        change = (above - below) / (2 * DEVIATION_STEP_RATIO)
-        total = total + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2
-    return np.sqrt(total)
+        change = (upper - lower) / (2 * DEVIATION_STEP_RATIO)
+        variance = variance + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2
+    return np.sqrt(variance)

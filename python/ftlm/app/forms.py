@@ -188,14 +188,16 @@ class FitRequest:
         """
         structures = self.structures()
         listener.phase("reading")
-        own, other, cut = self._runs()
+        estimation_run, validation_run, split_at = self._runs()
         listener.phase(
-            SELECTION_PHASE if self.selects_structure else f"fitting{self._time_estimate(own, structures[0])}"
+            SELECTION_PHASE
+            if self.selects_structure
+            else f"fitting{self._time_estimate(estimation_run, structures[0])}"
         )
         choice = None
         if not self.selects_structure:
             method, offset = self.estimation_method(), cast("Offset", self.offset) if self.offset else None
-            result = identify(own, structures[0], method=method, offset=offset, progress=listener)
+            result = identify(estimation_run, structures[0], method=method, offset=offset, progress=listener)
         else:
             candidates = (
                 "auto"
@@ -204,20 +206,25 @@ class FitRequest:
                 if self.selection_mode == "inside"
                 else structures
             )
-            choice = select(own, candidates, progress=listener, store=store)
+            choice = select(estimation_run, candidates, progress=listener, store=store)
             # The selection may have assumed zero initial conditions. Its structure allows others, which this fit tests.
             listener.phase("fitting what was chosen")
-            result = identify(own, choice.winner.structure, progress=listener)
+            result = identify(estimation_run, choice.winner.structure, progress=listener)
         listener.phase("validating")
         return FittedModel(
-            result, own, other, None if other is None else result.validate(other), choice, self._script(cut)
+            result,
+            estimation_run,
+            validation_run,
+            None if validation_run is None else result.validate(validation_run),
+            choice,
+            self._script(split_at),
         )
 
     def _time_estimate(self, run: Run, structure: Structure) -> str:
         """Return the estimated duration of an output-error fit as text; empty for a short fit or another method."""
-        numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+        parameter_count = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
         seconds = estimate_duration(
-            output_error_cost(run.length * len(structure.outputs), numbers), check_threads(None)
+            output_error_cost(run.length * len(structure.outputs), parameter_count), check_threads(None)
         )
         if seconds < ANNOUNCEMENT_THRESHOLD_S or self.method not in ("", METHOD_NAMES[0]):
             return ""
@@ -387,9 +394,9 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
         return {name: parse(name, text) for name in names if (text := _text(texts, name))}
 
     options = read_fields(parse_number, "step", "resample") | read_fields(_plain_text, "time_unit", "missing")
-    ends = read_fields(parse_number, "from", "to")
-    if ends:
-        options["window"] = [ends.get("from"), ends.get("to")]
+    bounds = read_fields(parse_number, "from", "to")
+    if bounds:
+        options["window"] = [bounds.get("from"), bounds.get("to")]
     layout = read_fields(_plain_text, *TEXT_LAYOUT_FIELDS) | read_fields(_parse_line_count, *INTEGER_LAYOUT_FIELDS)
     if layout:
         options["layout"] = layout
@@ -479,12 +486,12 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
     of the run [s], which determines the range of delays.
     """
     suggestions: list[dict[str, str]] = []
-    driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
+    input_names = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
-        ends = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
+        delay_range = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
         terms = {
-            "inputs": "".join(f" + b{k} {name}" for k, name in enumerate(driven)),
-            "delayed_inputs": "".join(f" + b{k} {name}(t - {ends})" for k, name in enumerate(driven)),
+            "inputs": "".join(f" + b{k} {name}" for k, name in enumerate(input_names)),
+            "delayed_inputs": "".join(f" + b{k} {name}(t - {delay_range})" for k, name in enumerate(input_names)),
         }
         for kind in _suggested_kinds():
             structure = kind["equation"].format(y=output, **terms)

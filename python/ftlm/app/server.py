@@ -53,13 +53,13 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
     """
     if port is not None and not 0 <= port <= 65535:
         raise ModelError(f"{setting('port')} {port} is not a valid port; take one from 1024 to 65535, or 0 for any")
-    number = DEFAULT_PORT if port is None else port
+    port_number = DEFAULT_PORT if port is None else port
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":
         # On Windows, this option would let two programs share the port.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        sock.bind((LOOPBACK_ADDRESS, number))
+        sock.bind((LOOPBACK_ADDRESS, port_number))
         sock.listen(MAX_CONNECTIONS)
     except OSError as error:
         sock.close()
@@ -68,8 +68,8 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
             return open_socket(0)[
                 0
             ], f"port {DEFAULT_PORT} is taken, perhaps by another ftlm app; this one has a port of its own"
-        why = "is taken, perhaps by another ftlm app" if is_taken else f"cannot be used ({error.strerror})"
-        raise DataError(f"{setting('port')} {number} {why}; take another one, or leave it out") from None
+        reason = "is taken, perhaps by another ftlm app" if is_taken else f"cannot be used ({error.strerror})"
+        raise DataError(f"{setting('port')} {port_number} {reason}; take another one, or leave it out") from None
     return sock, ""
 
 

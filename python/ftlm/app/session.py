@@ -151,7 +151,7 @@ class Session:
         self.folder = (folder or Path(tempfile.mkdtemp(prefix="ftlm-app-"))).resolve()
         self.files: dict[str, File] = {}
         self.models: dict[str, Model] = {}
-        self._turn = asyncio.Lock()
+        self._fit_lock = asyncio.Lock()
         self._openings = asyncio.Semaphore(MAX_CONCURRENT_OPENS)
         self._jobs: set[asyncio.Task[None]] = set()
         self._count = 0
@@ -169,13 +169,13 @@ class Session:
             self._check_size(name, size)
         return self._free_name(safe_name(name))
 
-    def _check_size(self, name: str, size: int, own: File | None = None) -> None:
+    def _check_size(self, name: str, size: int, replaced_file: File | None = None) -> None:
         if size > MAX_FILE_BYTES:
             raise DataError(
                 f"{safe_name(name)!r} is larger than {MAX_FILE_BYTES >> 20} MB, the maximum size; load it in "
                 "Python, or take fewer rows"
             )
-        if size + sum(f.size for f in self.files.values() if f is not own) > MAX_TOTAL_BYTES:
+        if size + sum(f.size for f in self.files.values() if f is not replaced_file) > MAX_TOTAL_BYTES:
             raise DataError(f"the files together are larger than {MAX_TOTAL_BYTES >> 20} MB; remove one")
 
     def _free_name(self, name: str) -> str:
@@ -268,7 +268,7 @@ class Session:
             If a file is missing, still being read or not a run. Also if an option is unknown, an equation is invalid,
             or a run lacks a signal of a structure.
         """
-        other = str(fields.get("validation") or "")
+        validation_name = str(fields.get("validation") or "")
         share = real_number("share", fields.get("share", 0))
         texts = fields.get("structure") or []
         texts = [texts] if isinstance(texts, str) else texts
@@ -278,8 +278,8 @@ class Session:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
         fit_request = FitRequest(
             self._run(str(fields.get("estimation") or "")),
-            self._run(other) if other else None,
-            0.0 if other else share,
+            self._run(validation_name) if validation_name else None,
+            0.0 if validation_name else share,
             tuple(t.strip() for t in texts if t.strip()),
             *(
                 str(fields.get(name) or default)
@@ -350,7 +350,7 @@ class Session:
         return model
 
     async def _make(self, model: Model) -> None:
-        async with self._turn:
+        async with self._fit_lock:
             if model.state != STATE_WAITING:
                 return
             model.state, model.phase, model.started_at = STATE_RUNNING, "starting", time.monotonic()
@@ -394,21 +394,21 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------------------- both
 
-    def without_paths(self, words: str) -> str:
+    def without_paths(self, message: str) -> str:
         """Return a message in which paths of the folder are replaced by displayed file names."""
         folder = str(self.folder)
-        words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
+        message = message.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
         for file in self.files.values():
-            words = words.replace(file.stored_name, file.name).replace(file.key, base_name(Path(file.name)))
-        return words
+            message = message.replace(file.stored_name, file.name).replace(file.key, base_name(Path(file.name)))
+        return message
 
-    def _with_names(self, answer: Any) -> Any:
+    def _with_names(self, content: Any) -> Any:
         """Return the answer of a worker process, with :meth:`without_paths` applied to all text in it."""
-        if isinstance(answer, dict):
-            return {key: self._with_names(value) for key, value in answer.items()}
-        if isinstance(answer, list):
-            return [self._with_names(value) for value in answer]
-        return self.without_paths(answer) if isinstance(answer, str) else answer
+        if isinstance(content, dict):
+            return {key: self._with_names(value) for key, value in content.items()}
+        if isinstance(content, list):
+            return [self._with_names(value) for value in content]
+        return self.without_paths(content) if isinstance(content, str) else content
 
     async def close(self) -> None:
         """Stop all worker processes and remove the folder."""
@@ -449,18 +449,21 @@ def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
         model.time_left = f"{message['done']} of {message['total']} candidates known so far are fitted"
     elif message.get("total"):
         share = min(max(float(message["done"]) / float(message["total"]), 0.0), 1.0)
-        passed = time.monotonic() - model.phase_started_at
+        elapsed = time.monotonic() - model.phase_started_at
         model.share = share
-        if share > 0.02 and passed > 1.0:
+        if share > 0.02 and elapsed > 1.0:
             # The remaining time from the measured rate replaces the estimate in the name of the phase.
             model.phase = model.phase.partition(", about")[0]
-            model.time_left = format_time_left(passed * (1.0 - share) / share)
+            model.time_left = format_time_left(elapsed * (1.0 - share) / share)
 
 
 def safe_name(name: str) -> str:
     """Return a file name without folders and forbidden characters, truncated to `MAX_NAME_BYTES` bytes."""
-    last = re.split(r"[/\\]", name)[-1]
-    bare = "".join(c if c.isprintable() and c not in _RESERVED_CHARACTERS else "_" for c in last).strip(" .") or "file"
+    last_part = re.split(r"[/\\]", name)[-1]
+    bare = (
+        "".join(c if c.isprintable() and c not in _RESERVED_CHARACTERS else "_" for c in last_part).strip(" .")
+        or "file"
+    )
     stem, dot, suffix = bare.rpartition(".")
     while len(bare.encode("utf-8", "replace")) > MAX_NAME_BYTES and (stem or suffix):
         stem, suffix = (stem[:-1], suffix) if stem else (stem, suffix[:-1])

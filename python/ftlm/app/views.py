@@ -53,7 +53,7 @@ def style() -> str:
 
 def page(session: Session) -> str:
     """Return the HTML of the whole page for the current state of `session`."""
-    parts = {
+    contents = {
         # The templates escape all text.
         "files": Markup("").join(Markup(file(f)) for f in session.files.values()),
         "models": Markup("").join(Markup(model(m)) for m in reversed(session.models.values())),
@@ -61,7 +61,7 @@ def page(session: Session) -> str:
     }
     return _render_template(
         "page.html.j2",
-        **parts,
+        **contents,
         version=__version__,
         most=MAX_FILE_BYTES,
         units=[u for u in SIGNAL_UNITS if u],
@@ -146,8 +146,8 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
     All text in its HTML markup is escaped.
     """
     result, checked = fitted_model.result, fitted_model.validation
-    judgement = verdict(result, checked)
-    warnings, rest = first_findings([*result.findings, *(checked.findings if checked else ())])
+    overall_verdict = verdict(result, checked)
+    warnings, further = first_findings([*result.findings, *(checked.findings if checked else ())])
     figures = []
     if checked is not None:
         figures += comparison_charts(checked, units=result.model.units, label="validation", points=MAX_CHART_POINTS)
@@ -158,23 +158,23 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
     choice = fitted_model.choice
     return {
         "title": title_of(result.model),
-        "verdict": judgement.to_dict(),
-        "box": str(verdict_box(judgement)),
+        "verdict": overall_verdict.to_dict(),
+        "box": str(verdict_box(overall_verdict)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],
         "numbers": len(result.joint.names) if result.joint is not None else len(result.coefficients),
         "fits": [
             {
                 "output": output,
                 "unit": result.model.units.get(output, ""),
-                "estimation": finite(own.fit),
+                "estimation": finite(error_metrics.fit),
                 "validation": None if checked is None else finite(checked.output_error[output].fit),
-                "rmse": finite(own.rmse),
+                "rmse": finite(error_metrics.rmse),
             }
-            for output, own in result.output_error.items()
+            for output, error_metrics in result.output_error.items()
         ],
         "runs": [fitted_model.run.name, None if fitted_model.other is None else fitted_model.other.name],
         "warnings": [str(typeset(w)) for w in warnings],
-        "more": [str(typeset(w)) for w in rest],
+        "more": [str(typeset(w)) for w in further],
         "figures": figure_markup(figures),
         "tables": [str(t.to_html()) for t in tables],
         "choice": None

@@ -150,13 +150,13 @@ class WebApplication:
         except ClientDisconnect:
             answer = json_response({"error": "the upload was cut off; try again"}, 400)
         except FtlmError as error:
-            answer = json_response({"error": self._words(error)}, 400)
+            answer = json_response({"error": self._error_text(error)}, 400)
         except Exception as error:
             # The response has the type of the error only, because a traceback would contain local paths.
             answer = json_response({"error": f"a fault in ftlm itself ({type(error).__name__})"}, 500)
         await answer(scope, receive, send_secured)
 
-    def _words(self, error: FtlmError) -> str:
+    def _error_text(self, error: FtlmError) -> str:
         return self._session.without_paths(str(error))
 
     def _check_head(self, scope: Scope) -> str:
@@ -177,16 +177,16 @@ class WebApplication:
             origin is None or headers.get("sec-fetch-site", "same-origin") != "same-origin"
         ):
             raise HTTPException(403, "only the page itself may change its content")
-        first, slash, rest = scope["path"].removeprefix("/").partition("/")
-        if method == "GET" and first == "open" and slash and "/" not in rest:
-            self._redeem_key(rest)
-        if not secrets.compare_digest(first.encode("utf-8", "replace"), self._token.encode()):
+        first_segment, slash, remaining_path = scope["path"].removeprefix("/").partition("/")
+        if method == "GET" and first_segment == "open" and slash and "/" not in remaining_path:
+            self._redeem_key(remaining_path)
+        if not secrets.compare_digest(first_segment.encode("utf-8", "replace"), self._token.encode()):
             raise HTTPException(404, "there is no page at this address; use the address that ftlm app printed")
         if scope["query_string"].count(b"&") >= MAX_QUERY_FIELDS:
             raise HTTPException(400, "the address has too many fields")
         if not slash and method in ("GET", "HEAD"):
             raise self._redirection()
-        return f"{slash}{rest}"
+        return f"{slash}{remaining_path}"
 
     def _redirection(self) -> HTTPException:
         """Return the redirection to the permanent address as an HTTPException with status 303."""
@@ -211,7 +211,7 @@ class WebApplication:
         try:
             self._session.parse_request(request_body)
         except FtlmError as error:
-            return json_response({"error": self._words(error)})
+            return json_response({"error": self._error_text(error)})
         return json_response({"error": ""})
 
     async def _upload(self, request: Request) -> Response:
@@ -285,11 +285,11 @@ class WebApplication:
         return Response(content, headers=headers, media_type=media_type)
 
 
-def _view(make: Callable[[], str], media_type: str) -> Endpoint:
-    """Return an endpoint that calls `make` for each request and responds with the returned text."""
+def _view(render: Callable[[], str], media_type: str) -> Endpoint:
+    """Return an endpoint that calls `render` for each request and responds with the returned text."""
 
     async def endpoint(_: Request) -> Response:
-        return Response(make().encode("utf-8", "replace"), media_type=media_type)
+        return Response(render().encode("utf-8", "replace"), media_type=media_type)
 
     return endpoint
 
@@ -314,7 +314,7 @@ class TimedConnection(H11Protocol):
     """
 
     _since = 0.0
-    _unread = 0
+    _unsent_bytes = 0
     _next: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -346,11 +346,11 @@ class TimedConnection(H11Protocol):
 
     def _check_timeout(self) -> None:
         """Abort the connection if the client neither sent data nor read its response within the timeout."""
-        unread, size_before = self.transport.get_write_buffer_size(), self._unread
-        self._unread = unread
-        if unread < size_before or (unread and not size_before):
+        unsent_bytes, size_before = self.transport.get_write_buffer_size(), self._unsent_bytes
+        self._unsent_bytes = unsent_bytes
+        if unsent_bytes < size_before or (unsent_bytes and not size_before):
             self._since = self.loop.time()
-        is_incomplete = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+        is_incomplete = bool(unsent_bytes) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
         if is_incomplete and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:
             # close() would wait until the client reads the remaining data.
             self.transport.abort()

@@ -42,13 +42,13 @@ class Reports(Progress):
     def __init__(self, stream: TextIO) -> None:
         super().__init__("", quiet=True)
         self._stream = stream
-        self._turn = threading.Lock()
-        self._last = 0.0
+        self._output_lock = threading.Lock()
+        self._last_time = 0.0
 
     def send(self, **facts: Any) -> None:
         """Write the keyword arguments as one line of JSON."""
         line = json.dumps(facts, allow_nan=False)
-        with self._turn:
+        with self._output_lock:
             self._stream.write(line + "\n")
             self._stream.flush()
 
@@ -58,9 +58,9 @@ class Reports(Progress):
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Report completed and total parts, at most once per `REPORT_INTERVAL_S` except at the end; ignore `pruned`."""
-        now = time.monotonic()
-        if now - self._last >= REPORT_INTERVAL_S or count >= total:
-            self._last = now
+        time_now = time.monotonic()
+        if time_now - self._last_time >= REPORT_INTERVAL_S or count >= total:
+            self._last_time = time_now
             self.send(done=int(count), total=int(total))
 
 
@@ -75,7 +75,7 @@ def main() -> None:
     limit_resources(MEMORY_LIMIT)
     try:
         with use_interface("app"):
-            answer = describe_file(task) if task["do"] == "open" else make_model(task, reports)
+            result = describe_file(task) if task["do"] == "open" else make_model(task, reports)
     except FtlmError as error:
         reports.send(error=str(error))
     except MemoryError:
@@ -83,7 +83,7 @@ def main() -> None:
     except Exception as error:
         reports.send(error=f"a fault in ftlm itself ({type(error).__name__}: {error}); please report it")
     else:
-        reports.send(answer=answer)
+        reports.send(answer=result)
 
 
 def _end_with_parent() -> None:

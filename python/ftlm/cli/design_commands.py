@@ -110,20 +110,22 @@ def control(
     arguments = dict(locals())
     if trajectory is not None and path is None:
         raise ModelError("--trajectory needs a move; give --path SIZE:SECONDS")
-    wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if arguments[n] not in (None, [])]
-    if wrong:
-        other = "lqg" if design == "pid" else "pid"
-        text = ", ".join(map(parameter, wrong))
-        raise ModelError(f"{text}: used with --design {other}, not with {design}; leave it out, or change --design")
+    inapplicable = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if arguments[n] not in (None, [])]
+    if inapplicable:
+        other_design = "lqg" if design == "pid" else "pid"
+        text = ", ".join(map(parameter, inapplicable))
+        raise ModelError(
+            f"{text}: used with --design {other_design}, not with {design}; leave it out, or change --design"
+        )
     loaded = load_model(model)
-    most = np.inf if limit is None else limit
+    maximum = np.inf if limit is None else limit
     # The path may apply to a sum of outputs, but the loop controls a single output.
-    followed = output
+    tracked_output = output
     if path is not None and output is not None and "+" in output:
-        followed = output.partition("+")[0].strip() if design == "pid" else None
-    common: dict[str, Any] = {"input": input, "output": followed, "rate": rate, "samples": samples, "seed": seed}
+        tracked_output = output.partition("+")[0].strip() if design == "pid" else None
+    common: dict[str, Any] = {"input": input, "output": tracked_output, "rate": rate, "samples": samples, "seed": seed}
     result: designs.PidDesign | designs.LqgDesign
-    running: designs.DiscretePid | designs.Lqg
+    discrete_controller: designs.DiscretePid | designs.Lqg
     if design == "pid":
         if crossover is None:
             raise ModelError("--crossover is missing; give the frequency at which the loop gain is 1 [rad/s]")
@@ -131,7 +133,7 @@ def control(
         result = designs.fractional_pid(
             loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
         )
-        running = designs.DiscretePid(result.pid, rate, limit=most)
+        discrete_controller = designs.DiscretePid(result.pid, rate, limit=maximum)
     else:
         if max_input is None or not max_deviation:
             raise ModelError(
@@ -146,32 +148,38 @@ def control(
             process_noise=process_noise,
             noise=numbers("--noise", noise) or None,
             measured=measured or None,
-            limit=most,
+            limit=maximum,
             poles=poles,
             band=None if low_high is None else (low_high[0], low_high[1]),
             **common,
         )
-        running = result.controller
+        discrete_controller = result.controller
     planned = None
     if path is not None:
-        size, seconds = parse_numbers("--path", path, 2)
-        tracked = result.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
+        distance, seconds = parse_numbers("--path", path, 2)
+        tracked = result.plants[0].output if design == "pid" else discrete_controller.tracked  # type: ignore[union-attr]
         planned = designs.inverse_dynamics(
             result,
-            designs.point_to_point(size, seconds, rate),
+            designs.point_to_point(distance, seconds, rate),
             output=output or tracked,
-            limit=most,
+            limit=maximum,
             samples=min(samples, 40),
             seed=seed,
         )
     if out is not None:
-        designs.save_controller(running, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force)
+        designs.save_controller(
+            discrete_controller, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force
+        )
     if trajectory is not None and planned is not None:
         _write_trajectory(planned, rate, trajectory, force=force)
     if as_json:
         show_json(result.to_dict() | {"planned": None if planned is None else planned.to_dict()})
         return
-    for line in (result, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
+    for line in (
+        result,
+        *([discrete_controller] if design == "pid" else []),
+        *([planned] if planned is not None else []),
+    ):
         print_text(str(line))
     say_written(out, trajectory)
 

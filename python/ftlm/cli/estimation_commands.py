@@ -42,7 +42,7 @@ from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import Weights
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.estimation.methods import OutputError, method_with_options
-from ftlm.estimation.order_ranking import identification_of_searches, with_verdict
+from ftlm.estimation.order_ranking import search_identification, with_verdict
 from ftlm.estimation.output_error import Loss
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
@@ -104,7 +104,7 @@ def select_structure(
     Of `shape`, only the delays and the option --only are used, and only for ``"auto"``. `driven_by` contains texts of
     the form OUTPUT=SIGNAL,…
     """
-    automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
+    automatic, is_listed = isinstance(candidates, str), isinstance(candidates, list)
     drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
     if automatic and shape.only is not None:
         runs = [run.select([shape.only, *run.inputs]) for run in runs]
@@ -114,9 +114,11 @@ def select_structure(
         if isinstance(structure_list, str)
         else structure_list
     )
-    seconds = sum(fit_seconds(runs, one, threads) for one in largest)
+    seconds = sum(fit_seconds(runs, candidate, threads) for candidate in largest)
     with Progress("fitting candidates", quiet=quiet) as progress:
-        progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))
+        progress.expect(
+            "choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if is_listed else STEPWISE_TIME_FACTORS)
+        )
         return choice.select(
             runs,
             candidates,
@@ -125,7 +127,7 @@ def select_structure(
             driven_by=drivers or None,
             threads=threads,
             # The number of candidates of a stepwise selection is not known in advance.
-            progress=progress if listed else progress.so_far,
+            progress=progress if is_listed else progress.so_far,
             store=store,
         )
 
@@ -133,8 +135,8 @@ def select_structure(
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
     """Return the expected total time [s] of `fits` output-error fits, each to an equal share of the samples."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
-    numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
-    return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
+    parameter_count = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+    return estimate_duration(fits * output_error_cost(samples // max(fits, 1), parameter_count), check_threads(threads))
 
 
 def validation_runs(
@@ -207,7 +209,7 @@ def identify(
     options |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
     estimator = method_with_options(method, options)
     runs = reading.runs(files, equation)
-    others = validation_runs(reading, validation, validation_window, equation)
+    validation_data = validation_runs(reading, validation, validation_window, equation)
     selection = None
     if structure == "auto":
         selection = select_structure(runs, "auto", shape, driven_by=driven_by, threads=threads, quiet=as_json)
@@ -224,9 +226,9 @@ def identify(
         result.model.save(out, force=force)
     if report is not None:
         progress.say("writing the report")
-        chosen = selection if selection is not None and selection.best is result else None
-        (chosen or result).report(report, validation=others or None, force=force)
-    checked = result.validate(others) if others else None
+        chosen_selection = selection if selection is not None and selection.best is result else None
+        (chosen_selection or result).report(report, validation=validation_data or None, force=force)
+    checked = result.validate(validation_data) if validation_data else None
     if as_json:
         verdict_entry = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
         chosen_from = {} if selection is None else {"selection": selection.ranking_dict()}
@@ -241,9 +243,9 @@ def identify(
     if verbose:
         print_text(f"\n{result.details()}")
     if verbose and checked is not None:
-        print_text(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
+        print_text(f"\nvalidation on {', '.join(r.name for r in validation_data)}\n{checked}")
     elif checked is not None:
-        print(f"validation on {', '.join(r.name for r in others)}")
+        print(f"validation on {', '.join(r.name for r in validation_data)}")
         print_text("\n".join(f"! {w}" for w in checked.warnings), end="\n" if checked.warnings else "")
 
 
@@ -281,18 +283,18 @@ def search(
     """
     equation = shape.structure(structure)
     runs = reading.runs(files, equation)
-    others = validation_runs(reading, validation, validation_window, equation)
+    validation_data = validation_runs(reading, validation, validation_window, equation)
     target = shape.structure_for_runs(structure, runs)
-    parts = target.independent_groups() or {e.output: target.equation(e.output) for e in target.equations}
-    every = grid.grid() or OrderGrid()
-    check_order_names(every, target)
+    groups = target.independent_groups() or {e.output: target.equation(e.output) for e in target.equations}
+    full_grid = grid.grid() or OrderGrid()
+    check_order_names(full_grid, target)
     options = given_fields(replace(ranking, store=None), weighting)
     settings = SearchSettings(coefficients=coefficients, **options)
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
-            name: make_job(runs, part, restrict_grid(every, part), settings, m=m, threads=threads)
-            for name, part in parts.items()
+            name: make_job(runs, group, restrict_grid(full_grid, group), settings, m=m, threads=threads)
+            for name, group in groups.items()
         }
         open_store = None
         if ranking.store is not None:
@@ -302,12 +304,14 @@ def search(
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 result = run_job(replace(job, progress=progress), store=open_store, number=number)
-            results[name] = with_verdict(result, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
-    if out is None and report is None and not others:
+            results[name] = with_verdict(
+                result, runs, groups[name], settings, restrict_grid(full_grid, groups[name]), m=m
+            )
+    if out is None and report is None and not validation_data:
         show_by_output(results, as_json=as_json)
         return
-    best = identification_of_searches(results, runs, target, settings, every, m=m)
-    checked = best.validate(others) if others else None
+    search_result = search_identification(results, runs, target, settings, full_grid, m=m)
+    checked = search_result.validate(validation_data) if validation_data else None
     if as_json:
         content = {name: result.to_dict() for name, result in results.items()}
         show_json(content if checked is None else {**content, "validation": checked.to_dict()})
@@ -315,11 +319,11 @@ def search(
         show_by_output(results, as_json=False)
     if checked is not None and not as_json:
         fits = ", ".join(f"{o} {fit:.4g} %" for o, fit in checked.fit.items())
-        print_text(f"validation on {', '.join(r.name for r in others)}: fit {fits}; {checked.verdict}")
+        print_text(f"validation on {', '.join(r.name for r in validation_data)}: fit {fits}; {checked.verdict}")
     if out is not None:
-        best.model.save(out, force=force)
+        search_result.model.save(out, force=force)
     if report is not None:
-        best.report(report, validation=others or None, force=force)
+        search_result.report(report, validation=validation_data or None, force=force)
 
 
 @command
@@ -355,16 +359,16 @@ def certify(
     """
     runs = reading.runs(files, shape.structure(structure))
     target = shape.structure_for_runs(structure, runs)
-    every = grid.grid() or OrderGrid()
-    check_order_names(every, target)
+    full_grid = grid.grid() or OrderGrid()
+    check_order_names(full_grid, target)
     results = {}
-    for item in target.equations:
-        part = target.equation(item.output)
-        with Progress(f"certifying orders of {item.output}", quiet=as_json) as progress:
-            results[item.output] = certify_orders(
+    for equation in target.equations:
+        single = target.equation(equation.output)
+        with Progress(f"certifying orders of {equation.output}", quiet=as_json) as progress:
+            results[equation.output] = certify_orders(
                 runs,
-                part,
-                restrict_grid(every, part),
+                single,
+                restrict_grid(full_grid, single),
                 tolerance=tolerance,
                 min_separation=min_separation,
                 max_term_ratio=max_term_ratio,
@@ -384,9 +388,9 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
             raise ModelError(f"--order-grid {name!r} is not a free order; free are {free}")
 
 
-def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
-    """Return the order grid restricted to ``alpha`` and the free orders of the structure `part`."""
-    return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in part.order_names})
+def restrict_grid(grid: OrderGrid, group: Structure) -> OrderGrid:
+    """Return the order grid restricted to ``alpha`` and the free orders of the structure `group`."""
+    return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in group.order_names})
 
 
 def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
@@ -398,17 +402,17 @@ def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 @contextlib.contextmanager
-def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
+def resumable(path: str | None, hint: str | None = None) -> Iterator[None]:
     """Context manager that prints on Ctrl-C how to resume from the checkpoint file `path`.
 
-    `how` is the command to print; by default ``ftlm resume PATH``. Without a checkpoint file, Ctrl-C is not handled.
+    `hint` is the command to print; by default ``ftlm resume PATH``. Without a checkpoint file, Ctrl-C is not handled.
     """
     try:
         yield
     except KeyboardInterrupt:
         if path is None or not Path(path).exists():
             raise
-        print(f"ftlm: interrupted; go on with: {how or f'ftlm resume {path}'}", file=sys.stderr)
+        print(f"ftlm: interrupted; go on with: {hint or f'ftlm resume {path}'}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
@@ -561,8 +565,8 @@ def identify_frequency(
     if report is not None:
         result.report(report, validation=checked, force=force)
     if as_json:
-        judgement = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
-        show_json({**judgement, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        verdict_entry = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
+        show_json({**verdict_entry, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     print_text(result.summary(checked))
     if verbose:

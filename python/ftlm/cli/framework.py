@@ -62,15 +62,15 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
 
     Raise ModelError for other text.
     """
-    what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
+    description, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, texts).items():
-        ends = split_numbers(value)
-        if len(ends) not in (1, 2):
+        bounds = split_numbers(value)
+        if len(bounds) not in (1, 2):
             raise ModelError(
-                f"{option} {name}={value}: {value!r} is neither {what} nor LOW:HIGH; give one, such as {example}"
+                f"{option} {name}={value}: {value!r} is neither {description} nor LOW:HIGH; give one, such as {example}"
             )
-        values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
+        values[name] = bounds[0] if len(bounds) == 1 else (bounds[0], bounds[1])
     return values
 
 
@@ -79,11 +79,11 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
 
     `option` and `example` are named in the message.
     """
-    parts = text.split(":")
+    texts = text.split(":")
     try:
-        if len(parts) != 2:
+        if len(texts) != 2:
             raise ValueError
-        start, stop = (float(p) if p.strip() else None for p in parts)
+        start, stop = (float(p) if p.strip() else None for p in texts)
     except ValueError:
         raise ModelError(f"{option} {text!r} is not an interval; give FROM:TO, such as {example}") from None
     return start, stop
@@ -131,9 +131,9 @@ def _number_message(details: Mapping[str, Any]) -> str:
     value, kind = details["input"], details["type"]
     if kind not in ("float_parsing", "int_parsing"):
         return f"{value!r} is out of range: {details['msg'].removeprefix('Input ')}."
-    what = "number" if kind == "float_parsing" else "whole number"
+    description = "number" if kind == "float_parsing" else "whole number"
     remedy = f"; write {value.replace(',', '.')!r}" if re.fullmatch(r"-?\d+,\d+", str(value)) else ""
-    return f"{value!r} is not a {what}{remedy}."
+    return f"{value!r} is not a {description}{remedy}."
 
 
 class Command(TyperCommand):
@@ -172,13 +172,13 @@ class Command(TyperCommand):
     def _check_repetition(self, ctx: Any, args: Sequence[str]) -> None:
         """Fail if an option with a single value is given twice; the parser would ignore all values but the last."""
         order: list[Any] = self.make_parser(ctx).parse_args(list(args))[2]
-        single = [p for p in order if p.param_type_name == "option" and not (p.multiple or p.is_flag or p.count)]
-        for option in single:
-            if single.count(option) > 1:
+        single_valued = [p for p in order if p.param_type_name == "option" and not (p.multiple or p.is_flag or p.count)]
+        for option in single_valued:
+            if single_valued.count(option) > 1:
                 (flag, *_), remedy = sorted(option.opts, key=len, reverse=True), "give it once"
                 if flag == "--structure":
                     remedy = "join the equations of several outputs by a semicolon"
-                ctx.fail(f"{flag} is given {single.count(option)} times, but takes one value; {remedy}.")
+                ctx.fail(f"{flag} is given {single_valued.count(option)} times, but takes one value; {remedy}.")
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:
         """Return the method that the arguments select, or the default method; None if the command has no methods."""
@@ -186,10 +186,10 @@ class Command(TyperCommand):
         if option is None:
             return None
         choice = option.default
-        for word, following in zip(args, [*args, ""][1:], strict=True):
+        for word, next_argument in zip(args, [*args, ""][1:], strict=True):
             flag, equals, value = word.partition("=")
             if flag in option.opts:
-                choice = value if equals else following
+                choice = value if equals else next_argument
         return str(choice)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -281,11 +281,13 @@ def parse_option_texts(docstring: str | None) -> tuple[str, dict[str, OptionText
     The summary is the text before the first section. Each section is a panel of the help, and its entries have the
     form of numpydoc: option name, colon and metavar, then the text. Options in the section ``Options`` have no panel.
     """
-    summary, *parts = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
+    summary, *sections = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
     texts = {}
-    for panel, entries in zip(parts[::2], parts[1::2], strict=True):
-        for name, metavar, words in re.findall(r"^(\w+)(?: : (.+))?\n((?: +.*\n?)+)", entries, re.MULTILINE):
-            texts[name] = OptionText(None if panel == OTHER_PANEL else panel, metavar or None, " ".join(words.split()))
+    for panel, parameters in zip(sections[::2], sections[1::2], strict=True):
+        for name, metavar, description in re.findall(r"^(\w+)(?: : (.+))?\n((?: +.*\n?)+)", parameters, re.MULTILINE):
+            texts[name] = OptionText(
+                None if panel == OTHER_PANEL else panel, metavar or None, " ".join(description.split())
+            )
     return summary.strip(), texts
 
 
@@ -312,8 +314,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
             records[parameter.name] = kind
-            hints, own = get_type_hints(kind, include_extras=True), parse_option_texts(kind.__doc__)[1] | texts
-            options += [_option(f.name, hints[f.name], f.default, own) for f in fields(kind)]
+            hints, option_texts = get_type_hints(kind, include_extras=True), parse_option_texts(kind.__doc__)[1] | texts
+            options += [_option(f.name, hints[f.name], f.default, option_texts) for f in fields(kind)]
             if hasattr(kind, "methods_of"):
                 methods_by_field |= {f.name: kind.methods_of(f.name) for f in fields(kind)}
         else:
@@ -348,9 +350,10 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(exit_code(error)) from None
         except OSError as error:
             # This is an error of standard output or of the working folder; errors of files are FtlmError.
-            what = "" if error.filename is None else f" {error.filename!r}"
+            file_text = "" if error.filename is None else f" {error.filename!r}"
             print(
-                f"ftlm: the system refuses{what}: {error.strerror or error}; files that were written are complete; "
+                f"ftlm: the system refuses{file_text}: {error.strerror or error}; files that were written are "
+                "complete; "
                 "check the destination of standard output and the working folder",
                 file=sys.stderr,
             )
@@ -421,7 +424,7 @@ def print_text(text: str, end: str = "\n") -> None:
     Table rows and commands to copy are not wrapped.
     """
     if sys.stdout.isatty():
-        text = "\n".join(piece for line in text.split("\n") for piece in wrap_line(line))
+        text = "\n".join(wrapped for line in text.split("\n") for wrapped in wrap_line(line))
     print(text, end=end)
 
 
@@ -430,12 +433,12 @@ def wrap_line(line: str) -> list[str]:
 
     Table rows, and lines that begin with "next: ", are not wrapped.
     """
-    lead = line[: len(line) - len(line.lstrip())]
+    indent = line[: len(line) - len(line.lstrip())]
     if len(line) <= columns() or line.startswith("next: ") or len(_GAP_PATTERN.findall(line.strip())) >= MIN_TABLE_GAPS:
         return [line]
     # Further lines of a list entry are indented to the column where the text of the entry begins.
     entry = _ENTRY_PATTERN.match(line)
-    return wrap_text(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
+    return wrap_text(line.strip(), indent, " " * (entry.end() if entry else len(indent) + 2))
 
 
 def show_json(document: Any) -> None:
@@ -511,9 +514,9 @@ def announce_design(design: str, samples: int) -> None:
     _announce("designing", DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0))
 
 
-def _announce(what: str, seconds: float, *, quiet: bool = False) -> None:
-    """Print the expected duration of `what` if it is long; `seconds` is its time on the reference machine."""
+def _announce(operation: str, seconds: float, *, quiet: bool = False) -> None:
+    """Print the expected duration of `operation` if it is long; `seconds` is its time on the reference machine."""
     # The speed of this machine is measured only for long work, because the measurement itself takes time.
     if seconds > MIN_ANNOUNCED_TIME_S:
         bounds = duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS)
-        Progress("", quiet=quiet).expect(what, *bounds)
+        Progress("", quiet=quiet).expect(operation, *bounds)

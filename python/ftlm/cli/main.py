@@ -55,9 +55,9 @@ class CommandTable(UserDict[str, Any]):
         commands = importlib.import_module(f"ftlm.cli.{module}_commands")
         # The function of the command `open` is `open_`, because `open` would hide a builtin function.
         function = getattr(commands, name.replace("-", "_"), None) or getattr(commands, f"{name}_")
-        own = typer.Typer(rich_markup_mode=None, add_completion=False, context_settings=CONTEXT_SETTINGS)
-        own.command(name, cls=Command, short_help=short)(function)
-        subcommand = typer.main.get_command(own)
+        application = typer.Typer(rich_markup_mode=None, add_completion=False, context_settings=CONTEXT_SETTINGS)
+        application.command(name, cls=Command, short_help=short)(function)
+        subcommand = typer.main.get_command(application)
         assert isinstance(subcommand, TyperCommand)
         return subcommand
 

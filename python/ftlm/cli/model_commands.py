@@ -68,8 +68,8 @@ def compare(
         # The comparison is negated, so that a fit of NaN counts as too low.
         low = {name: fit for name, fit in comparison.fit.items() if not fit >= min_fit}
         if low:
-            listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
-            print(f"ftlm: fit below {min_fit:g} %: {listed}", file=sys.stderr)
+            fits_text = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
+            print(f"ftlm: fit below {min_fit:g} %: {fits_text}", file=sys.stderr)
             raise typer.Exit(EXIT_VALIDATION)
 
 
@@ -170,11 +170,11 @@ def plot(
     """
     figure_kind(out)
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
-    alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
-    if not runs and kind not in alone:
+    plots_of_model = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
+    if not runs and kind not in plots_of_model:
         raise ModelError(f"--kind {kind} needs at least one run; give files")
-    if kind in alone:
-        figure = alone[kind](loaded)
+    if kind in plots_of_model:
+        figure = plots_of_model[kind](loaded)
     elif kind == "fit":
         figure = plots.fit(loaded, runs, inputs=True)
     elif kind == "series":

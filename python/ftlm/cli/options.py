@@ -143,10 +143,10 @@ class StructureOptions:
         """
         stage = re.fullmatch("arm:([12])", text)
         if stage is not None:
-            other = f"theta{3 - int(stage[1])}"
-            if not any(name.startswith(other) for run in runs for name in run.signals):
-                absent = f"no run has {other}1 or {other}2"
-                print(f"ftlm: {absent}: {text} is a link alone, the other locked", file=sys.stderr)
+            other_joint = f"theta{3 - int(stage[1])}"
+            if not any(name.startswith(other_joint) for run in runs for name in run.signals):
+                reason = f"no run has {other_joint}1 or {other_joint}2"
+                print(f"ftlm: {reason}: {text} is a link alone, the other locked", file=sys.stderr)
                 return self.structure(text, alone=True)
         return self.structure(text)
 
@@ -157,12 +157,15 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Raise ModelError if an option is set that does not apply to a structure of `count` equations as text."""
-        wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
-        if wrong:
-            owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
+        inapplicable = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
+        if inapplicable:
+            owner = (
+                "the flexible link or of several equations" if inapplicable == ["--coupling"] else "the flexible link"
+            )
             kind = "one equation in words" if count == 1 else "equations in words"
             raise ModelError(
-                f"{', '.join(wrong)}: of {owner}, not used with {kind}; leave {'it' if len(wrong) == 1 else 'them'} "
+                f"{', '.join(inapplicable)}: of {owner}, not used with {kind}; leave "
+                f"{'it' if len(inapplicable) == 1 else 'them'} "
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
@@ -199,18 +202,19 @@ class StructureOptions:
         the zero of the strain gauge. The initial conditions are the angle and velocity of the link by default, because
         terms of nearly integer order have little memory.
         """
-        wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
-        if wrong:
+        inapplicable = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
+        if inapplicable:
             raise ModelError(
-                f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "
+                f"{', '.join(inapplicable)}: --structure {text} has its own; leave "
+                f"{'it' if len(inapplicable) == 1 else 'them'} out, "
                 "or use --structure flexible-link:1, :2 or :both"
             )
         stage = STAGES_BY_NAME.get(text.partition(":")[2] or "both")
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
         built = link_structure(stage, both=not alone)
-        whole = ("beta", 0.0) if alone else ("mu", 1.0)
-        return built.with_orders({n: whole[1] for n in built.order_names if n.startswith(whole[0])})
+        integer_order = ("beta", 0.0) if alone else ("mu", 1.0)
+        return built.with_orders({n: integer_order[1] for n in built.order_names if n.startswith(integer_order[0])})
 
     def _flexible_link(self, text: str) -> Structure:
         stage = STAGES_BY_NAME.get(text.partition(":")[2])

@@ -33,23 +33,26 @@ def same_rate(first: float, second: float) -> bool:
     return abs(first - second) <= 1e-9 * second
 
 
-def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
+def select_outputs(argument: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of chosen outputs; all outputs if the choice is None.
 
-    Raise ModelError if a name is unknown or repeated, or the choice is empty. `what` names the argument in the message.
+    Raise ModelError if a name is unknown or repeated, or the choice is empty. `argument` names the argument in the
+    message.
     """
     if choice is None:
         return outputs
     names = [] if isinstance(choice, str) or not isinstance(choice, Sequence) else [*choice[: len(outputs) + 1]]
-    absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
-    if not names or (not absent and len(set(names)) < len(names)):
+    unknown_names = [n for n in names if not (isinstance(n, str) and n in outputs)]
+    if not names or (not unknown_names and len(set(names)) < len(names)):
         raise ModelError(
-            f"{what} = {short_repr(choice)} is not a list of different outputs; the input affects {', '.join(outputs)}"
+            f"{argument} = {short_repr(choice)} is not a list of different outputs; the input affects "
+            f"{', '.join(outputs)}"
         )
-    if absent:
-        near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""
+    if unknown_names:
+        suggestion = nearest(unknown_names[0], outputs) if isinstance(unknown_names[0], str) else ""
         raise ModelError(
-            f"{what} = {short_repr(absent[0])} is not one of the outputs that the input reaches{near}; they are "
+            f"{argument} = {short_repr(unknown_names[0])} is not one of the outputs that the input "
+            f"reaches{suggestion}; they are "
             f"{', '.join(outputs)}"
         )
     return tuple(names)
@@ -70,10 +73,10 @@ def positive(name: str, value: object) -> float:
 
 def check_limit(limit: object) -> float:
     """Return the maximum magnitude of a command, which may be infinite; raise ModelError if it is not positive."""
-    most = real_number("limit", limit)
-    if not most > 0:
+    maximum = real_number("limit", limit)
+    if not maximum > 0:
         raise ModelError(f"{setting('limit')} {short_repr(limit)} is not positive; give a number above 0, or inf")
-    return most
+    return maximum
 
 
 def check_samples(samples: object, seed: object) -> tuple[int, int]:
@@ -84,18 +87,18 @@ def check_samples(samples: object, seed: object) -> tuple[int, int]:
     return check_integer("samples", samples, 0, 10_000), check_seed(seed)
 
 
-def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
+def sum_row(argument: str, text: object, outputs: tuple[str, ...]) -> Floats:
     """Return the coefficient of each output in a sum such as "theta11 + theta12", shape (outputs,).
 
-    Raise ModelError if a term is not an output. `what` names the argument in the message.
+    Raise ModelError if a term is not an output. `argument` names the argument in the message.
     """
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:
         name = part.strip()
         if name not in outputs:
-            near = nearest(name, outputs)
+            suggestion = nearest(name, outputs)
             raise ModelError(
-                f"{what} = {short_repr(text)} is not a sum of outputs that the input reaches{near}; they are "
+                f"{argument} = {short_repr(text)} is not a sum of outputs that the input reaches{suggestion}; they are "
                 f"{', '.join(outputs)}"
             )
         row[outputs.index(name)] += 1.0

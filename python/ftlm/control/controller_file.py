@@ -96,9 +96,9 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
     def controller(self) -> Lqg:
         """Return the controller with these matrices; raise ModelError if shapes, numbers or names are invalid."""
-        size, count = len(self.a), len(self.measured)
-        shapes = {"a": (size, size), "b": (size, 1), "c": (len(self.outputs), size)}
-        shapes |= {"correction": (size + 1, count), "feedback": (1, size)}
+        state_count, count = len(self.a), len(self.measured)
+        shapes = {"a": (state_count, state_count), "b": (state_count, 1), "c": (len(self.outputs), state_count)}
+        shapes |= {"correction": (state_count + 1, count), "feedback": (1, state_count)}
         matrices = {name: np.array(getattr(self, name), dtype=np.float64) for name in shapes}
         for name, shape in shapes.items():
             matrix = matrices[name]
@@ -106,19 +106,19 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
                 raise ModelError(f"{name} has shape {matrix.shape}, not {shape}")
             if not np.isfinite(matrix).all():
                 raise ModelError(f"{name} is not finite")
-        if not 0 < size <= MAX_POLES + 1:
-            raise ModelError(f"the number of states, {size}, is not from 1 to {MAX_POLES + 1}")
-        if not 0 < len(self.poles) <= size:
-            raise ModelError(f"{len(self.poles)} poles do not match {size} states")
-        absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
-        if absent:
-            raise ModelError(f"{absent[0]} is not one of its outputs")
+        if not 0 < state_count <= MAX_POLES + 1:
+            raise ModelError(f"the number of states, {state_count}, is not from 1 to {MAX_POLES + 1}")
+        if not 0 < len(self.poles) <= state_count:
+            raise ModelError(f"{len(self.poles)} poles do not match {state_count} states")
+        missing_names = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
+        if missing_names:
+            raise ModelError(f"{missing_names[0]} is not one of its outputs")
         if not (self.rate > 0 and len(self.noise) == count):
             raise ModelError("the rate is not above 0, or a measured output has no noise level")
         lists = (self.gain_error_db, self.phase_error_degrees, self.deviations)
-        if any(len(one) != len(self.outputs) for one in lists):
+        if any(len(values) != len(self.outputs) for values in lists):
             raise ModelError("an output has no approximation errors")
-        gain, phase, deviations = (dict(zip(self.outputs, one, strict=True)) for one in lists)
+        gain, phase, deviations = (dict(zip(self.outputs, values, strict=True)) for values in lists)
         realization = Realization(
             tuple(self.outputs),
             self.input,
@@ -197,9 +197,9 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     DataError
         If the file cannot be read, or is not a controller file of this version.
     """
-    read = CONTROLLER_FORMAT.read(path)
+    stored = CONTROLLER_FORMAT.read(path)
     try:
-        return read.controller.controller()
+        return stored.controller.controller()
     except (FtlmError, ValueError) as error:
         raise DataError(f"{path} is damaged: {error_text(error)}; save the controller again") from error
 
@@ -212,7 +212,7 @@ def _pid(controller: DiscretePid) -> PidFile:
         band=controller.band,
         order=controller.order,
         direct=controller.direct,
-        lags=[Lag(of, *values) for of, values in controller.lags()],
+        lags=[Lag(kind, *values) for kind, values in controller.lags()],
     )
 
 
@@ -261,23 +261,24 @@ class JointControllers:
 
     def __init__(self, first: DiscretePid | Lqg | None, second: DiscretePid | Lqg | None = None) -> None:
         self.loops = (first, second)
-        self._reads: list[list[int]] = []
+        self._measured_indices: list[list[int]] = []
         for j, loop in enumerate(self.loops):
             if not isinstance(loop, (DiscretePid, Lqg, type(None))):
                 raise ModelError(f"controller {j + 1} is {type_name(loop)}; give a DiscretePid, an Lqg or None")
             names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLE_NAMES[2 * j],)
-            unknown = [n for n in names if n not in ANGLE_NAMES]
-            if unknown:
+            unknown_names = [n for n in names if n not in ANGLE_NAMES]
+            if unknown_names:
                 raise ModelError(
-                    f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLE_NAMES)}"
+                    f"the controller reads {', '.join(unknown_names)}; the arm measures {', '.join(ANGLE_NAMES)}"
                 )
-            driven = loop.observer.realization.input if isinstance(loop, Lqg) else None
-            if driven in MOTOR_INPUTS and driven != MOTOR_INPUTS[j]:
+            motor_input = loop.observer.realization.input if isinstance(loop, Lqg) else None
+            if motor_input in MOTOR_INPUTS and motor_input != MOTOR_INPUTS[j]:
                 raise ModelError(
-                    f"the controller of joint {j + 1} commands {driven}, the current of joint {2 - j}; give it as the "
+                    f"the controller of joint {j + 1} commands {motor_input}, the current of joint {2 - j}; give it "
+                    "as the "
                     f"{('second', 'first')[j]} one"
                 )
-            self._reads.append([ANGLE_NAMES.index(n) for n in names])
+            self._measured_indices.append([ANGLE_NAMES.index(n) for n in names])
         rates = [loop.rate for loop in self.loops if loop is not None]
         if len(rates) == 2 and not same_rate(*rates):
             raise ModelError(
@@ -307,12 +308,12 @@ class JointControllers:
             raise DataError(
                 f"angles and reference have shapes {angles.shape} and {reference.shape}; give (4,) and (2,)"
             )
-        first, second = (
+        first_current, second_current = (
             0.0
             if loop is None
-            else loop(angles[reads], float(reference[j]))
+            else loop(angles[indices], float(reference[j]))
             if isinstance(loop, Lqg)
-            else loop(float(reference[j] - angles[reads[0]]))
-            for j, (loop, reads) in enumerate(zip(self.loops, self._reads, strict=True))
+            else loop(float(reference[j] - angles[indices[0]]))
+            for j, (loop, indices) in enumerate(zip(self.loops, self._measured_indices, strict=True))
         )
-        return first, second
+        return first_current, second_current

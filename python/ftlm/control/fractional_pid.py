@@ -104,13 +104,13 @@ class _Bank:
     direct: float
     weights: Floats
     keeps: Floats
-    now: Floats
-    before: Floats
+    input_gain: Floats
+    previous_input_gain: Floats
 
     def response(self, z: Complex) -> Complex:
         """Return the frequency response at points z on the unit circle, shape (W,)."""
         inverse = 1.0 / z[:, None]
-        lags = (self.now + self.before * inverse) / (1.0 - self.keeps * inverse)
+        lags = (self.input_gain + self.previous_input_gain * inverse) / (1.0 - self.keeps * inverse)
         return np.asarray(self.direct + lags @ self.weights)
 
 
@@ -162,7 +162,7 @@ class DiscretePid:
                     "of at most 1"
                 )
         value = checked_rate(rate)
-        most = check_limit(limit)
+        maximum = check_limit(limit)
         half = math.pi * value
         if band is None:
             band = (half / 1000.0, half / 8.0)
@@ -173,7 +173,7 @@ class DiscretePid:
                 f"the rate, {half:g} rad/s, the upper at most {MAX_BAND_RATIO:g} times the lower"
             )
         count = check_integer("order", order, 1, MAX_APPROXIMATION_ORDER)
-        self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
+        self.pid, self.rate, self.limit, self.band, self.order = pid, value, maximum, (low, high), count
         pole_band = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, pole_band, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, pole_band, count), 1.0 / value)
@@ -206,7 +206,7 @@ class DiscretePid:
         return [
             (name, (float(k), float(n), float(b), float(w)))
             for name, bank in banks
-            for k, n, b, w in zip(bank.keeps, bank.now, bank.before, bank.weights, strict=True)
+            for k, n, b, w in zip(bank.keeps, bank.input_gain, bank.previous_input_gain, bank.weights, strict=True)
         ]
 
     def response(self, w: Floats | Complex) -> Complex:
@@ -226,21 +226,23 @@ class DiscretePid:
         if self._lags is None:
             # The lags of the derivative start in the steady state of a constant error, in which its output is zero.
             bank = self._derivative
-            self._lags = error * (bank.now + bank.before) / (1.0 - bank.keeps)
+            self._lags = error * (bank.input_gain + bank.previous_input_gain) / (1.0 - bank.keeps)
             self._error, sums = error, self._sums
         else:
             self._lags = self._next_states(self._derivative, self._lags, error)
             sums = self._next_states(self._integral, self._sums, error)
-        rest = self.pid.kp * error + self._derivative.direct * error + float(self._lags @ self._derivative.weights)
-        output = rest + self._integral.direct * error + float(sums @ self._integral.weights)
+        proportional_part = (
+            self.pid.kp * error + self._derivative.direct * error + float(self._lags @ self._derivative.weights)
+        )
+        output = proportional_part + self._integral.direct * error + float(sums @ self._integral.weights)
         if abs(output) > self.limit and output * error > 0:
             sums = self._sums
-            output = rest + self._integral.direct * error + float(sums @ self._integral.weights)
+            output = proportional_part + self._integral.direct * error + float(sums @ self._integral.weights)
         self._sums, self._error = sums, error
         return min(max(output, -self.limit), self.limit)
 
     def _next_states(self, bank: _Bank, states: Floats, error: float) -> Floats:
-        return bank.keeps * states + bank.now * error + bank.before * self._error
+        return bank.keeps * states + bank.input_gain * error + bank.previous_input_gain * self._error
 
     def _errors(self) -> tuple[float, float]:
         w = np.geomspace(*self.band, ERROR_FREQUENCIES)
@@ -289,8 +291,8 @@ def _integral(power: float, pole_band: tuple[float, float], order: int) -> tuple
     if power >= 1.0:
         return np.zeros(1), np.ones(1), 0.0
     poles, residues, gain = oustaloup(1.0 - power, pole_band, order)
-    whole = gain + float(np.sum(residues / poles))
-    return np.append(0.0, poles), np.append(whole, -residues / poles), 0.0
+    total_gain = gain + float(np.sum(residues / poles))
+    return np.append(0.0, poles), np.append(total_gain, -residues / poles), 0.0
 
 
 def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
@@ -301,13 +303,13 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
     x = poles * step
     keeps = np.exp(-x)
     # Near x = 0, (1 - e^-x)/x and both coefficients are replaced by their limits 1, 1/2 and 1/2.
-    small = x < 1e-6
-    safe = np.where(small, 1.0, x)
-    mean = np.where(small, 1.0 - x / 2.0, -np.expm1(-safe) / safe)
-    now = step * np.where(small, 0.5, (1.0 - mean) / safe)
-    coefficients_before = step * np.where(small, 0.5, (mean - keeps) / safe)
+    is_small = x < 1e-6
+    divisor = np.where(is_small, 1.0, x)
+    mean = np.where(is_small, 1.0 - x / 2.0, -np.expm1(-divisor) / divisor)
+    input_gain = step * np.where(is_small, 0.5, (1.0 - mean) / divisor)
+    coefficients_before = step * np.where(is_small, 0.5, (mean - keeps) / divisor)
     with np.errstate(over="ignore"):
-        return _Bank(factor * direct, factor * residues, keeps, now, coefficients_before)
+        return _Bank(factor * direct, factor * residues, keeps, input_gain, coefficients_before)
 
 
 #: Range of the orders of integral and derivative, and number of values per order in each step of the grid refinement.
@@ -466,12 +468,14 @@ def fractional_pid(
     plant.check_stable()
     samples_drawn = plant.samples(count, start)
     target = np.exp(1j * (math.radians(margin) - math.pi)) / plant.response(np.array([wc]))[0]
-    near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
-    slope = float(np.diff(np.unwrap(np.angle(plant.response(near))))[0] / (near[1] - near[0]))
+    crossover_pair = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
+    slope = float(
+        np.diff(np.unwrap(np.angle(plant.response(crossover_pair))))[0] / (crossover_pair[1] - crossover_pair[0])
+    )
     w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARISON_FREQUENCIES)
-    plant_responses = np.array([one.response(w) for one in [plant, *samples_drawn[:50]]])
-    best = _best_controller(target, slope, wc, w, plant_responses)
-    if best is None:
+    plant_responses = np.array([plant_sample.response(w) for plant_sample in [plant, *samples_drawn[:50]]])
+    controller = _best_controller(target, slope, wc, w, plant_responses)
+    if controller is None:
         raise ModelError(
             f"no fractional PID with gains from 0 and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
             "margin of "
@@ -479,21 +483,26 @@ def fractional_pid(
             f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
             "another phase margin"
         )
-    fine = nyquist_frequencies(wc, plant.rate)
-    above = fine > LAST_CROSSOVER_TOLERANCE * wc
-    high = plant.response(fine[above])
+    fine_frequencies = nyquist_frequencies(wc, plant.rate)
+    is_above_crossover = fine_frequencies > LAST_CROSSOVER_TOLERANCE * wc
+    high = plant.response(fine_frequencies[is_above_crossover])
 
     def is_last(pid: FractionalPid) -> bool:
         """Whether the loop gain is below 1 at all frequencies above the requested crossover."""
-        return bool(np.all(np.abs(pid.response(fine[above]) * high) < 1.0))
+        return bool(np.all(np.abs(pid.response(fine_frequencies[is_above_crossover]) * high) < 1.0))
 
-    choice = best if is_last(best) else _best_controller(target, slope, wc, w, plant_responses, is_last)
-    acting = (choice or best).response(fine)
-    lam = (choice or best).lam if (choice or best).ki > 0 else 0.0
+    choice = controller if is_last(controller) else _best_controller(target, slope, wc, w, plant_responses, is_last)
+    acting = (choice or controller).response(fine_frequencies)
+    lam = (choice or controller).lam if (choice or controller).ki > 0 else 0.0
 
-    def loop_margins(one: Plant, factor: float = 1.0) -> Margins:
-        order = one.integral_order() + lam
-        return margins_of(factor * acting * one.response(fine), fine, order, one.count_unstable_poles())
+    def loop_margins(plant_sample: Plant, factor: float = 1.0) -> Margins:
+        order = plant_sample.integral_order() + lam
+        return margins_of(
+            factor * acting * plant_sample.response(fine_frequencies),
+            fine_frequencies,
+            order,
+            plant_sample.count_unstable_poles(),
+        )
 
     nominal = loop_margins(plant)
     if not nominal.stable:
@@ -518,8 +527,8 @@ def fractional_pid(
             "identify from a longer or richer run, or lower the crossover"
         )
     flat = tuple(loop_margins(plant, factor).phase for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1]))
-    others = [replace(plant, output=o) for o in model.outputs if o != plant.output]
-    plants = (plant, *(p for p in others if p.has_response()))
+    other_plants = [replace(plant, output=o) for o in model.outputs if o != plant.output]
+    plants = (plant, *(p for p in other_plants if p.has_response()))
     return PidDesign(choice, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), plants)
 
 
@@ -538,15 +547,16 @@ def plant_of(
     check_no_input_nonlinearity(model, "a loop's margin")
     inputs = response_inputs(model, coupled=is_coupled(coupling))
     names = []
-    for what, name, choices in (("output", output, model.outputs), ("input", driver, inputs)):
+    for kind, name, choices in (("output", output, model.outputs), ("input", driver, inputs)):
         if name is None and len(choices) == 1:
             names.append(choices[0])
         elif name is None:
-            raise ModelError(f"the model has several {what}s; name one with {parameter(what)}: {', '.join(choices)}")
+            raise ModelError(f"the model has several {kind}s; name one with {parameter(kind)}: {', '.join(choices)}")
         elif not isinstance(name, str) or name not in choices:
-            near = nearest(name, choices) if isinstance(name, str) else ""
+            suggestion = nearest(name, choices) if isinstance(name, str) else ""
             raise ModelError(
-                f"{what} = {short_repr(name)} is not one of the model's{near}; it has {', '.join(choices) or 'none'}"
+                f"{kind} = {short_repr(name)} is not one of the model's{suggestion}; it has "
+                f"{', '.join(choices) or 'none'}"
             )
         else:
             names.append(name)
@@ -568,22 +578,28 @@ def _best_controller(
     parameter sample. They determine the maximum sensitivity of the loop.
     """
     candidates: list[tuple[float, float, FractionalPid]] = []
-    centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
+    center, half_range = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
     for _ in range(REFINEMENT_ROUNDS):
-        around = [np.clip(c + reach * np.linspace(-1, 1, ORDERS_PER_ROUND), MIN_ORDER, MAX_ORDER) for c in centre]
-        for lam in np.unique(around[0]).tolist():
-            for mu in np.unique(around[1]).tolist():
+        order_values = [
+            np.clip(c + half_range * np.linspace(-1, 1, ORDERS_PER_ROUND), MIN_ORDER, MAX_ORDER) for c in center
+        ]
+        for lam in np.unique(order_values[0]).tolist():
+            for mu in np.unique(order_values[1]).tolist():
                 pid = _solve_gains(target, slope, wc, lam, mu)
                 if pid is None or not is_allowed(pid):
                     continue
-                worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * plant_responses)))
-                candidates.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
+                max_sensitivity = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * plant_responses)))
+                candidates.append(
+                    (max_sensitivity, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid)
+                )
         if not candidates:
             return None
-        sensitivity_limit = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in candidates))
-        best = max((f for f in candidates if f[0] <= sensitivity_limit), key=lambda f: f[1])[2]
-        centre, reach = (best.lam, best.mu), reach / ORDERS_PER_ROUND * 2
-    return best
+        sensitivity_limit = max(
+            TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(max_sensitivity for max_sensitivity, _, _ in candidates)
+        )
+        controller = max((f for f in candidates if f[0] <= sensitivity_limit), key=lambda f: f[1])[2]
+        center, half_range = (controller.lam, controller.mu), half_range / ORDERS_PER_ROUND * 2
+    return controller
 
 
 def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
@@ -592,11 +608,11 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
     Return None if a gain is negative or not finite, or if the equations are singular.
     """
     powers = np.array([0.0, -lam, mu])
-    parts = (1j * wc) ** powers
-    turning = powers * parts / (wc * target)
+    powers_of_s = (1j * wc) ** powers
+    turning = powers * powers_of_s / (wc * target)
     try:
         gains = np.linalg.solve(
-            np.array([parts.real, parts.imag, turning.imag]), np.array([target.real, target.imag, -slope])
+            np.array([powers_of_s.real, powers_of_s.imag, turning.imag]), np.array([target.real, target.imag, -slope])
         )
     except np.linalg.LinAlgError:
         return None
@@ -612,15 +628,20 @@ def least_certain_parameter(model: Model) -> str:
     if covariance is None:
         return "their covariance is not known"
     names = []
-    for item in model.equations:
-        names += [f"the order of {item.output}"]
+    for equation in model.equations:
+        names += [f"the order of {equation.output}"]
         names += [
             n
-            for t in item.terms
-            for n in (f"the order of {t.signal} in {item.output}", f"the coefficient of {t.signal} in {item.output}")
+            for t in equation.terms
+            for n in (
+                f"the order of {t.signal} in {equation.output}",
+                f"the coefficient of {t.signal} in {equation.output}",
+            )
         ]
-        names += [f"the friction of {item.output}"] * (0 if item.friction is None else len(item.friction.numbers))
+        names += [f"the friction of {equation.output}"] * (
+            0 if equation.friction is None else len(equation.friction.numbers)
+        )
     names += list(model.structure.fixed_inputs)
-    share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
-    at = int(np.argmax(np.nan_to_num(share, nan=0.0, posinf=1e300)))
-    return f"the most uncertain is {names[at]}, with a standard error of {100 * share[at]:.2g} %"
+    relative_errors = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
+    at = int(np.argmax(np.nan_to_num(relative_errors, nan=0.0, posinf=1e300)))
+    return f"the most uncertain is {names[at]}, with a standard error of {100 * relative_errors[at]:.2g} %"

@@ -100,9 +100,9 @@ class Shaper:
                     f"{setting('rate')} {rate:g} Hz has fewer than four samples in a period of the mode at "
                     f"{mode.frequency:.4g} rad/s; use at least {2.0 * mode.pole.imag / math.pi:.3g} Hz"
                 )
-            part = _zv_samples(mode, 1.0 / rate)
+            mode_impulses = _zv_samples(mode, 1.0 / rate)
             for _ in range(SHAPER_REPETITIONS[self.kind]):
-                taps = _convolve(np.append(taps, np.zeros(len(part) - 1)), part)
+                taps = _convolve(np.append(taps, np.zeros(len(mode_impulses) - 1)), mode_impulses)
         return taps
 
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
@@ -129,14 +129,15 @@ class Shaper:
         if values.dtype.kind not in "fiu" or values.ndim not in (1, 2) or values.size == 0:
             raise DataError("reference is not an array of numbers; give one of shape (rows,) or (rows, columns)")
         x = as_floats("reference", values).reshape(len(values), -1)
-        bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-        if bad.size:
+        invalid_rows = np.flatnonzero(~np.isfinite(x).all(axis=1))
+        if invalid_rows.size:
             raise DataError(
-                f"reference is not finite at row {bad[0]} ({bad.size} such rows in all); give finite numbers"
+                f"reference is not finite at row {invalid_rows[0]} ({invalid_rows.size} such rows in all); give "
+                "finite numbers"
             )
         taps = self.impulses(rate)
-        rest = x[0]
-        shaped = np.column_stack([_convolve(column, taps) for column in (x - rest).T]) + rest
+        initial_value = x[0]
+        shaped = np.column_stack([_convolve(column, taps) for column in (x - initial_value).T]) + initial_value
         return np.asarray(shaped.reshape(values.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,10 +146,10 @@ class Shaper:
         return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
 
     def __str__(self) -> str:
-        steps = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
-        within = "" if self.worst is None else f"; within their intervals at most {100 * self.worst:.2g} % is left"
+        impulses_text = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
+        worst_text = "" if self.worst is None else f"; within their intervals at most {100 * self.worst:.2g} % is left"
         modes_text = ", ".join(map(str, self.modes))
-        return f"{self.kind.upper()} shaper of {modes_text}: {steps}{within}"
+        return f"{self.kind.upper()} shaper of {modes_text}: {impulses_text}{worst_text}"
 
 
 @check_arguments
@@ -193,16 +194,16 @@ def input_shaper(
     check_choice("kind", kind, SHAPER_REPETITIONS)
     count = check_integer("modes", modes, 1)
     if isinstance(model, (complex, float, int, np.number)):
-        every: tuple[Mode, ...] = (_mode_of(model),)
+        all_modes: tuple[Mode, ...] = (_mode_of(model),)
     else:
-        every = model_modes(model, coupling=coupling)
-    unstable = [m for m in every if m.unstable or m.damping <= 0.0]
+        all_modes = model_modes(model, coupling=coupling)
+    unstable = [m for m in all_modes if m.unstable or m.damping <= 0.0]
     if unstable:
         raise ModelError(
             f"the model is not stable ({unstable[0]}), so its response cannot be shaped; close a loop around it, and "
             "shape the poles of the loop"
         )
-    oscillatory = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
+    oscillatory = sorted((m for m in all_modes if m.oscillatory), key=lambda m: m.damping)
     if len(oscillatory) < count:
         raise ModelError(
             f"{short_repr(count)} modes are to be shaped, but {len(oscillatory)} modes of the model oscillate, and "
@@ -215,19 +216,22 @@ def input_shaper(
         for _ in range(SHAPER_REPETITIONS[kind]):
             times = np.concatenate([times, times + half])
             amplitudes = np.concatenate([amplitudes, amplitudes * decay]) / (1.0 + decay)
-    instants, place = np.unique(np.round(times, 15), return_inverse=True)
-    summed = np.bincount(place, weights=amplitudes)
-    worst = _worst_residual(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), modes_used)
-    if worst is not None and not worst <= MAX_RESIDUAL_VIBRATION:
+    instants, time_index = np.unique(np.round(times, 15), return_inverse=True)
+    summed = np.bincount(time_index, weights=amplitudes)
+    worst_residual = _worst_residual(
+        np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), modes_used
+    )
+    if worst_residual is not None and not worst_residual <= MAX_RESIDUAL_VIBRATION:
         widest = max(modes_used, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
         raise ModelError(
             f"the poles are too uncertain for a shaper: within the intervals of the mode at "
             f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
-            f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave {100 * worst:.0f} % of the "
+            f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave "
+            f"{100 * worst_residual:.0f} % of the "
             f"vibration, more than {100 * MAX_RESIDUAL_VIBRATION:.0f} %; identify from a longer run, or from one "
             "that excites this mode" + (f", or use {parameter('kind', 'zvd')}" if kind == "zv" else "")
         )
-    return Shaper(kind, modes_used, tuple(instants.tolist()), tuple(summed.tolist()), worst)
+    return Shaper(kind, modes_used, tuple(instants.tolist()), tuple(summed.tolist()), worst_residual)
 
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
@@ -255,14 +259,20 @@ def _convolve(x: Floats, taps: Floats) -> Floats:
 def _mode_of(value: complex | np.number[Any]) -> Mode:
     try:
         pole = complex(value)
-        size = abs(pole)
+        magnitude = abs(pole)
     except (TypeError, ValueError, OverflowError):
-        pole, size = complex("nan"), math.nan
+        pole, magnitude = complex("nan"), math.nan
     low, high = POLE_RANGE_RAD_S
-    if not (low <= abs(pole.imag) and size <= high):
+    if not (low <= abs(pole.imag) and magnitude <= high):
         raise ModelError(f"pole = {short_repr(value)} does not oscillate; give a complex pole such as -2 + 17j [rad/s]")
-    slow = abs(pole.real)
-    return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
+    decay_rate = abs(pole.real)
+    return Mode(
+        complex(pole.real, abs(pole.imag)),
+        magnitude,
+        -pole.real / magnitude,
+        1 / decay_rate if decay_rate else math.inf,
+        True,
+    )
 
 
 def _half(mode: Mode) -> tuple[float, float]:
@@ -277,16 +287,24 @@ def _zv_samples(mode: Mode, step: float) -> Floats:
     `step` is the sampling interval [s].
     """
     half, decay_ratio = _half(mode)
-    whole = math.floor(half / step)
-    rest = half - whole * step
+    whole_samples = math.floor(half / step)
+    remainder = half - whole_samples * step
     # sooner + later e^(-s step) = e^(-s rest) at the pole s. Both are positive if the pole is below half the rate.
-    decay, turn = mode.pole.real, mode.pole.imag
-    later = math.exp(decay * (step - rest)) * math.sin(turn * rest) / math.sin(turn * step)
-    sooner = math.exp(-decay * rest) * math.sin(turn * (step - rest)) / math.sin(turn * step)
-    taps = np.zeros(whole + 2)
+    decay, angular_frequency = mode.pole.real, mode.pole.imag
+    second_amplitude = (
+        math.exp(decay * (step - remainder))
+        * math.sin(angular_frequency * remainder)
+        / math.sin(angular_frequency * step)
+    )
+    sooner = (
+        math.exp(-decay * remainder)
+        * math.sin(angular_frequency * (step - remainder))
+        / math.sin(angular_frequency * step)
+    )
+    taps = np.zeros(whole_samples + 2)
     taps[0] = 1.0
-    taps[whole] += decay_ratio * sooner
-    taps[whole + 1] += decay_ratio * later
+    taps[whole_samples] += decay_ratio * sooner
+    taps[whole_samples + 1] += decay_ratio * second_amplitude
     return np.asarray(taps / taps.sum())
 
 
@@ -295,7 +313,7 @@ def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) 
 
     Return None if no mode has intervals.
     """
-    worst: float | None = None
+    largest_residual: float | None = None
     for mode in modes:
         if mode.frequency_error is None or mode.damping_error is None:
             continue
@@ -303,5 +321,7 @@ def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) 
         w = np.maximum(mode.frequency + mode.frequency_error * across, 1e-6 * mode.frequency)
         z = np.clip(mode.damping + mode.damping_error * across, -0.99, 0.99)
         vibration = residual_vibration(times, amplitudes, w[:, None], z)
-        worst = max(worst or 0.0, float(np.max(np.where(np.isfinite(vibration), vibration, np.inf))))
-    return worst
+        largest_residual = max(
+            largest_residual or 0.0, float(np.max(np.where(np.isfinite(vibration), vibration, np.inf)))
+        )
+    return largest_residual

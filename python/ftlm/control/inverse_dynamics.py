@@ -93,14 +93,15 @@ class Trajectory:
         }
 
     def __str__(self) -> str:
-        most = f"largest command {np.max(np.abs(self.command)):.3g}"
-        within = (
+        command_text = f"largest command {np.max(np.abs(self.command)):.3g}"
+        uncertainty_text = (
             ""
             if self.residual_vibration is None
             else f", at most {self.residual_vibration:.2g} off it afterwards within the intervals"
         )
         return (
-            f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {most}{within}; the path itself as the "
+            f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {command_text}{uncertainty_text}; the "
+            "path itself as the "
             f"reference would leave {self.plain:.2g}"
         )
 
@@ -129,8 +130,8 @@ def point_to_point(
     ModelError
         If an argument is out of range, the move has fewer than ten samples, or the path has more than 100 000.
     """
-    reach = real_number("distance", distance)
-    if not math.isfinite(reach):
+    distance_value = real_number("distance", distance)
+    if not math.isfinite(distance_value):
         raise ModelError(f"{setting('distance')} {short_repr(distance)} is not a finite number; give a number")
     times = positive("duration", duration), positive("rate", rate)
     rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
@@ -148,7 +149,7 @@ def point_to_point(
     if rows > MAX_PATH_ROWS:
         raise ModelError(f"a move of {rows:.4g} samples is longer than {MAX_PATH_ROWS}; give it less time")
     s = np.clip((np.arange(round(rows)) / times[1] - rests[0]) / times[0], 0.0, 1.0)
-    return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
+    return np.asarray(distance_value * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
 
 
 @check_arguments
@@ -202,72 +203,78 @@ def inverse_dynamics(
         raise ModelError(f"design is {type_name(design)}, not a PidDesign or an LqgDesign; design a loop first")
     rows = _path(path)
     count, start = check_samples(samples, seed)
-    most = check_limit(limit)
+    maximum = check_limit(limit)
     names = tuple(p.output for p in design.plants)
     row = sum_row("output", names[0] if output is None and len(names) == 1 else output, names)
-    size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
+    transform_length = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
     # Frequencies on a line s = jw with a constant positive real part, right of all poles, and left of the zeros in the
     # right half-plane that the response of a tip has.
-    fall = WEIGHT_DECAY * design.rate / size
-    w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
-    inside = w.real < 0.999 * math.pi * design.rate
-    weight = np.exp(-fall * np.arange(size) / design.rate)
-    measured, feedback_response, reference_response = design.controller_response(w[inside])
+    fall = WEIGHT_DECAY * design.rate / transform_length
+    w: Complex = np.asarray(
+        2.0 * math.pi * np.fft.rfftfreq(transform_length, 1.0 / design.rate) - 1j * fall, dtype=np.complex128
+    )
+    is_below_nyquist = w.real < 0.999 * math.pi * design.rate
+    weight = np.exp(-fall * np.arange(transform_length) / design.rate)
+    measured, feedback_response, reference_response = design.controller_response(w[is_below_nyquist])
 
     def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Return the closed-loop responses of the command, (W,), and of the outputs, (outputs, W), to the reference."""
-        responses = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
+        responses = np.array([replace(p, model=model).response(w[is_below_nyquist]) for p in design.plants])
         loop = np.sum([a * responses[names.index(o)] for o, a in zip(measured, feedback_response, strict=True)], axis=0)
         command = reference_response / (1.0 + loop)
         return command, responses * command
 
     command, outputs = closed_loop_response(design.plants[0].model)
-    extended = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
-    spectrum = np.fft.rfft(extended * weight)[inside]
-    needed = spectrum / (row @ outputs)
+    padded_path = np.concatenate([rows, np.full(transform_length - len(rows), rows[-1])]) - rows[0]
+    spectrum = np.fft.rfft(padded_path * weight)[is_below_nyquist]
+    command_spectrum = spectrum / (row @ outputs)
 
-    def inverse_transform(part: Complex) -> Floats:
-        every = np.zeros(len(w), dtype=complex)
-        every[inside] = part
-        return np.asarray((np.fft.irfft(every, size) / weight)[: len(rows)])
+    def inverse_transform(half_spectrum: Complex) -> Floats:
+        full_spectrum = np.zeros(len(w), dtype=complex)
+        full_spectrum[is_below_nyquist] = half_spectrum
+        return np.asarray((np.fft.irfft(full_spectrum, transform_length) / weight)[: len(rows)])
 
-    reference = inverse_transform(needed) + rows[0]
-    move = float(np.ptp(rows))
+    reference = inverse_transform(command_spectrum) + rows[0]
+    range_width = float(np.ptp(rows))
     off = float(np.max(np.abs(reference[:1] - rows[0])))
-    if off > MAX_INITIAL_OFFSET_SHARE * move:
+    if off > MAX_INITIAL_OFFSET_SHARE * range_width:
         raise ModelError(
             f"the reference would have to begin before the path: at its first row it differs from rest by {off:.3g}, "
             f"more than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path stay at rest longer before the move"
         )
-    effort = inverse_transform(needed * command)
-    if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * move:
+    effort = inverse_transform(command_spectrum * command)
+    if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * range_width:
         raise ModelError(
             "the reference diverges, because the output first moves in the wrong direction (non-minimum phase); give "
             "the path more time, or choose another output"
         )
-    if np.max(np.abs(effort)) > most:
+    if np.max(np.abs(effort)) > maximum:
         at = int(np.argmax(np.abs(effort)))
         raise ModelError(
             f"the path needs a command of {np.max(np.abs(effort)):.3g} at {at / design.rate:.4g} s, over the limit of "
-            f"{most:g}; give it more time, or a smaller move"
+            f"{maximum:g}; give it more time, or a smaller move"
         )
-    ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * move)[-1]) + 1
-    unshaped_residual = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, ends)
+    end_row = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * range_width)[-1]) + 1
+    unshaped_residual = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, end_row)
     errors = [
-        _residual_rms(inverse_transform(needed * (row @ closed_loop_response(one.model)[1])) + rows[0], rows, ends)
-        for one in design.plants[0].samples(count, start)
+        _residual_rms(
+            inverse_transform(command_spectrum * (row @ closed_loop_response(plant_sample.model)[1])) + rows[0],
+            rows,
+            end_row,
+        )
+        for plant_sample in design.plants[0].samples(count, start)
     ]
-    worst = float(np.quantile(errors, 0.975)) if errors else None
-    if worst is not None and not worst <= MAX_RESIDUAL_SHARE * unshaped_residual:
+    worst_error = float(np.quantile(errors, 0.975)) if errors else None
+    if worst_error is not None and not worst_error <= MAX_RESIDUAL_SHARE * unshaped_residual:
         raise ModelError(
             "the confidence intervals are too wide to design on: within them the deviation after the end of the path "
             "may be "
-            f"{worst:.2g}, and {unshaped_residual:.2g} with the path itself as reference; "
+            f"{worst_error:.2g}, and {unshaped_residual:.2g} with the path itself as reference; "
             f"{least_certain_parameter(design.plants[0].model)}; identify from a longer or richer run (ftlm "
             "design-input designs one)"
         )
-    ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
-    return Trajectory(reference, rows, effort, ways, worst, unshaped_residual)
+    ways = {n: inverse_transform(command_spectrum * line) for n, line in zip(names, outputs, strict=True)}
+    return Trajectory(reference, rows, effort, ways, worst_error, unshaped_residual)
 
 
 def _path(path: ArrayLike) -> Floats:
@@ -276,13 +283,15 @@ def _path(path: ArrayLike) -> Floats:
     Raise DataError if the path is not one-dimensional, has fewer than 16 or more than 100 000 rows, contains a value
     that is not finite or too large, is constant, or is not at rest at both ends.
     """
-    raw = as_array("path", path)
-    if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
-        raise DataError(f"path has shape {raw.shape}; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
-    rows = np.array(raw, dtype=np.float64)
-    bad = np.flatnonzero(~np.isfinite(rows))
-    if bad.size:
-        raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all); give finite numbers")
+    samples = as_array("path", path)
+    if samples.dtype.kind not in "fiu" or samples.ndim != 1 or not 16 <= samples.size <= MAX_PATH_ROWS:
+        raise DataError(f"path has shape {samples.shape}; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
+    rows = np.array(samples, dtype=np.float64)
+    invalid_rows = np.flatnonzero(~np.isfinite(rows))
+    if invalid_rows.size:
+        raise DataError(
+            f"path is not finite at row {invalid_rows[0]} ({invalid_rows.size} such rows in all); give finite numbers"
+        )
     large = np.flatnonzero(np.abs(rows) > POSITIVE_RANGE[1])
     if large.size:
         raise DataError(
@@ -290,12 +299,14 @@ def _path(path: ArrayLike) -> Floats:
         )
     if np.ptp(rows) < POSITIVE_RANGE[0]:
         raise DataError("path: all points are equal; give at least two different points")
-    for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
+    for end_name, pair in (("begin", rows[:2]), ("end", rows[-2:])):
         if abs(pair[1] - pair[0]) > MAX_INITIAL_OFFSET_SHARE * np.ptp(rows):
-            raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")
+            raise DataError(
+                f"path does not {end_name} at rest; repeat its {'first' if end_name == 'begin' else 'last'} row"
+            )
     return rows
 
 
-def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
-    """Return the RMS deviation of an output from the path `rows`, from sample index `ends` to the last sample."""
-    return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))
+def _residual_rms(output: Floats, rows: Floats, end_row: int) -> float:
+    """Return the RMS deviation of an output from the path `rows`, from sample index `end_row` to the last sample."""
+    return float(np.sqrt(np.mean(np.square((output - rows)[min(end_row, len(rows) - 1) :]))))

@@ -64,10 +64,10 @@ class Observer:
     def matrices(self) -> tuple[Floats, Floats, Floats]:
         """Matrices a, b, c of the discrete-time system with the input disturbance as the last state."""
         a, b = self.realization.a, self.realization.b
-        size = len(a)
-        whole = np.eye(size + 1)
-        whole[:size, :size], whole[:size, size:] = a, b
-        return whole, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
+        state_count = len(a)
+        transformation = np.eye(state_count + 1)
+        transformation[:state_count, :state_count], transformation[:state_count, state_count:] = a, b
+        return transformation, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
 
     def over(self, run: Run) -> dict[str, Floats]:
         """Return estimates of each output and of the input disturbance over a run, one array per name.
@@ -81,9 +81,9 @@ class Observer:
             If the run lacks a signal, or has another sampling interval.
         """
         names = (self.realization.input, *self.measured)
-        absent = [n for n in names if n not in run.signals]
-        if absent:
-            raise DataError(f"run {run.name} has no {', '.join(absent)}; the observer reads {', '.join(names)}")
+        missing_names = [n for n in names if n not in run.signals]
+        if missing_names:
+            raise DataError(f"run {run.name} has no {', '.join(missing_names)}; the observer reads {', '.join(names)}")
         if abs(run.step * self.realization.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
@@ -204,10 +204,10 @@ def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, s
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
-    reached = [p for p in plants if p.has_response()]
-    if not reached:
+    controllable_plants = [p for p in plants if p.has_response()]
+    if not controllable_plants:
         raise ModelError(f"{plants[0].input} affects no output of this model; choose another input")
-    return reached
+    return controllable_plants
 
 
 def kalman_filter(
@@ -222,14 +222,14 @@ def kalman_filter(
     a, b, c = bare.matrices
     step = 1.0 / realization.rate
     # The input also has white process noise, whose standard deviation is that of its random walk after one second.
-    inside = np.zeros_like(a)
-    inside[:-1, :-1] = b[:-1] @ b[:-1].T * process_noise**2
-    inside[-1, -1] = process_noise**2 * step
-    outside = np.diag(np.square(noise))
+    process_covariance = np.zeros_like(a)
+    process_covariance[:-1, :-1] = b[:-1] @ b[:-1].T * process_noise**2
+    process_covariance[-1, -1] = process_noise**2 * step
+    measurement_covariance = np.diag(np.square(noise))
     with catch_numerical_errors(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
-        _, spread, _ = python_control().dlqe(a, np.eye(len(a)), c, inside, outside)
-        gain = np.linalg.solve(c @ spread @ c.T + outside, c @ spread).T
-        posterior = spread - gain @ c @ spread
+        _, error_covariance, _ = python_control().dlqe(a, np.eye(len(a)), c, process_covariance, measurement_covariance)
+        gain = np.linalg.solve(c @ error_covariance @ c.T + measurement_covariance, c @ error_covariance).T
+        posterior = error_covariance - gain @ c @ error_covariance
         good = bool(np.isfinite(gain).all())
     if not good or np.max(np.abs(np.linalg.eigvals(a - a @ gain @ c))) >= 1.0:
         raise ModelError(
@@ -251,9 +251,9 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
         raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping; give standard deviations by output")
     for name in noise or {}:
         if name not in measured:
-            near = nearest(name, measured) if isinstance(name, str) else ""
+            suggestion = nearest(name, measured) if isinstance(name, str) else ""
             raise ModelError(
-                f"{setting('noise')} {{{short_repr(name)}: …}}: this is not a measured output{near}; they are "
+                f"{setting('noise')} {{{short_repr(name)}: …}}: this is not a measured output{suggestion}; they are "
                 f"{', '.join(measured)}"
             )
     free = None if model.estimate is None else model.estimate.free
@@ -367,9 +367,9 @@ class Lqg:
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
-        right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
-        answer = (self._gains @ np.linalg.solve(system, right))[:, 0, :]
-        return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self.ahead * (1.0 - answer[:, -1]))
+        input_columns = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
+        responses = (self._gains @ np.linalg.solve(system, input_columns))[:, 0, :]
+        return np.asarray(-z[None] * responses[:, :-1].T), np.asarray(self.ahead * (1.0 - responses[:, -1]))
 
     def poles(self) -> Complex:
         """Return the poles of the controller in the z-plane."""
@@ -540,31 +540,37 @@ def lqg(
     process_noise_value = 0.2 * max_input_value if process_noise is None else positive("process_noise", process_noise)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = tuple(p.output for p in plants)
-    read = select_outputs("measured", measured, names)
+    measured_names = select_outputs("measured", measured, names)
     weights = _weights(max_deviation, names)
     tracked = _tracked_output(output, plants)
     realization = fit_realization(plants, band, poles)
-    kalman = kalman_filter(realization, read, noise_deviations(model, read, noise), process_noise_value)
+    kalman = kalman_filter(
+        realization, measured_names, noise_deviations(model, measured_names, noise), process_noise_value
+    )
     c = realization.c
-    cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
+    cost = sum(np.outer(row @ c, row @ c) / max_value**2 for row, max_value in weights)
     no = "no state feedback stabilizes the model; state a maximum deviation of every output that integrates"
     with catch_numerical_errors(*no.split("; ")):
-        gains, _, own = python_control().dlqr(realization.a, realization.b, cost, np.eye(1) / max_input_value**2)
-    if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
+        gains, _, closed_loop_poles = python_control().dlqr(
+            realization.a, realization.b, cost, np.eye(1) / max_input_value**2
+        )
+    if np.max(np.abs(closed_loop_poles)) >= 1.0 - INTEGRATOR_TOLERANCE:
         raise ModelError(no)
     controller = Lqg(kalman, gains, tracked, limit=limit)
     w = np.geomspace(BAND_EXTENSION * realization.band[0], 0.999 * math.pi * plants[0].rate, CURVE_POINTS)
     acting = -controller.response(w)[0]
     poles_of_it = controller.poles()
-    at_one = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
-    integral, unstable_poles = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
+    is_integrator = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
+    integral, unstable_poles = int(np.sum(is_integrator)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~is_integrator))
     measured_plants = [plants[names.index(o)] for o in kalman.measured]
 
     def loop_margins(which: Model) -> Margins:
-        parts = [replace(p, model=which) for p in measured_plants]
-        loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
-        order = max(p.integral_order() for p in parts)
-        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].count_unstable_poles() + unstable_poles)
+        sampled_plants = [replace(p, model=which) for p in measured_plants]
+        loop = np.sum(acting * np.array([p.response(w) for p in sampled_plants]), axis=0)
+        order = max(p.integral_order() for p in sampled_plants)
+        return margins_of(
+            loop, w, max(order, 0.0) + integral, sampled_plants[0].count_unstable_poles() + unstable_poles
+        )
 
     nominal = loop_margins(model)
     if not (nominal.stable and nominal.sensitivity <= MAX_SENSITIVITY):
@@ -573,7 +579,7 @@ def lqg(
             "guaranteed margins; make max_input smaller, process_noise larger or the noise smaller, or allow for "
             "larger deviations"
         )
-    margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
+    margins = tuple(loop_margins(plant_sample.model) for plant_sample in plants[0].samples(count, start))
     failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
     if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
         raise ModelError(
@@ -607,8 +613,8 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
             f"to deviations; give such as {{{names[0]!r}: 0.01}}"
         )
     return [
-        (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", size))
-        for text, size in max_deviation.items()
+        (sum_row("max_deviation", text, names), positive(f"max_deviation[{short_repr(text)}]", max_value))
+        for text, max_value in max_deviation.items()
     ]
 
 
@@ -621,13 +627,13 @@ def _equilibrium(realization: Realization, tracked: str) -> Floats:
         raise ModelError(
             f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realization.outputs)}"
         )
-    size = realization.states
-    matrix = np.zeros((size + 1, size + 1))
-    matrix[:size, :size] = realization.a - np.eye(size)
-    matrix[:size, size:] = realization.b
-    matrix[size, :size] = realization.c[realization.outputs.index(tracked)]
+    state_count = realization.states
+    matrix = np.zeros((state_count + 1, state_count + 1))
+    matrix[:state_count, :state_count] = realization.a - np.eye(state_count)
+    matrix[:state_count, state_count:] = realization.b
+    matrix[state_count, :state_count] = realization.c[realization.outputs.index(tracked)]
     try:
-        equilibrium = np.linalg.solve(matrix, np.eye(size + 1)[-1])
+        equilibrium = np.linalg.solve(matrix, np.eye(state_count + 1)[-1])
     except np.linalg.LinAlgError:
         raise ModelError(
             f"{tracked} cannot follow a constant reference, because its steady-state gain from {realization.input} is "

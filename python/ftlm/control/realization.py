@@ -124,42 +124,43 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     w = np.geomspace(low, high, FIT_FREQUENCIES)
     with catch_numerical_errors(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
         responses = np.array([p.exact(w) for p in plants])
-    own = [
+    model_poles = [
         m.pole
         for m in modes(plants[0].model, coupling=plants[0].coupling)
         if m.oscillatory and low < m.frequency < high
     ]
     has_integrator = [p.integral_order() > 0.5 for p in plants]
-    best: Realization | None = None
+    best_realization: Realization | None = None
     for count in counts:
         with catch_numerical_errors(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
             poles_and_residues = _fit(
                 np.asarray(1j * w, dtype=np.complex128),
                 responses,
                 has_integrator,
-                _initial_poles(own, low, high, count),
+                _initial_poles(model_poles, low, high, count),
             )
             realization = _discretize(library, plants, (low, high), *poles_and_residues)
-        if best is None or _scaled_error(realization) < _scaled_error(best):
-            best = realization
-        if _scaled_error(best) <= 1.0:
+        if best_realization is None or _scaled_error(realization) < _scaled_error(best_realization):
+            best_realization = realization
+        if _scaled_error(best_realization) <= 1.0:
             break
-    assert best is not None
-    gain, phase = max(best.gain_error.values()), max(best.phase_error.values())
+    assert best_realization is not None
+    gain, phase = max(best_realization.gain_error.values()), max(best_realization.phase_error.values())
     if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
         raise ModelError(
-            f"a realization with {best.states} states has errors of up to {gain:.2g} dB and {phase:.2g} degrees "
+            f"a realization with {best_realization.states} states has errors of up to {gain:.2g} dB and {phase:.2g} "
+            "degrees "
             f"between {low:.3g} and {high:.3g} rad/s, too large for a design; use a narrower band"
             + ("" if poles is None else ", or more poles")
         )
-    return best
+    return best_realization
 
 
 @contextmanager
-def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
+def catch_numerical_errors(operation: str, way_out: str) -> Iterator[None]:
     """Raise ModelError in place of an overflow, a singular matrix or another numerical error in a ``with`` block.
 
-    The message names the failed computation (`what`) and a remedy (`way_out`).
+    The message names the failed computation (`operation`) and a remedy (`way_out`).
     """
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
         # SciPy reports a singular matrix only by a warning.
@@ -169,7 +170,7 @@ def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
         except ModelError:
             raise
         except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
-            raise ModelError(f"{what} ({error_text(error, 200)}); {way_out}") from None
+            raise ModelError(f"{operation} ({error_text(error, 200)}); {way_out}") from None
 
 
 def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
@@ -185,12 +186,13 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     return low, high
 
 
-def _initial_poles(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
+def _initial_poles(model_poles: Sequence[complex], low: float, high: float, count: int) -> Complex:
     """Return initial poles for vector fitting [rad/s], one of each conjugate pair; pairs count twice in `count`.
 
-    They are the poles `own` of oscillatory modes of the model, followed by real poles that are spread over the band.
+    They are the poles `model_poles` of oscillatory modes of the model, followed by real poles that are spread over the
+    band.
     """
-    pairs = list(own)[: count // 2]
+    pairs = list(model_poles)[: count // 2]
     real = -np.geomspace(low, high, count - 2 * len(pairs))
     return np.asarray([*pairs, *real.tolist()], dtype=np.complex128)
 
@@ -203,19 +205,19 @@ def _basis(s: Complex, poles: Complex) -> Complex:
     """
     columns = []
     for p in poles:
-        one = 1.0 / (s - p)
+        pole_term = 1.0 / (s - p)
         if p.imag == 0:
-            columns.append(one)
+            columns.append(pole_term)
         else:
-            other = 1.0 / (s - p.conjugate())
-            columns += [one + other, 1j * (one - other)]
+            conjugate_term = 1.0 / (s - p.conjugate())
+            columns += [pole_term + conjugate_term, 1j * (pole_term - conjugate_term)]
     return np.array(columns).T
 
 
 def _system(poles: Complex) -> tuple[Floats, Floats]:
     """Return (a, b) of a real system whose responses from input to states are the columns of :func:`_basis`."""
-    size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
-    a, b = np.zeros((size, size)), np.zeros((size, 1))
+    state_count = int(np.sum(np.where(poles.imag == 0, 1, 2)))
+    a, b = np.zeros((state_count, state_count)), np.zeros((state_count, 1))
     at = 0
     for p in poles:
         if p.imag == 0:
@@ -240,21 +242,21 @@ def _fit(
     weight = 1.0 / np.abs(responses)
     for _ in range(MAX_POLE_ITERATIONS):
         basis = _basis(s, poles)
-        blocks, right = [], []
-        width = basis.shape[1]
-        each = width + 1
+        blocks, right_sides = [], []
+        basis_size = basis.shape[1]
+        columns_each = basis_size + 1
         for i, (line, w) in enumerate(zip(responses, weight, strict=True)):
-            block = np.zeros((s.size, each * len(responses) + width), dtype=complex)
-            block[:, i * each] = 1.0 / s if has_integrator[i] else 0.0
-            block[:, i * each + 1 : (i + 1) * each] = basis
-            block[:, each * len(responses) :] = -line[:, None] * basis
+            block = np.zeros((s.size, columns_each * len(responses) + basis_size), dtype=complex)
+            block[:, i * columns_each] = 1.0 / s if has_integrator[i] else 0.0
+            block[:, i * columns_each + 1 : (i + 1) * columns_each] = basis
+            block[:, columns_each * len(responses) :] = -line[:, None] * basis
             blocks.append(block * w[:, None])
-            right.append(line * w)
-        matrix, vector = np.concatenate(blocks), np.concatenate(right)
+            right_sides.append(line * w)
+        matrix, vector = np.concatenate(blocks), np.concatenate(right_sides)
         scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-        solved = _least_squares(matrix / scale, vector) / scale
+        solution = _least_squares(matrix / scale, vector) / scale
         a, b = _system(poles)
-        stable_poles = np.linalg.eigvals(a - b @ solved[None, each * len(responses) :])
+        stable_poles = np.linalg.eigvals(a - b @ solution[None, columns_each * len(responses) :])
         # The model is stable. A pole that errors of the fit put into the right half-plane is mirrored.
         stable_poles = -np.abs(stable_poles.real) + 1j * stable_poles.imag
         poles_before, poles = (
@@ -267,12 +269,14 @@ def _fit(
     # Superfluous poles have negligible residues, so their states would not be observable. A second integrator would not
     # be observable either.
     at, is_significant = 1, []
-    slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(has_integrator) else 0.0
+    lowest_frequency = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(has_integrator) else 0.0
     for p in poles:
-        wide = 1 if p.imag == 0 else 2
-        part = residues[:, at : at + wide] @ _basis(s, np.array([p])).T
-        is_significant.append(bool(np.max(np.abs(part) * weight) > MIN_POLE_CONTRIBUTION and abs(p) > slow))
-        at += wide
+        pole_count = 1 if p.imag == 0 else 2
+        contribution = residues[:, at : at + pole_count] @ _basis(s, np.array([p])).T
+        is_significant.append(
+            bool(np.max(np.abs(contribution) * weight) > MIN_POLE_CONTRIBUTION and abs(p) > lowest_frequency)
+        )
+        at += pole_count
     if not all(is_significant) and any(is_significant):
         poles = poles[is_significant]
         residues = _residues(s, responses, has_integrator, poles)
@@ -297,8 +301,8 @@ def _residues(s: Complex, responses: Complex, has_integrator: Sequence[bool], po
     for i, line in enumerate(responses):
         matrix = (np.column_stack([1.0 / s, basis]) if has_integrator[i] else basis) / np.abs(line)[:, None]
         scale = np.linalg.norm(matrix, axis=0)
-        ones = line / np.abs(line)
-        solution = _least_squares(matrix / scale, ones) / scale
+        unit_phasors = line / np.abs(line)
+        solution = _least_squares(matrix / scale, unit_phasors) / scale
         residues[i, -len(solution) :] = solution
     return residues
 
@@ -321,16 +325,16 @@ def _discretize(
     rate = plants[0].rate
     system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
     # Scale the states, so that their units do not influence the process noise and the weights of a design.
-    size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
+    column_norms = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
     realization = Realization(
         tuple(p.output for p in plants),
         plants[0].input,
         rate,
         band,
         tuple(complex(p) for p in poles),
-        np.asarray(system.A) * size[:, None] / size,
-        np.asarray(system.B) * size[:, None],
-        c / size,
+        np.asarray(system.A) * column_norms[:, None] / column_norms,
+        np.asarray(system.B) * column_norms[:, None],
+        c / column_norms,
         {},
         {},
     )
@@ -344,5 +348,7 @@ def _discretize(
 
 def _scaled_error(realization: Realization) -> float:
     """Return the largest gain or phase error of all outputs, relative to its target of 0.1 dB or 1 degree."""
-    worst = max(max(realization.gain_error.values()) / GAIN_DB, max(realization.phase_error.values()) / PHASE_DEGREES)
-    return worst if math.isfinite(worst) else math.inf
+    largest_error = max(
+        max(realization.gain_error.values()) / GAIN_DB, max(realization.phase_error.values()) / PHASE_DEGREES
+    )
+    return largest_error if math.isfinite(largest_error) else math.inf

@@ -136,28 +136,33 @@ class Plant:
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
             s: Complex = 1j * as_complex("w", w)
-            above, below = (
+            numerator, denominator = (
                 value_at({p: c for c, p in pairs}, s)
                 for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
             )
-            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]) * self._filter_response(s))
+            return np.asarray(
+                numerator / denominator * np.exp(-s * transfer.delay[self.input]) * self._filter_response(s)
+            )
         inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
-        every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
-        return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
+        all_responses = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
+        return np.asarray(all_responses[self.model.outputs.index(self.output), inputs.index(self.input)])
 
     def _filter_response(self, s: Complex) -> Complex:
         """Return the factor by which the sensor filter changes the response at the points s; 1 without a filter."""
-        passed = self.model.structure.sensor_filter if self.sensor else None
-        if passed is None:
+        filter_model = self.model.structure.sensor_filter if self.sensor else None
+        if filter_model is None:
             return np.ones_like(s)
-        above, below = (value_at({o: c for c, o in part}, s) for part in (passed.numerator, passed.denominator))
-        power = (self.output in passed.signals) - (self.input in passed.signals)
-        return np.asarray((above / below) ** power)
+        numerator, denominator = (
+            value_at({o: c for c, o in polynomial}, s)
+            for polynomial in (filter_model.numerator, filter_model.denominator)
+        )
+        power = (self.output in filter_model.signals) - (self.input in filter_model.signals)
+        return np.asarray((numerator / denominator) ** power)
 
     def held_response(self, w: Floats | Complex) -> Complex:
         """Return the frequency response with a zero-order hold of the input, at w [rad/s] below Nyquist frequency."""
-        turn = 1j * w / self.rate
-        return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
+        z_exponent = 1j * w / self.rate
+        return np.asarray(self.exact(w) * -np.expm1(-z_exponent) / z_exponent)
 
     def response(self, w: Floats | Complex) -> Complex:
         """Return the frequency response with a zero-order hold and one sample of delay, at w [rad/s]."""
@@ -169,10 +174,10 @@ class Plant:
         Raise ModelError if the output does not depend on the input.
         """
         transfer = transfer_functions(self.model, coupling=self.coupling)
-        above = transfer.numerators[self.output, self.input]
-        if not above:
+        numerator = transfer.numerators[self.output, self.input]
+        if not numerator:
             raise ModelError(f"{self.input} does not affect {self.output} in this model; choose another pair")
-        return transfer.denominator[self.output][-1][1] - above[-1][1]
+        return transfer.denominator[self.output][-1][1] - numerator[-1][1]
 
     def count_unstable_poles(self) -> float:
         """Return the number of poles of the model with a positive real part; NaN if a pole is on the imaginary axis."""
@@ -187,13 +192,13 @@ class Plant:
         """Raise ModelError if the model is unstable; an integrator is permitted."""
         unstable_poles = self.count_unstable_poles()
         if unstable_poles != 0:
-            why = (
+            reason = (
                 "a pole is on the imaginary axis"
                 if math.isnan(unstable_poles)
                 else f"{unstable_poles:g} of its poles are on the right"
             )
             raise ModelError(
-                f"the model is not stable ({why}), so stability margins of its loop are meaningless; stabilize the "
+                f"the model is not stable ({reason}), so stability margins of its loop are meaningless; stabilize the "
                 "machine first, and identify the stabilized machine"
             )
 
@@ -205,10 +210,10 @@ class Plant:
         # A parameter that is not identifiable has an infinite variance, which is replaced by a large one.
         matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-        spread = vectors * np.sqrt(np.maximum(values, 0.0))
-        shifts = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
-        centre = parameter_vector(self.model)
-        return [replace(self, model=with_parameter_vector(self.model, centre + d)) for d in shifts]
+        covariance_root = vectors * np.sqrt(np.maximum(values, 0.0))
+        shifts = np.random.default_rng(seed).standard_normal((count, len(values))) @ covariance_root.T
+        mean_parameters = parameter_vector(self.model)
+        return [replace(self, model=with_parameter_vector(self.model, mean_parameters + d)) for d in shifts]
 
 
 def nyquist_frequencies(crossover: float, rate: float) -> Floats:
@@ -236,21 +241,21 @@ def margins_of(loop: Complex, w: Floats, integrates: float, unstable_poles: floa
     if not np.isfinite(loop).all() or math.isnan(unstable_poles):
         return Margins(False, math.nan, math.nan, math.nan, math.inf)
     difference = 1.0 + loop
-    turned = np.unwrap(np.angle(difference))
+    unwrapped_phase = np.unwrap(np.angle(difference))
     # Number of unstable poles of the closed loop, from the phase of 1 + L over the upper half of the Nyquist contour
     # and over the upper half of the small circle around the origin.
-    closed = unstable_poles + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
-    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
-    at = np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:]))
-    share = size[at] / (size[at] - size[at + 1])
-    phases = np.degrees(phase[at] + share * (phase[at + 1] - phase[at]))
-    crossings = np.exp(np.log(w[at]) + share * np.log(w[at + 1] / w[at]))
+    closed = unstable_poles + integrates / 2.0 - (unwrapped_phase[-1] - unwrapped_phase[0]) / math.pi
+    log_gain, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    at = np.flatnonzero(np.sign(log_gain[:-1]) != np.sign(log_gain[1:]))
+    fraction = log_gain[at] / (log_gain[at] - log_gain[at + 1])
+    phases = np.degrees(phase[at] + fraction * (phase[at + 1] - phase[at]))
+    crossings = np.exp(np.log(w[at]) + fraction * np.log(w[at + 1] / w[at]))
     away = np.abs((phases + 360.0) % 360.0 - 180.0)
-    turns = np.floor((phase / math.pi + 1.0) / 2.0)
-    cut = np.flatnonzero(turns[:-1] != turns[1:])
-    edge = math.pi * (2.0 * np.maximum(turns[cut], turns[cut + 1]) - 1.0)
-    part = (edge - phase[cut]) / (phase[cut + 1] - phase[cut])
-    gains = np.exp(np.abs(size[cut] + part * (size[cut + 1] - size[cut])))
+    revolutions = np.floor((phase / math.pi + 1.0) / 2.0)
+    cut = np.flatnonzero(revolutions[:-1] != revolutions[1:])
+    edge = math.pi * (2.0 * np.maximum(revolutions[cut], revolutions[cut + 1]) - 1.0)
+    interpolation = (edge - phase[cut]) / (phase[cut + 1] - phase[cut])
+    gains = np.exp(np.abs(log_gain[cut] + interpolation * (log_gain[cut + 1] - log_gain[cut])))
     return Margins(
         bool(round(closed) == 0),
         float(crossings[-1]) if at.size else math.nan,

@@ -79,8 +79,8 @@ class CircuitProblem(ResponseProblem):
 
         A parameter that must be positive but is not gives NaN.
         """
-        safe = np.where(values > 0, values, np.nan)
-        return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
+        positive_values = np.where(values > 0, values, np.nan)
+        return np.where(self.is_log, np.log(np.where(self.is_log, positive_values, 1.0)), values)
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Return (low, high) of each parameter by name, in SI units, from half-widths by name.
@@ -121,22 +121,22 @@ class CircuitProblem(ResponseProblem):
         They keep every parameter within its bounds, and exponents between 0.05 and 1. `values` are the variables of the
         optimizer.
         """
-        rows, limits, words = [], [], []
+        rows, limits, descriptions = [], [], []
         for k, name in enumerate(self.names):
             low, high = admissible_range(name, self.bounds)
             for sign, end in ((1.0, high), (-1.0, low)):
                 rows.append(sign * (np.arange(len(self.names)) == k))
                 limits.append(sign * (math.log(end) if self.is_log[k] else end))
-                words.append(ConstraintText(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}", name))
-        return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
+                descriptions.append(ConstraintText(f"{name} is at {'most' if sign > 0 else 'least'} {end:g}", name))
+        return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), descriptions
 
     def capacitor_of(self, name: str) -> str:
         """Return an unused name for a capacitor that replaces the constant-phase element whose exponent is `name`."""
-        taken = {parameter.partition("_")[0] for parameter in (*self.names, *self.circuit.values)}
+        used_names = {parameter.partition("_")[0] for parameter in (*self.names, *self.circuit.values)}
         number = name.removeprefix("CPE").removesuffix("_alpha")
-        return next(c for c in (f"C{number}", *(f"C{k}" for k in range(1, len(taken) + 2))) if c not in taken)
+        return next(c for c in (f"C{number}", *(f"C{k}" for k in range(1, len(used_names) + 2))) if c not in used_names)
 
-    def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
+    def names_on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
         """Return the names of the parameters on a bound of the user, as opposed to a limit of the element."""
         names = []
         for k in active_constraints:
@@ -155,20 +155,20 @@ class CircuitProblem(ResponseProblem):
         An exchange of two such groups does not change the impedance. The frequency of the peak of -Im Z determines
         which group is faster.
         """
-        kind, rest = self.circuit.tree
+        kind, elements = self.circuit.tree
         if kind != "series" or self.circuit.values or self.bounds:
             return values
         out = values.copy()
         by_parameter = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
-        every = np.concatenate([r.frequency for r in self.records])
-        w = np.geomspace(every.min() / 1e3, every.max() * 1e3, 2000)
-        alike: dict[str, list[tuple[float, list[int]]]] = {}
-        for part in (p for p in rest if p[0] == "parallel"):
-            z, derivatives = impedance_and_derivatives(self.circuit, w, by_parameter, part)
-            places = [self.names.index(n) for n in derivatives]
-            shape = re.sub(r"_?\d+'", "'", repr(part))
-            alike.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), places))
-        for group in alike.values():
+        frequencies = np.concatenate([r.frequency for r in self.records])
+        w = np.geomspace(frequencies.min() / 1e3, frequencies.max() * 1e3, 2000)
+        groups_by_shape: dict[str, list[tuple[float, list[int]]]] = {}
+        for element in (p for p in elements if p[0] == "parallel"):
+            z, derivatives = impedance_and_derivatives(self.circuit, w, by_parameter, element)
+            indices = [self.names.index(n) for n in derivatives]
+            shape = re.sub(r"_?\d+'", "'", repr(element))
+            groups_by_shape.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), indices))
+        for group in groups_by_shape.values():
             for (_, source), (_, target) in zip(sorted(group), group, strict=True):
                 out[target] = values[source]
         return out
@@ -179,18 +179,18 @@ class CircuitProblem(ResponseProblem):
         Time constants and exponents come from a Halton sequence over the measured band. Nonnegative least squares then
         give the impedance scale of each part in series.
         """
-        every = np.concatenate([r.frequency for r in self.records])
-        slow, fast = -math.log10(float(every.min())), -math.log10(float(every.max()))
-        kind, rest = self.circuit.tree
-        parts = rest if kind == "series" else [self.circuit.tree]
+        frequencies = np.concatenate([r.frequency for r in self.records])
+        slowest, fastest = -math.log10(float(frequencies.min())), -math.log10(float(frequencies.max()))
+        kind, elements = self.circuit.tree
+        series_elements = elements if kind == "series" else [self.circuit.tree]
         weight = np.concatenate([r.weight for r in self.records])
-        goal = np.concatenate([r.response for r in self.records]) * weight
+        target = np.concatenate([r.response for r in self.records]) * weight
         _, limits, _ = self.constraints()
         guesses = []
         for point in halton(START_POINTS, 2 * len(self.circuit.elements)):
             unit: dict[str, float] = {}
             for k, (letters, name) in enumerate(self.circuit.elements):
-                tau = 10.0 ** (fast + (slow - fast) * point[2 * k])
+                tau = 10.0 ** (fastest + (slowest - fastest) * point[2 * k])
                 size, alpha = (
                     10.0 ** (RATIO_DECADES * (point[2 * k + 1] - 0.5)),
                     float(np.interp(point[2 * k + 1], (0, 1), START_EXPONENTS)),
@@ -203,62 +203,66 @@ class CircuitProblem(ResponseProblem):
                     "W": {f"{name}_sigma": (2.0 * tau) ** -0.5},
                 }.get(letters, {f"{name}_R": size, f"{name}_tau": tau})
             shapes = []
-            for part in parts:
-                z, derivatives = impedance_and_derivatives(self.circuit, every, unit, part)
-                shapes.append((z + np.zeros(every.size), list(derivatives)))
+            for element in series_elements:
+                z, derivatives = impedance_and_derivatives(self.circuit, frequencies, unit, element)
+                shapes.append((z + np.zeros(frequencies.size), list(derivatives)))
             table = np.stack([z * weight for z, _ in shapes], axis=1)
-            sizes = _positive_least_squares(
-                np.concatenate([table.real, table.imag]), np.concatenate([goal.real, goal.imag])
+            scales = _positive_least_squares(
+                np.concatenate([table.real, table.imag]), np.concatenate([target.real, target.imag])
             )
-            for (_, names), scale in zip(shapes, sizes, strict=True):
+            for (_, names), scale in zip(shapes, scales, strict=True):
                 for n in names:
                     # An impedance is proportional to 1/Q and 1/C. Exponents and time constants do not scale it.
                     unit[n] *= 1.0 if n.endswith(("_alpha", "_tau")) else 1.0 / scale if n[0] == "C" else scale
             values = self.in_problem_units(np.array([unit[n] for n in self.names]))
             # The constraints of each parameter are its upper bound, then its lower bound.
-            inside = np.clip(values, -limits[1::2], limits[0::2])
-            residuals, _ = self.residuals(inside, jacobian=False)
+            feasible = np.clip(values, -limits[1::2], limits[0::2])
+            residuals, _ = self.residuals(feasible, jacobian=False)
             cost = float(residuals @ residuals)
             if math.isfinite(cost):
-                guesses.append((cost, inside))
+                guesses.append((cost, feasible))
         guesses.sort(key=lambda pair: pair[0])
         return [values for _, values in guesses[:MAX_STARTS]]
 
 
 def admissible_range(name: str, bounds: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
     """Return (lowest, highest) value of a circuit parameter within its bounds and the limits of its element."""
-    least, most = (MIN_EXPONENT, MAX_EXPONENT) if name.endswith("_alpha") else PARAMETER_RANGE
-    low, high = bounds.get(name, (least, most))
-    return max(low, least), min(high, most)
+    minimum, maximum = (MIN_EXPONENT, MAX_EXPONENT) if name.endswith("_alpha") else PARAMETER_RANGE
+    low, high = bounds.get(name, (minimum, maximum))
+    return max(low, minimum), min(high, maximum)
 
 
 def check_admissible(values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> None:
     """Raise ModelError if a fixed value is not admissible, or if bounds leave at most one admissible value."""
     for name, value in values.items():
-        least, most = admissible_range(name, {})
+        minimum, maximum = admissible_range(name, {})
         # An element of the value 0 is absent.
-        if not (least <= value <= most or (value == 0 and not name.endswith("_alpha"))):
+        if not (minimum <= value <= maximum or (value == 0 and not name.endswith("_alpha"))):
             raise ModelError(
-                f"{parameter('fixed', {name: value})} is not admissible: {name} lies between {least:g} and {most:g}; "
+                f"{parameter('fixed', {name: value})} is not admissible: {name} lies between {minimum:g} and "
+                f"{maximum:g}; "
                 "fix it within this range, or leave it free"
             )
     for name, (low, high) in bounds.items():
-        least, most = admissible_range(name, {})
+        minimum, maximum = admissible_range(name, {})
         low_inside, high_inside = admissible_range(name, bounds)
         if not low_inside < high_inside:
             raise ModelError(
-                f"bounds of {name}, {low:g} to {high:g}, leave no range: {name} lies between {least:g} and {most:g}; "
+                f"bounds of {name}, {low:g} to {high:g}, leave no range: {name} lies between {minimum:g} and "
+                f"{maximum:g}; "
                 f"give bounds that overlap this range, or fix the value with {parameter('fixed')}"
             )
-        if name.endswith("_alpha") and high > most:
-            raise ModelError(f"bounds of {name}, {low:g} to {high:g}, exceed its largest value {most:g}; use {most:g}")
+        if name.endswith("_alpha") and high > maximum:
+            raise ModelError(
+                f"bounds of {name}, {low:g} to {high:g}, exceed its largest value {maximum:g}; use {maximum:g}"
+            )
 
 
 def profile_intervals(
     problem: CircuitProblem,
     records: Sequence[FrequencyData],
-    best: tuple[Floats, float],
-    standard: Mapping[str, float],
+    optimum: tuple[Floats, float],
+    standard_errors: Mapping[str, float],
     noise: float,
     factor: float,
     optimize: Optimizer,
@@ -272,9 +276,9 @@ def profile_intervals(
     ----------
     problem, records
         Estimation problem and its measured impedances.
-    best
+    optimum
         Optimum: variables of the optimizer and cost.
-    standard
+    standard_errors
         Standard errors by name, in SI units.
     noise
         Variance of a residual.
@@ -289,82 +293,84 @@ def profile_intervals(
         (low, high) by name in SI units, and (name, limit) of each parameter whose limit, "0" or "infinity", is not
         rejected at 99 %.
     """
-    values, least_cost = best
+    values, least_cost = optimum
     weights = [r.weight for r in problem.records]
-    intervals, absent = {}, []
+    intervals, compatible_limits = {}, []
     estimates = dict(zip(problem.names, problem.in_seconds(values).tolist(), strict=True))
     for k, name in enumerate(problem.names):
-        estimate, error = estimates[name], standard.get(name, math.nan)
+        estimate, error = estimates[name], standard_errors.get(name, math.nan)
         if not problem.is_log[k] or not error > MAX_WALD_RELATIVE_ERROR * estimate:
             continue
-        warm = np.delete(values, k)
+        initial = np.delete(values, k)
 
-        def likelihood_ratio(value: float, name: str = name, warm: Floats = warm) -> float:
+        def likelihood_ratio(value: float, name: str = name, initial: Floats = initial) -> float:
             """Return twice the decrease of the log likelihood if the parameter has this value."""
             circuit = problem.circuit.with_values({name: value})
-            _, cost = optimize(CircuitProblem(circuit, records, weights, problem.bounds), warm)
+            _, cost = optimize(CircuitProblem(circuit, records, weights, problem.bounds), initial)
             return max(cost - least_cost, 0.0) / max(noise, 1e-300)
 
-        ends = []
-        for side, (absence, words) in enumerate(((0.0, "0"), (math.inf, "infinity"))):
+        interval_bounds = []
+        for side, (limiting_value, text) in enumerate(((0.0, "0"), (math.inf, "infinity"))):
             limit, end = PARAMETER_RANGE[side], admissible_range(name, problem.bounds)[side]
             at_end = likelihood_ratio(end)
             if end == limit and math.isfinite(error) and at_end <= chi_squared_99(1):
-                absent.append((name, words))
+                compatible_limits.append((name, text))
             is_open = at_end <= factor**2
-            reached = absence if end == limit else end
+            reached_bound = limiting_value if end == limit else end
             distance = error * factor
-            ends.append(reached if is_open else _bound_crossing(likelihood_ratio, estimate, end, factor**2, distance))
-        intervals[name] = (ends[0], ends[1])
-    return intervals, absent
+            interval_bounds.append(
+                reached_bound if is_open else _bound_crossing(likelihood_ratio, estimate, end, factor**2, distance)
+            )
+        intervals[name] = (interval_bounds[0], interval_bounds[1])
+    return intervals, compatible_limits
 
 
 def _bound_crossing(
-    function: Callable[[float], float], inside: float, outside: float, level: float, distance: float
+    function: Callable[[float], float], inner: float, outer: float, level: float, distance: float
 ) -> float:
-    """Return the value between `inside` and `outside` at which `function` reaches `level`, by bracketing and bisection.
+    """Return the value between `inner` and `outer` at which `function` reaches `level`, by bracketing and bisection.
 
-    `distance` is the expected distance from `inside`. A wide bracket is bisected geometrically.
+    `distance` is the expected distance from `inner`. A wide bracket is bisected geometrically.
     """
-    sign = math.copysign(1.0, outside - inside)
-    estimate = inside
-    if min(distance, inside) <= 0 or not math.isfinite(distance):
-        distance = inside
+    sign = math.copysign(1.0, outer - inner)
+    estimate = inner
+    if min(distance, inner) <= 0 or not math.isfinite(distance):
+        distance = inner
     for _ in range(MAX_PROFILE_FITS):
-        trial = inside + sign * distance
-        if not min(estimate, outside) < trial < max(estimate, outside):
+        trial = inner + sign * distance
+        if not min(estimate, outer) < trial < max(estimate, outer):
             break
         if function(trial) > level:
-            outside = trial
+            outer = trial
             break
-        inside, distance = trial, 2.0 * distance
+        inner, distance = trial, 2.0 * distance
     for _ in range(MAX_PROFILE_FITS):
-        is_wide = max(inside, outside) > WIDE_RATIO * min(inside, outside)
-        distance = min(max(abs(inside - estimate), 1e-2 * outside), max(inside, outside))
-        if not is_wide and abs(outside - inside) <= PROFILE_TOLERANCE * distance:
+        is_wide = max(inner, outer) > WIDE_RATIO * min(inner, outer)
+        distance = min(max(abs(inner - estimate), 1e-2 * outer), max(inner, outer))
+        if not is_wide and abs(outer - inner) <= PROFILE_TOLERANCE * distance:
             break
-        trial = math.sqrt(inside * outside) if is_wide else 0.5 * (inside + outside)
+        trial = math.sqrt(inner * outer) if is_wide else 0.5 * (inner + outer)
         if function(trial) > level:
-            outside = trial
+            outer = trial
         else:
-            inside = trial
-    return outside
+            inner = trial
+    return outer
 
 
-def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
+def _positive_least_squares(table: Floats, target: Floats) -> Floats:
     """Return a positive least-squares solution x of ``table @ x = goal``.
 
     Components that are not positive are replaced by 0.001 of the largest component, for columns of unit norm.
     """
-    lengths = np.linalg.norm(table, axis=0)
-    scaled = table / lengths
-    is_active = np.ones(lengths.size, dtype=bool)
-    sizes = np.zeros(lengths.size)
+    norms = np.linalg.norm(table, axis=0)
+    scaled = table / norms
+    is_active = np.ones(norms.size, dtype=bool)
+    solution = np.zeros(norms.size)
     while np.any(is_active):
-        sizes[:] = 0.0
-        sizes[is_active] = np.linalg.lstsq(scaled[:, is_active], goal, rcond=None)[0]
-        if np.all(sizes[is_active] > 0):
+        solution[:] = 0.0
+        solution[is_active] = np.linalg.lstsq(scaled[:, is_active], target, rcond=None)[0]
+        if np.all(solution[is_active] > 0):
             break
-        is_active &= sizes > 0
-    least = 1e-3 * max(float(np.max(sizes)), 1e-30)
-    return np.asarray(np.maximum(sizes, least) / lengths)
+        is_active &= solution > 0
+    minimum = 1e-3 * max(float(np.max(solution)), 1e-30)
+    return np.asarray(np.maximum(solution, minimum) / norms)

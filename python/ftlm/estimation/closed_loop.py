@@ -79,7 +79,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         for dense in DENSE_LAG_COUNTS
         if dense == DENSE_LAG_COUNTS[0] or dense * MIN_ROWS_PER_LAG < shortest
     ]
-    answers: dict[str, list[Floats]] = {}
+    explained_inputs: dict[str, list[Floats]] = {}
     findings = []
     for name in inputs:
         output = np.concatenate([run[name] for run in runs])
@@ -87,12 +87,14 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
         fits = [columns @ minimum_norm_solution(columns, output, 1e-10) for columns in laws]
         costs = [_criterion(output - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
         best = int(np.argmin(costs))
-        answers[name] = np.split(fits[best], ends)
-        statistic = first_stage_f(answers[name], np.split(output - fits[best], ends), laws[best].shape[1])
+        explained_inputs[name] = np.split(fits[best], ends)
+        statistic = first_stage_f(explained_inputs[name], np.split(output - fits[best], ends), laws[best].shape[1])
         if statistic < MIN_FIRST_STAGE_F:
-            numbers = {"f": statistic, "needed": MIN_FIRST_STAGE_F}
-            findings.append(make_finding("reference_weak", input=name, reference=reference, **numbers))
-    return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
+            details = {"f": statistic, "needed": MIN_FIRST_STAGE_F}
+            findings.append(make_finding("reference_weak", input=name, reference=reference, **details))
+    return [
+        run_with_inputs(run, {n: a[k] for n, a in explained_inputs.items()}) for k, run in enumerate(runs)
+    ], findings
 
 
 def past_regressors(signal: Floats, first: int, max_lag: int, *, dense: int = DENSE_PAST_SAMPLES) -> list[Floats]:
@@ -105,28 +107,28 @@ def past_regressors(signal: Floats, first: int, max_lag: int, *, dense: int = DE
     of the signal.
     """
     count = signal.size
-    padded = np.concatenate([np.full(count, signal[0]), signal])
-    deviations = padded - signal[0]
+    extended_signal = np.concatenate([np.full(count, signal[0]), signal])
+    deviations = extended_signal - signal[0]
     sums = np.concatenate([[0.0], np.cumsum(deviations)])
     columns = [deviations[count - lag : 2 * count - lag] for lag in range(first, min(dense, max_lag) + 1)]
-    start, width = dense + 1, max(2, dense // 4)
-    while start + width <= max_lag:
+    start, block_length = dense + 1, max(2, dense // 4)
+    while start + block_length <= max_lag:
         end = count - start + 1
-        columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
-        start, width = start + width, int(width * BLOCK_GROWTH_FACTOR) + 1
+        columns.append((sums[end : end + count] - sums[end - block_length : end - block_length + count]) / block_length)
+        start, block_length = start + block_length, int(block_length * BLOCK_GROWTH_FACTOR) + 1
     return columns
 
 
-def first_stage_f(explained: Sequence[Floats], residuals: Sequence[Floats], coefficients: int) -> float:
+def first_stage_f(explained_parts: Sequence[Floats], residuals: Sequence[Floats], coefficients: int) -> float:
     """Return the F statistic of the first stage of a two-stage fit, corrected for colored residuals.
 
-    `explained` are the explained parts of an input by run, `residuals` its residuals, and `coefficients` is the number
-    of coefficients of the first stage. The statistic is infinite if the residuals are 0.
+    `explained_parts` are the explained parts of an input by run, `residuals` its residuals, and `coefficients` is the
+    number of coefficients of the first stage. The statistic is infinite if the residuals are 0.
     """
     noise_filter = autoregression(residuals, DEFAULT_LAGS)
     errors = np.concatenate([np.convolve(e - np.mean(e), noise_filter, "valid") for e in residuals])
     level = float(np.mean(errors**2)) / max(float(np.sum(noise_filter)) ** 2, 1e-12)
-    power = sum(float(np.var(a)) * a.size for a in explained)
+    power = sum(float(np.var(a)) * a.size for a in explained_parts)
     return power / coefficients / level if level > 0 else math.inf
 
 
@@ -136,9 +138,9 @@ def _columns(references: Sequence[Floats], shortest: int, dense: int) -> Floats:
     The largest lag is half of `shortest`, the length of the shortest run. Each lag up to `dense` has its own column,
     and larger lags share columns.
     """
-    parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in references]
+    blocks = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in references]
     levels = np.repeat(np.eye(len(references)), [r.size for r in references], axis=0)
-    return np.hstack([np.concatenate(parts), levels])
+    return np.hstack([np.concatenate(blocks), levels])
 
 
 def _criterion(residuals: Floats, coefficients: int) -> float:
@@ -159,11 +161,11 @@ def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
     )
 
 
-def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
+def with_reference_findings(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
     """Return a fit whose settings name the reference signal that it used, with `findings` on this signal.
 
     The finding on colored residuals is removed.
     """
     # Noise in a closed loop is colored even if the model is complete. Intervals take the color into account.
-    own = [f for f in fit.findings if f.code != "residuals_not_white"]
-    return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})
+    other_findings = [f for f in fit.findings if f.code != "residuals_not_white"]
+    return replace(fit, findings=[*other_findings, *findings], settings={**fit.settings, "reference": reference})

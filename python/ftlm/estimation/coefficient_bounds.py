@@ -26,8 +26,10 @@ def check_intervals(bounds: object, *, finite: bool = False) -> None:
     if not isinstance(bounds, Mapping):
         raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():
-        ends = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
-        if not (len(ends) == 2 and ends[0] < ends[1]) or (finite and not all(map(math.isfinite, ends))):
+        pair_values = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
+        if not (len(pair_values) == 2 and pair_values[0] < pair_values[1]) or (
+            finite and not all(map(math.isfinite, pair_values))
+        ):
             raise ModelError(
                 f"bounds of {name} = {pair!r} are not an interval; write "
                 f"{parameter('bounds', {name: (Placeholder('low'), Placeholder('high'))})}"
@@ -92,20 +94,25 @@ def fit_within_bounds(
     """
 
     def violations(values: Mapping[str, float]) -> dict[str, float]:
-        ends = {n: (values[n], min(max(values[n], low), high)) for n, (low, high) in bounds.items() if n in values}
-        return {n: end for n, (value, end) in ends.items() if value != end}
+        clipped_values = {
+            n: (values[n], min(max(values[n], low), high)) for n, (low, high) in bounds.items() if n in values
+        }
+        return {n: end for n, (value, end) in clipped_values.items() if value != end}
 
     result, values = fit(structure, None)
-    fixed, outside = dict[str, float](), dict[str, float]()
-    while out := violations(values):
-        fixed |= out
-        outside |= {n: values[n] for n in out}
+    fixed, violating_values = dict[str, float](), dict[str, float]()
+    while bound_values := violations(values):
+        fixed |= bound_values
+        violating_values |= {n: values[n] for n in bound_values}
         result, values = fit(structure.with_coefficients(fixed), None)
     for name in list(fixed):
-        others = {n: v for n, v in fixed.items() if n != name}
+        other_fixed = {n: v for n, v in fixed.items() if n != name}
         with contextlib.suppress(ConvergenceError):
-            inner, inner_values = fit(structure.with_coefficients(others), {**values, name: fixed[name]})
-            if not violations(inner_values):
-                result, values, fixed = inner, inner_values, others
-    on = [make_finding("coefficient_on_bound", parameter=n, value=v, outside=outside[n]) for n, v in fixed.items()]
-    return result, on
+            relaxed_fit, relaxed_values = fit(structure.with_coefficients(other_fixed), {**values, name: fixed[name]})
+            if not violations(relaxed_values):
+                result, values, fixed = relaxed_fit, relaxed_values, other_fixed
+    bound_findings = [
+        make_finding("coefficient_on_bound", parameter=n, value=v, outside=violating_values[n])
+        for n, v in fixed.items()
+    ]
+    return result, bound_findings

@@ -66,7 +66,7 @@ def with_intervals(
         return joint, []
     findings: list[Finding] = []
     pulse_count = 0
-    for turn in range(MAX_RESTARTS + 1):
+    for restart in range(MAX_RESTARTS + 1):
         pulses = joint.samples * joint.refinement * (FREE_ORDER_COST_FACTOR if joint.orders else 1)
         auto = intervals == "auto"
         budget = (max(MAX_AUTO_PULSES - pulse_count, 0) // pulses, MIN_INITIAL_BUDGET_PER_BOUND) if auto else None
@@ -79,7 +79,7 @@ def with_intervals(
             # There is no finite simulation with the new weights, so the previous result is kept.
             return joint, findings
         pulse_count += profile.evaluations * pulses
-        if profile.lower_optimum is None or turn == MAX_RESTARTS:
+        if profile.lower_optimum is None or restart == MAX_RESTARTS:
             break
         if not profile.lower_on_finer_grid:
             # An optimum on this grid only is an artifact of the discretization, so its cost is no evidence.
@@ -87,14 +87,14 @@ def with_intervals(
         start = dict(zip(problem.names, profile.lower_optimum.tolist(), strict=True))
         start_count, level = len(joint.starts), joint.noise
         try:
-            again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
+            refit = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
             break
-        exact = joint.exact_outputs(runs)
-        if all(o in exact or v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in again.noise.items()):
-            joint = replace(again, starts=joint.starts, origin=joint.origin)
+        exact_outputs = joint.exact_outputs(runs)
+        if all(o in exact_outputs or v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in refit.noise.items()):
+            joint = replace(refit, starts=joint.starts, origin=joint.origin)
             continue
-        joint = replace(again, origin="a lower optimum found by the search for its intervals")
+        joint = replace(refit, origin="a lower optimum found by the search for its intervals")
         before_text, after_text = (
             ", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise)
         )
@@ -180,11 +180,11 @@ def profile_intervals(
         stop=stop_flag(),
     )
     # A lower bound of 0 is a limit of the quantity itself, such as of a delay, and ends the interval.
-    least = [0.0 if low == 0.0 else -math.inf for low, _ in problem.all_bounds]
+    minima = [0.0 if low == 0.0 else -math.inf for low, _ in problem.all_bounds]
     return ProfileResult(
         {
-            problem.names[i]: ProfileInterval(max(low, least[i]), high, level, tuple(points), took)
-            for i, low, high, points, took in answer["intervals"]
+            problem.names[i]: ProfileInterval(max(low, minima[i]), high, level, tuple(points), evaluation_count)
+            for i, low, high, points, evaluation_count in answer["intervals"]
         },
         answer["lower_optimum"],
         answer["lower_on_finer_grid"],
@@ -224,9 +224,9 @@ def result_profiles(
     problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
     unknown = [n for n in names if n not in problem.names]
     if unknown:
-        others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
+        further_names = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
         raise ModelError(
-            f"{unknown[0]!r}{others} is not a free parameter of this fit; it has {', '.join(problem.names)}"
+            f"{unknown[0]!r}{further_names} is not a free parameter of this fit; it has {', '.join(problem.names)}"
         )
     probability = real_number("level", level)
     if not 0.0 < probability < 1.0:

@@ -124,13 +124,13 @@ class Consistency(ReportMixin):
 
     def describe_difference(self, difference: ParameterDifference) -> str:
         """Return text on one parameter in two segments: values, intervals and difference in standard errors."""
-        ends = []
+        text = []
         for part in difference.parts:
             low, high = self.results[part].intervals[difference.name]
             value = f"{self._values(part)[difference.name]:.4g}"
-            ends.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
+            text.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
         return (
-            f"{difference.name} is {ends[0]} and {ends[1]}, {difference.difference_in_errors:.2g} standard errors apart"
+            f"{difference.name} is {text[0]} and {text[1]}, {difference.difference_in_errors:.2g} standard errors apart"
         )
 
     @property
@@ -140,13 +140,13 @@ class Consistency(ReportMixin):
         if self.consistent is None:
             return "Inconclusive: no parameter is identifiable from two segments"
         if self.consistent:
-            words = "The same model within its uncertainty: the 95 % intervals of every parameter overlap; the largest "
-            words += f"difference: {self.describe_difference(comparable[0])}"
-            return words + (f"; all parameters together: {self._joint_test_text}" if self._joint_test_text else "")
-        far = [d for d in comparable if d.disjoint]
-        if far:
-            words = f"Not the same model: {'; '.join(self.describe_difference(d) for d in far)}"
-            return words + (f"; all parameters together: {self._joint_test_text}" if self._exceeds_limit else "")
+            text = "The same model within its uncertainty: the 95 % intervals of every parameter overlap; the largest "
+            text += f"difference: {self.describe_difference(comparable[0])}"
+            return text + (f"; all parameters together: {self._joint_test_text}" if self._joint_test_text else "")
+        disjoint = [d for d in comparable if d.disjoint]
+        if disjoint:
+            text = f"Not the same model: {'; '.join(self.describe_difference(d) for d in disjoint)}"
+            return text + (f"; all parameters together: {self._joint_test_text}" if self._exceeds_limit else "")
         return (
             f"Not the same model: the 95 % intervals of each parameter overlap, but all parameters together differ "
             f"({self._joint_test_text}); the largest difference: {self.describe_difference(comparable[0])}"
@@ -326,11 +326,11 @@ def consistency(
     ConvergenceError
         If the fit of a segment fails.
     """
-    every = as_runs(runs)
+    all_runs = as_runs(runs)
     count = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
-    if len(every) > 1 and count is not None:
+    if len(all_runs) > 1 and count is not None:
         raise ModelError(
-            f"{len(every)} runs are given, and each is a segment; leave {parameter('segments')} out, or give one run"
+            f"{len(all_runs)} runs are given, and each is a segment; leave {parameter('segments')} out, or give one run"
         )
     estimator = resolve_method(method)
     options = [n for n in ("store", "start") if getattr(estimator, n, None) is not None]
@@ -339,7 +339,7 @@ def consistency(
             f"{parameter(options[0])} applies to a single identification, but each segment is identified separately; "
             "leave it out"
         )
-    pieces = split_run(every[0], count or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
+    pieces = split_run(all_runs[0], count or DEFAULT_SEGMENTS) if len(all_runs) == 1 else list(all_runs)
     names = _segment_names(pieces)
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
@@ -354,10 +354,12 @@ def consistency(
             )
         if progress is not None:
             progress(len(results), len(pieces))
-    crossed = tuple(tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
+    cross_validation = tuple(
+        tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results
+    )
     distance, degrees = joint_distance(results)
-    result = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
-    if result.consistent is not False or len(every) == 1:
+    result = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, cross_validation)
+    if result.consistent is not False or len(all_runs) == 1:
         return result
     return replace(result, delays=tuple(_delay_findings(names, pieces, results)))
 
@@ -370,7 +372,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
         if k == j or piece.sample_times is not None or piece.length <= 2 * MAX_SHIFT_ROWS:
             continue
         # A fit is 100 (1 - NR).
-        own = results[k].fit
+        segment_fit = results[k].fit
         misfits: dict[int, dict[str, float]] = {}
         for rows in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1):
             shifted = piece.with_samples({n: _shift_rows(piece[n], rows) for n in inputs})
@@ -382,11 +384,11 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
             if (
                 rows
                 and misfit_after < MAX_SHIFTED_SHARE * misfit_before
-                and misfit_after <= MAX_OWN_RATIO * (100.0 - own[output])
+                and misfit_after <= MAX_OWN_RATIO * (100.0 - segment_fit[output])
             ):
                 text = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"
-                numbers = {"before": misfit_before, "after": misfit_after, "other": names[j], "shown": text}
-                findings.append(make_finding("segments_differ_by_delay", run=names[k], output=output, **numbers))
+                details = {"before": misfit_before, "after": misfit_after, "other": names[j], "shown": text}
+                findings.append(make_finding("segments_differ_by_delay", run=names[k], output=output, **details))
     return findings
 
 
@@ -420,15 +422,15 @@ def _segment_names(pieces: Sequence[Run]) -> list[str]:
     return [f"{name} ({k})" for k, name in enumerate(names, 1)]
 
 
-def _cross_validated_fit(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
+def _cross_validated_fit(result: Identification, piece: Run, segment_result: Identification) -> dict[str, float]:
     """Return the fit in percent, by output, of the model of `result` on the segment `piece`.
 
-    The simulation uses the initial conditions of `own`, the identification of this segment. The result is {} if the
-    simulation fails.
+    The simulation uses the initial conditions of `segment_result`, the identification of this segment. The result is {}
+    if the simulation fails.
     """
-    if result is own:
+    if result is segment_result:
         return dict(result.fit)
-    structure = replace(result.model.structure, initial=own.model.structure.initial)
+    structure = replace(result.model.structure, initial=segment_result.model.structure.initial)
     try:
         return dict(compare(replace(result.model, structure=structure), piece).fit)
     except FtlmError:
@@ -438,17 +440,19 @@ def _cross_validated_fit(result: Identification, piece: Run, own: Identification
 def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
     """Return the differences of each parameter between any two segments, most significant first."""
     out = []
-    for places in itertools.combinations(range(len(results)), 2):
-        pair = [results[k] for k in places]
+    for pair_indices in itertools.combinations(range(len(results)), 2):
+        pair = [results[k] for k in pair_indices]
         for name in pair[0].standard_errors:
             (first, low), (second, high) = sorted((values_of(r)[name], r.intervals[name]) for r in pair)
             # Profile-likelihood intervals are asymmetric. The bounds that face each other determine the standard error.
-            width = (low[1] - first, second - high[0])
-            error = math.hypot(*width) / NORMAL_95
+            gap = (low[1] - first, second - high[0])
+            error = math.hypot(*gap) / NORMAL_95
             is_determined = 0.0 < error < math.inf and all(is_identifiable(r, name) for r in pair)
-            is_apart = is_determined and second - first > sum(width)
+            is_apart = is_determined and second - first > sum(gap)
             out.append(
-                ParameterDifference(name, places, (second - first) / error if is_determined else math.nan, is_apart)
+                ParameterDifference(
+                    name, pair_indices, (second - first) / error if is_determined else math.nan, is_apart
+                )
             )
     return sorted(
         out,
@@ -468,10 +472,11 @@ def is_identifiable(result: Identification, name: str) -> bool:
 
 def is_quadratic(result: Identification, name: str) -> bool:
     """Whether both bounds of a parameter's interval are close to the bounds of its Wald interval."""
-    value, usual = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
+    value, half_width = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
     low, high = result.intervals[name]
     return is_identifiable(result, name) and all(
-        usual / MAX_ASYMMETRY_RATIO <= end <= MAX_ASYMMETRY_RATIO * usual for end in (value - low, high - value)
+        half_width / MAX_ASYMMETRY_RATIO <= end <= MAX_ASYMMETRY_RATIO * half_width
+        for end in (value - low, high - value)
     )
 
 
@@ -490,9 +495,11 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     if count == 0:
         return None, 0
     unit = np.sqrt(np.mean([np.diag(j.covariance)[is_comparable] for j in joints], axis=0))
-    spreads = [j.covariance[np.ix_(is_comparable, is_comparable)] / np.outer(unit, unit) for j in joints]
+    covariances = [j.covariance[np.ix_(is_comparable, is_comparable)] / np.outer(unit, unit) for j in joints]
     points = [j.values[is_comparable] / unit for j in joints]
-    weights = [np.linalg.pinv(s, hermitian=True) for s in spreads]
-    centre = np.linalg.lstsq(np.sum(weights, axis=0), sum(w @ p for w, p in zip(weights, points, strict=True)))[0]
-    distance = float(sum((p - centre) @ w @ (p - centre) for w, p in zip(weights, points, strict=True)))
+    weights = [np.linalg.pinv(s, hermitian=True) for s in covariances]
+    weighted_mean = np.linalg.lstsq(np.sum(weights, axis=0), sum(w @ p for w, p in zip(weights, points, strict=True)))[
+        0
+    ]
+    distance = float(sum((p - weighted_mean) @ w @ (p - weighted_mean) for w, p in zip(weights, points, strict=True)))
     return distance, count * (len(joints) - 1)

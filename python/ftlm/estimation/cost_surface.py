@@ -40,11 +40,11 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     if result.joint is None:
         return None
     names = list(result.joint.orders)
-    sizes = np.abs(result.joint.correlation[: len(names), : len(names)])
-    sizes = np.where(np.isfinite(sizes) & ~np.eye(len(names), dtype=bool), sizes, -1.0)
-    if len(names) < 2 or sizes.max() < 0:
+    magnitudes = np.abs(result.joint.correlation[: len(names), : len(names)])
+    magnitudes = np.where(np.isfinite(magnitudes) & ~np.eye(len(names), dtype=bool), magnitudes, -1.0)
+    if len(names) < 2 or magnitudes.max() < 0:
         return None
-    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(sizes)), sizes.shape))
+    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(magnitudes)), magnitudes.shape))
     return names[i], names[j], float(result.joint.correlation[i, j])
 
 
@@ -90,7 +90,7 @@ def output_error_landscape(
     if not all(0 < errors[n] < math.inf for n in (first, second)):
         return None
     problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
-    least, x, y, costs = _core.cost_surface(
+    minimum, x, y, costs = _core.cost_surface(
         problem.core,
         [recording(run, problem.structure) for run in task.runs],
         {**fit_state(joint, problem), "steady": False},
@@ -101,14 +101,14 @@ def output_error_landscape(
         evaluations=OPTIMUM_EVALUATIONS,
         stop=stop_flag(),
     )
-    least = min(least, float(costs.min()))
+    minimum = min(minimum, float(costs.min()))
     subtitle = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
     i, j = names.index(first), names.index(second)
     return Landscape(
         (first, second),
         x,
         y,
-        1.0 + costs - least,
+        1.0 + costs - minimum,
         subtitle,
         "1 + increase of the weighted sum of squares",
         float(joint.correlation[i, j]),

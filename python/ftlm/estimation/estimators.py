@@ -58,86 +58,88 @@ MIN_PULSES_PER_SAMPLE = 2
 
 
 def fit_with_instruments(
-    joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]
+    joint: JointFit, problem: FreeProblem, runs: Sequence[Run], noise_free_runs: Sequence[Run]
 ) -> JointFit:
     """Return a joint fit whose output-error residuals are uncorrelated with instruments from noise-free inputs.
 
-    `joint` is the initial fit to `answers`. These are the measured `runs` in which each input is replaced by the
-    noise-free part that the reference explains.
+    `joint` is the initial fit to `noise_free_runs`. These are the measured `runs` in which each input is replaced by
+    the noise-free part that the reference explains.
 
     The residuals belong to the measured runs. The instruments are the sensitivities of the outputs to the parameters,
-    computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever the accuracy
-    of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The equations are
-    solved by Gauss-Newton. The covariance is robust to colored residuals.
+    computed with `noise_free_runs`. Orthogonality of both removes the bias caused by feedback of noise, whatever the
+    accuracy of `noise_free_runs` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The
+    equations are solved by Gauss-Newton. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-    every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
-    data_objective, noise_free_objective = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+    pulses_per_sample = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
+    data_objective, noise_free_objective = (
+        Objective(problem, data, weights, pulses_per_sample=pulses_per_sample) for data in (runs, noise_free_runs)
+    )
     values, converged = joint.values, False
-    moments = _evaluate_moments(data_objective, noise_free_objective, values)
+    evaluation = _evaluate_estimating_equation(data_objective, noise_free_objective, values)
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
-        attempt, slopes, instruments = moments
-        residuals = np.asarray(attempt.outcome["residuals"])
-        moment_inverse = np.linalg.pinv(instruments @ slopes.T)
-        step = -moment_inverse @ (instruments @ residuals)
-        errors = np.sqrt(np.diag(_covariance(data_objective, attempt, moment_inverse @ instruments)))
+        iterate, slopes, instruments = evaluation
+        residuals = np.asarray(iterate.outcome["residuals"])
+        gradient_inverse = np.linalg.pinv(instruments @ slopes.T)
+        step = -gradient_inverse @ (instruments @ residuals)
+        errors = np.sqrt(np.diag(_covariance(data_objective, iterate, gradient_inverse @ instruments)))
         if np.all(np.abs(step) <= STEP_TOLERANCE_ERRORS * errors):
             converged = True
             break
-        level = _moment_norm(moments)
+        current_norm = _estimating_equation_norm(evaluation)
         for halving in range(MAX_STEP_HALVINGS):
             trial = problem.feasible_point(values, values + 0.5**halving * step)
             try:
-                trial_moments = _evaluate_moments(data_objective, noise_free_objective, trial)
+                trial_evaluation = _evaluate_estimating_equation(data_objective, noise_free_objective, trial)
             except FtlmError:
                 # The simulation diverges after a step of this length.
                 continue
-            if _moment_norm(trial_moments) < level:
-                values, moments = trial, trial_moments
+            if _estimating_equation_norm(trial_evaluation) < current_norm:
+                values, evaluation = trial, trial_evaluation
                 break
         else:
             break
-    attempt, slopes, instruments = moments
-    covariance = _covariance(data_objective, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
+    iterate, slopes, instruments = evaluation
+    covariance = _covariance(data_objective, iterate, np.linalg.pinv(instruments @ slopes.T) @ instruments)
     orders, coefficients, inputs = problem.split(values.tolist())
-    levels = data_objective.rms_residuals(attempt)
+    levels = data_objective.rms_residuals(iterate)
     return replace(
         joint,
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)),
         covariance=covariance,
-        noise={o: level / w for (o, level), w in zip(levels.items(), weights, strict=True)},
-        cost=float(attempt.outcome["cost"]),
-        residuals=data_objective.residuals(attempt),
-        refinement=every,
+        noise={o: current_norm / w for (o, current_norm), w in zip(levels.items(), weights, strict=True)},
+        cost=float(iterate.outcome["cost"]),
+        residuals=data_objective.residuals(iterate),
+        refinement=pulses_per_sample,
         converged=converged,
     )
 
 
-def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> float:
+def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], noise_free_runs: Sequence[Run]) -> float:
     """Return the largest bias that feedback of noise causes in a parameter, in standard errors of the parameter.
 
-    `answers` are the runs with inputs from which the part that depends on past residuals is removed. They serve as
-    instruments, and the bias is the first Gauss-Newton step of :func:`fit_with_instruments`. The result is infinite if
-    that step cannot be computed.
+    `noise_free_runs` are the runs with inputs from which the part that depends on past residuals is removed. They serve
+    as instruments, and the bias is the first Gauss-Newton step of :func:`fit_with_instruments`. The result is infinite
+    if that step cannot be computed.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-    every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
+    pulses_per_sample = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
     try:
         data_objective, noise_free_objective = (
-            Objective(problem, each, weights, every=every) for each in (runs, answers)
+            Objective(problem, data, weights, pulses_per_sample=pulses_per_sample) for data in (runs, noise_free_runs)
         )
-        attempt, slopes, instruments = _evaluate_moments(data_objective, noise_free_objective, joint.values)
+        iterate, slopes, instruments = _evaluate_estimating_equation(data_objective, noise_free_objective, joint.values)
     except FtlmError:
         return math.inf
-    step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(attempt.outcome["residuals"]))
+    step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(iterate.outcome["residuals"]))
     errors = np.array([joint.standard_errors[n] for n in joint.names])
     is_finite = np.isfinite(errors) & (errors > 0)
     return float(np.max(np.abs(step[is_finite]) / errors[is_finite], initial=0.0))
 
 
-def _evaluate_moments(
+def _evaluate_estimating_equation(
     data_objective: Objective, noise_free_objective: Objective, values: Floats
 ) -> tuple[Iterate, Floats, Floats]:
     """Return the evaluated residuals, their Jacobian on measured inputs, and the Jacobian on noise-free inputs.
@@ -146,25 +148,25 @@ def _evaluate_moments(
     """
     orders, coefficients, inputs = data_objective.problem.split(values.tolist())
     start = Iterate(orders, coefficients, "instruments", {}, inputs)
-    at = data_objective.minimize(start, 1, plain=True)
-    instruments = noise_free_objective.minimize(start, 1, plain=True)
-    return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
+    iterate = data_objective.minimize(start, 1, linear_scale=True)
+    instruments = noise_free_objective.minimize(start, 1, linear_scale=True)
+    return iterate, np.asarray(iterate.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
 
 
-def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
+def _estimating_equation_norm(evaluation: tuple[Iterate, Floats, Floats]) -> float:
     """Return the norm of the residuals projected onto the span of the instruments."""
-    attempt, _, instruments = moment
+    iterate, _, instruments = evaluation
     basis = orthonormal(instruments.T, INSTRUMENT_RANK_TOLERANCE)
-    return vector_norm(projections(basis, np.asarray(attempt.outcome["residuals"])))
+    return vector_norm(projections(basis, np.asarray(iterate.outcome["residuals"])))
 
 
-def _covariance(objective: Objective, attempt: Iterate, influence: Floats) -> Floats:
+def _covariance(objective: Objective, iterate: Iterate, influence: Floats) -> Floats:
     """Return the parameter covariance, consistent under heteroskedasticity and autocorrelation of residuals.
 
     The estimator is that of Newey and West (doi:10.2307/1913610). ``influence`` is the derivative of each parameter
     with respect to each residual, of shape (parameters, residuals).
     """
-    series = [residuals for part in objective.residuals(attempt) for residuals in part.values()]
+    series = [residuals for run_residuals in objective.residuals(iterate) for residuals in run_residuals.values()]
     return _core.long_run_covariance(influence, series)
 
 
@@ -182,20 +184,20 @@ def estimate_output_error(
     m: int | None,
     threads: int,
     progress: ProgressCallback,
-    answers: Sequence[Run] | None = None,
+    noise_free_runs: Sequence[Run] | None = None,
     loss: Loss = "squares",
     intervals: Intervals = "auto",
     begin: Model | Mapping[str, float] | None = None,
-    more: Mapping[str, float] | None = None,
+    additional_values: Mapping[str, float] | None = None,
     alone: bool = False,
     joint_fit: JointFit | None = None,
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
-    `answers` are the runs with each input replaced by the part that a reference explains. If given, they serve as
-    instruments. `begin` is an additional initial guess. If it is a model, `more` adds values of parameters that the
-    model lacks. If `alone` is True, no other initial guess is used. `joint_fit` is a joint fit of the same task, if one
-    was computed before.
+    `noise_free_runs` are the runs with each input replaced by the part that a reference explains. If given, they serve
+    as instruments. `begin` is an additional initial guess. If it is a model, `additional_values` adds values of
+    parameters that the model lacks. If `alone` is True, no other initial guess is used. `joint_fit` is a joint fit of
+    the same task, if one was computed before.
     """
     # An order with a single grid value is fixed.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -203,35 +205,35 @@ def estimate_output_error(
     structure = resolve_start(task.runs, request)
     record = prepare(task.runs, structure.without_input_nonlinearities(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
-    begins: list[dict[str, float]] = []
+    additional_guesses: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        guess = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
-        begins = warm_starts(free, guess)
+        guess = values_of_model(free, begin, additional_values or {}) if isinstance(begin, Model) else begin
+        additional_guesses = warm_starts(free, guess)
     # Progress assumes one fit, since a second one (with or without a history) is rare. Profiles take about a third.
     tracker = ShareTracker(progress)
     joint = joint_fit or fit_with_initial_conditions(
-        answers or task.runs,
+        noise_free_runs or task.runs,
         structure,
         start,
         threads=threads,
         progress=tracker.subtask(0.7, 0.9),
         loss=loss,
-        guesses=begins,
-        alone=alone,
+        guesses=additional_guesses,
+        single_start=alone,
     )
     tracker.advance_to(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     lower: list[Finding] = []
-    if answers is not None:
-        joint = fit_with_instruments(joint, problem, task.runs, answers)
+    if noise_free_runs is not None:
+        joint = fit_with_instruments(joint, problem, task.runs, noise_free_runs)
     else:
         joint, lower = with_intervals(
             joint, problem, task.runs, intervals, threads=threads, progress=tracker.subtask(1.0, 0.9), loss=loss
         )
     tracker.advance_to(1.0)
     findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
-    if answers is None:
+    if noise_free_runs is None:
         findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
         # Otherwise a comparison of the model would assume rest because of the first samples.
@@ -271,8 +273,8 @@ def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[floa
     jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
     with np.errstate(invalid="ignore", over="ignore"):
         # Covariances of non-identifiable directions are NaN or overflow.
-        spread = jacobian @ joint.covariance @ jacobian.T
-    return tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None
+        covariance = jacobian @ joint.covariance @ jacobian.T
+    return tuple(tuple(row) for row in covariance.tolist()) if np.all(np.isfinite(covariance)) else None
 
 
 def estimate_order_search(
@@ -348,25 +350,25 @@ def prior_findings(
     findings = []
     groups = task.structure.independent_groups() if searches else {}
     for name, search in searches.items():
-        part = groups.get(name, task.structure)
-        if len(part.equations) > 1:
+        group = groups.get(name, task.structure)
+        if len(group.equations) > 1:
             continue
-        (output,) = part.outputs
-        records = prepare(task.runs, part, m, power_of_two=settings.needs_haar)
+        (output,) = group.outputs
+        records = prepare(task.runs, group, m, power_of_two=settings.needs_haar)
         outputs = np.concatenate([record.of(output) for record in records])
         zero_output_score = np.abs(outputs).sum() if settings.norm == "l1" else np.sqrt(np.mean(outputs**2))
-        share = search.score / float(zero_output_score)
-        if share > MAX_PRIOR_SCORE_RATIO:
+        score_ratio = search.score / float(zero_output_score)
+        if score_ratio > MAX_PRIOR_SCORE_RATIO:
             findings.append(
-                make_finding("prior_decides_ranking", output=output, prior=settings.prior_covariance, share=share)
+                make_finding("prior_decides_ranking", output=output, prior=settings.prior_covariance, share=score_ratio)
             )
     return findings
 
 
 def fixed_orders(task: Task) -> set[str]:
     """Return the names of orders with a single grid value, which are not estimated."""
-    parts = task.structure.independent_groups().values() if task.structure.order_names else []
-    axes = [(task.part_order_grid(part) or OrderGrid()).values(part) for part in parts]
+    groups = task.structure.independent_groups().values() if task.structure.order_names else []
+    axes = [(task.part_order_grid(group) or OrderGrid()).values(group) for group in groups]
     return {n for values in axes for n, v in values.items() if len(v) == 1}
 
 
@@ -384,8 +386,8 @@ def run_order_searches(
     The results are keyed by output, or by ``"stage"`` for a search of coupled equations.
     """
     jobs = {
-        name: make_job(task.runs, part, task.part_order_grid(part), settings, m=m, threads=threads, progress=progress)
-        for name, part in task.structure.independent_groups().items()
+        name: make_job(task.runs, group, task.part_order_grid(group), settings, m=m, threads=threads, progress=progress)
+        for name, group in task.structure.independent_groups().items()
     }
     with contextlib.ExitStack() as stack:
         requests = [job.request(name) for name, job in jobs.items()]
@@ -423,9 +425,9 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
 def fitted_model(joint: JointFit, structure: Structure) -> Model:
     """Return the model of a joint fit, with its initial conditions and the covariance of its parameters."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
-    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
+    coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
     identified_structure = (
-        problem.structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
+        problem.structure.with_orders(joint.orders).with_coefficients(coefficients).with_inputs(joint.inputs)
     )
     estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
     return Model(identified_structure, orders=joint.orders, estimate=estimate)

@@ -111,7 +111,7 @@ class Extension:
         Names of the inputs that the extension concerns.
     starts
         Initial guesses, each with values by parameter name. The entry None stands for automatic initial guesses.
-    near
+    initial_fit
         Fit with the same free parameters. If given, the extension is fitted from the optimum of this fit with its time
         step, not from `starts`.
     local_start
@@ -132,7 +132,7 @@ class Extension:
     parameter_count: int
     inputs: Sequence[str]
     starts: Sequence[Mapping[str, float] | None] = (None,)
-    near: JointFit | None = None
+    initial_fit: JointFit | None = None
     local_start: Mapping[str, float] | None = None
     term_text: str = ""
     runs: Runs | None = None
@@ -160,7 +160,7 @@ class ExtensionTests:
     """Result of :func:`run_extension_tests`: findings, and whether a structure with dry friction was tested."""
 
     findings: list[Finding]
-    friction_tested: bool = False
+    has_friction_test: bool = False
 
 
 def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
@@ -181,20 +181,20 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     non-linear terms are tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
-    large = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
-    colored = any(not o.whiteness.passed or o.follows_direction for o in large)
+    inexact = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
+    colored = any(not o.whiteness.passed or o.follows_direction for o in inexact)
     is_excluded = structure.has_friction or structure.limits or structure.free_inputs
     if joint is None or not joint.names or not colored or is_excluded:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
     fed_back = _inputs_fed_back_within_row(fit.model, tests)
     names = [n for n in _inputs_of_single_equation(structure, runs) if n not in fed_back]
-    about = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
+    location = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
     try:
         joint, runs = _first_samples(joint, structure, runs)
-        own = _prediction_criterion(joint, structure, runs, 0)
-        is_poor = any(not o.nr <= MAX_NORMALIZED_RESIDUAL for o in large)
-        fit_each = partial(_fit_extensions, runs=runs, own_criterion=own)
+        fitted_criterion = _prediction_criterion(joint, structure, runs, 0)
+        is_poor = any(not o.nr <= MAX_NORMALIZED_RESIDUAL for o in inexact)
+        fit_each = partial(_fit_extensions, runs=runs, fitted_criterion=fitted_criterion)
         fits = fit_each(_offset_extensions(structure, joint, runs, is_poor=is_poor))
         offset_fits = sorted((f.fit for f in fits), key=lambda fit: max(fit.noise.values()))
         fits += fit_each([e for e in _intersample_extensions(structure, joint, runs) if not fed_back & {*e.inputs}])
@@ -202,8 +202,10 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
-        best = _best_extension([f for f in fits if f.is_physical], own) or _best_extension(fits, own)
-        findings = _extension_findings(best, structure, joint, runs, names, about) if best else []
+        best = _best_extension([f for f in fits if f.is_physical], fitted_criterion) or _best_extension(
+            fits, fitted_criterion
+        )
+        findings = _extension_findings(best, structure, joint, runs, names, location) if best else []
     except FtlmError:
         # The fit to the first samples, with which extensions are compared, has failed.
         return ExtensionTests([])
@@ -216,14 +218,14 @@ def _extension_findings(
     joint: JointFit,
     runs: Runs,
     names: Sequence[str],
-    about: Mapping[str, str],
+    location: Mapping[str, str],
 ) -> list[Finding]:
     """Return the finding on the best extension, or ``dynamics_missing`` if it fails a residual test or is not physical.
 
     ``dynamics_missing`` is omitted if `names`, the inputs of a linear structure of one equation, is empty. An extension
     by another intersample behavior is reported only if it changes a parameter by over one standard error.
     """
-    missing = [make_finding("dynamics_missing", input=enumerate_names(names), **about)] if names else []
+    missing = [make_finding("dynamics_missing", input=enumerate_names(names), **location)] if names else []
     extension, refit = best.extension, best.fit
     if not best.is_physical or not _passes_residual_tests(best, runs):
         return missing
@@ -231,32 +233,32 @@ def _extension_findings(
         change = _largest_change(joint, refit)
         test = f"with it {change['parameter']} is {change['other_value']:.4g}, not {change['value']:.4g}"
         share = 100.0 * (1.0 - min(change["ratio"], 1.0))
-        return [make_finding("offset_missing", output=about["output"], share=share, test=test)]
+        return [make_finding("offset_missing", output=location["output"], share=share, test=test)]
     if extension.code == "drift_fits":
-        return [make_finding("drift_fits", **about, **_largest_change(joint, refit))]
+        return [make_finding("drift_fits", **location, **_largest_change(joint, refit))]
     if extension.code == "other_intersample_fits":
-        return _intersample_findings(extension, joint, refit, runs, about)
+        return _intersample_findings(extension, joint, refit, runs, location)
     if extension.code == "delay_fits":
-        return _delay_findings(extension, refit, structure, min(r.step for r in runs), about) or missing
-    about, numbers = dict(about), {}
+        return _delay_findings(extension, refit, structure, min(r.step for r in runs), location) or missing
+    location, details = dict(location), {}
     if extension.code == "load_step_fits":
         (load_name,) = extension.inputs
-        numbers = {
+        details = {
             "time": extension.load_time,
             "value": refit.coefficients[load_name],
             "error": refit.standard_errors[load_name],
         }
     if extension.code == "friction_fits":
         name = extension.positive_coefficient
-        numbers = {"value": refit.coefficients[name], "error": refit.standard_errors[name]}
+        details = {"value": refit.coefficients[name], "error": refit.standard_errors[name]}
     limits = {n: v for n, v in refit.inputs.items() if n not in joint.inputs}
     if limits:
         ((name, value),) = limits.items()
-        numbers = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
-        about["parameter"] = name
+        details = {"value": value, "error": refit.standard_errors[name], "low": 0.5 * value, "high": 2.0 * value}
+        location["parameter"] = name
     if extension.inputs:
-        about["input"] = enumerate_names(extension.inputs)
-    return [make_finding(extension.code, term=extension.term_text, **about, **numbers)]
+        location["input"] = enumerate_names(extension.inputs)
+    return [make_finding(extension.code, term=extension.term_text, **location, **details)]
 
 
 def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, ...]:
@@ -298,7 +300,7 @@ def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_
         # A ramp has a constant and a slope; the constant is not new beside a level.
         count *= 2
     drift = replace(structure, offset="ramp")
-    return [*extensions, Extension("drift_fits", drift, count, [], near=joint)]
+    return [*extensions, Extension("drift_fits", drift, count, [], initial_fit=joint)]
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -309,24 +311,26 @@ def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -
     """
     extensions = []
     for name in runs[0].inputs:
-        steps = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
-        if name in structure.signals and np.count_nonzero(steps) > MIN_CHANGING_SHARE * steps.size:
-            other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
-            changed = as_runs([run.with_intersample({name: other}) for run in runs])
-            extensions.append(Extension("other_intersample_fits", structure, 0, [name], near=joint, runs=changed))
+        increments = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
+        if name in structure.signals and np.count_nonzero(increments) > MIN_CHANGING_SHARE * increments.size:
+            alternative: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
+            changed = as_runs([run.with_intersample({name: alternative}) for run in runs])
+            extensions.append(
+                Extension("other_intersample_fits", structure, 0, [name], initial_fit=joint, runs=changed)
+            )
     return extensions
 
 
 def _intersample_findings(
-    extension: Extension, joint: JointFit, refit: JointFit, runs: Runs, about: Mapping[str, str]
+    extension: Extension, joint: JointFit, refit: JointFit, runs: Runs, location: Mapping[str, str]
 ) -> list[Finding]:
     """Return a finding on another intersample behavior if it changes a parameter by over one standard error."""
     change = _largest_change(joint, refit)
     if not abs(change["other_value"] - change["value"]) > change["error"]:
         return []
-    (name,), other = extension.inputs, as_runs(extension.runs or runs)[0].intersample
-    words = {"taken": INTERSAMPLE_NAMES[runs[0].intersample[name]], "other": INTERSAMPLE_NAMES[other[name]]}
-    return [make_finding(extension.code, input=name, kind=other[name], **about, **change, **words)]
+    (name,), alternative = extension.inputs, as_runs(extension.runs or runs)[0].intersample
+    texts = {"taken": INTERSAMPLE_NAMES[runs[0].intersample[name]], "other": INTERSAMPLE_NAMES[alternative[name]]}
+    return [make_finding(extension.code, input=name, kind=alternative[name], **location, **change, **texts)]
 
 
 def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
@@ -337,11 +341,13 @@ def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
     outputs. Changes are compared in standard errors.
     """
     ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
-    values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
-    moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
-    most = max(values, key=lambda n: moves.get(n, 0.0))
-    numbers = {"value": values[most], "error": errors[most], "other_value": others.get(most, math.nan)}
-    return {"parameter": most, "ratio": ratio, **numbers}
+    values, errors, refit_values = joint.values_by_name, joint.standard_errors, refit.values_by_name
+    relative_changes = {
+        n: abs(refit_values[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in refit_values
+    }
+    name = max(values, key=lambda n: relative_changes.get(n, 0.0))
+    details = {"value": values[name], "error": errors[name], "other_value": refit_values.get(name, math.nan)}
+    return {"parameter": name, "ratio": ratio, **details}
 
 
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
@@ -353,7 +359,7 @@ def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[J
     if all(run.length <= length for run in runs):
         return joint, runs
     parts = as_runs([run if run.length <= length else run.window(None, length * run.step) for run in runs])
-    return fit_output_error(parts, structure, near=joint, refine=False), parts
+    return fit_output_error(parts, structure, initial_fit=joint, refine=False), parts
 
 
 def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
@@ -364,21 +370,23 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
     return list(itertools.islice((n for n in names if n not in reserved_names), count))
 
 
-def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, own_criterion: float) -> list[FittedExtension]:
+def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, fitted_criterion: float) -> list[FittedExtension]:
     """Return the fits of extensions; an extension whose fits all fail is omitted."""
-    return [f for e in extensions if (f := _fit_extension(e, runs, own_criterion)) is not None]
+    return [f for e in extensions if (f := _fit_extension(e, runs, fitted_criterion)) is not None]
 
 
-def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
+def _fit_extension(extension: Extension, runs: Runs, fitted_criterion: float) -> FittedExtension | None:
     """Return the fit of an extension from its best initial guess; None if every fit fails.
 
-    ``own_criterion`` is the criterion without the extension. If the fit from ``local_start`` does not lower it, no
+    ``fitted_criterion`` is the criterion without the extension. If the fit from ``local_start`` does not lower it, no
     other initial guess is tried.
     """
     extension_runs = extension.runs or runs
 
     def fit(start: Mapping[str, float] | None) -> FittedExtension:
-        refit = fit_output_error(extension_runs, extension.structure, start=start, near=extension.near, refine=False)
+        refit = fit_output_error(
+            extension_runs, extension.structure, start=start, initial_fit=extension.initial_fit, refine=False
+        )
         criterion = _prediction_criterion(refit, extension.structure, extension_runs, extension.parameter_count)
         return FittedExtension(extension, refit, criterion)
 
@@ -386,7 +394,7 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
     with contextlib.suppress(FtlmError):
         if extension.local_start is not None:
             fits.append(fit(extension.local_start))
-            if not fits[0].criterion < own_criterion:
+            if not fits[0].criterion < fitted_criterion:
                 return fits[0]
     for start in extension.starts:
         with contextlib.suppress(FtlmError):
@@ -394,7 +402,7 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
     return min(fits, key=lambda f: max(f.fit.noise.values()), default=None)
 
 
-def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
+def _best_extension(fits: Sequence[FittedExtension], fitted_criterion: float) -> FittedExtension | None:
     """Return the extension with the lowest criterion; None if the decrease is below `MIN_CRITERION_DECREASE`.
 
     Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
@@ -404,29 +412,33 @@ def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> Fi
     for item in fits:
         if item.fit.unstable_optimum is not None:
             continue
-        if item.criterion < (own_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
+        if item.criterion < (fitted_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
             best = item
-    return best if best is not None and best.criterion <= own_criterion - MIN_CRITERION_DECREASE else None
+    return best if best is not None and best.criterion <= fitted_criterion - MIN_CRITERION_DECREASE else None
 
 
 def _delay_findings(
-    extension: Extension, refit: JointFit, structure: Structure, step: float, about: Mapping[str, str]
+    extension: Extension, refit: JointFit, structure: Structure, step: float, location: Mapping[str, str]
 ) -> list[Finding]:
     """Return a finding for each input with a significant delay or lead; `step` is the sampling step [s]."""
     findings = []
     for name in extension.inputs:
         key = input_name("delay", name)
-        value, error, before = refit.values_by_name[key], refit.standard_errors[key], structure.delay.get(name, 0.0)
-        if abs(value - before) > MIN_DELAY_CHANGE_SIGMAS * error:
-            if before:
-                change = abs(value - before)
+        value, error, previous_delay = (
+            refit.values_by_name[key],
+            refit.standard_errors[key],
+            structure.delay.get(name, 0.0),
+        )
+        if abs(value - previous_delay) > MIN_DELAY_CHANGE_SIGMAS * error:
+            if previous_delay:
+                change = abs(value - previous_delay)
                 interval = {"low": max(value - change, -step), "high": value + change}
-                numbers = {"value": value, "error": error, "before": before, **interval}
-                findings.append(make_finding("delay_differs", input=name, **about, **numbers))
+                details = {"value": value, "error": error, "before": previous_delay, **interval}
+                findings.append(make_finding("delay_differs", input=name, **location, **details))
                 continue
-            numbers = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
+            details = {"value": abs(value), "error": error, "rows": abs(value) / step, "longest": 2.0 * abs(value)}
             code = "delay_fits" if value > 0.0 else "lead_fits"
-            findings.append(make_finding(code, input=name, **about, **numbers))
+            findings.append(make_finding(code, input=name, **location, **details))
     return findings
 
 
@@ -439,14 +451,14 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     delays = {n: structure.delay.get(n, 0.0) for n in names}
     delayed_structure = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in delays.items()})
-    begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in delays.items()}}
+    initial_values = {**joint.values_by_name, **{input_name("delay", n): d for n, d in delays.items()}}
     extensions: list[Extension] = []
 
-    def add(code: str, make: Callable[[], Structure], count: int, inputs: Sequence[str], **more: Any) -> None:
+    def add(code: str, build: Callable[[], Structure], count: int, inputs: Sequence[str], **options: Any) -> None:
         # Extensions that the structure does not allow are omitted, such as orders that no input may have beside a
         # square.
         with contextlib.suppress(FtlmError):
-            extensions.append(Extension(code, make(), count, inputs, **more))
+            extensions.append(Extension(code, build(), count, inputs, **options))
 
     def with_terms(terms: Sequence[Term]) -> Structure:
         return replace(structure, equations=(_with_terms(equation, terms),))
@@ -457,41 +469,48 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
         return replace(structure, equations=(_with_terms(_with_lag(equation, lag_name), terms),))
 
     coefficients = _unused_names("k", len(names), structure, runs[0])
-    more = [_next_derivative(equation, *pair) for pair in zip(names, coefficients, strict=True)]
-    terms_text = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
-    known_orders = not equation.order.weights and not any(t.order.weights for t in more)
-    former = f"{lag_name} D^{equation.order} {equation.output}"
-    unchanged = joint.values_by_name | dict.fromkeys(coefficients, 0.0)
-    fast = None
+    derivative_terms = [_next_derivative(equation, *pair) for pair in zip(names, coefficients, strict=True)]
+    terms_text = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in derivative_terms)
+    has_fixed_orders = not equation.order.weights and not any(t.order.weights for t in derivative_terms)
+    previous_term = f"{lag_name} D^{equation.order} {equation.output}"
+    equivalent_values = joint.values_by_name | dict.fromkeys(coefficients, 0.0)
+    fast_values = None
     if set(structure.coefficient_names) == {t.coefficient for t in equation.terms}:
         # A lag with a time constant of two samples multiplies all coefficients by its rate.
         rate = 0.5 / step
         rates = dict.fromkeys(structure.coefficient_names, rate)
-        fast = {lag_name: -rate} | {n: v * rates.get(n, 1.0) for n, v in unchanged.items()}
-    add("lag_fits", partial(with_lag, []), 1, names, local_start=fast, term_text=former)
-    add("delay_fits", lambda: delayed_structure, len(names), names, local_start=begin)
-    if known_orders and all(t.order.constant <= equation.order.constant for t in more):
-        add("zero_fits", partial(with_terms, more), len(more), names, local_start=unchanged, term_text=terms_text)
-    if known_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in more):
+        fast_values = {lag_name: -rate} | {n: v * rates.get(n, 1.0) for n, v in equivalent_values.items()}
+    add("lag_fits", partial(with_lag, []), 1, names, local_start=fast_values, term_text=previous_term)
+    add("delay_fits", lambda: delayed_structure, len(names), names, local_start=initial_values)
+    if has_fixed_orders and all(t.order.constant <= equation.order.constant for t in derivative_terms):
+        add(
+            "zero_fits",
+            partial(with_terms, derivative_terms),
+            len(derivative_terms),
+            names,
+            local_start=equivalent_values,
+            term_text=terms_text,
+        )
+    if has_fixed_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in derivative_terms):
         add(
             "mode_fits",
-            partial(with_lag, more),
-            1 + len(more),
+            partial(with_lag, derivative_terms),
+            1 + len(derivative_terms),
             names,
-            local_start=fast,
-            term_text=f"{former} + {terms_text}",
+            local_start=fast_values,
+            term_text=f"{previous_term} + {terms_text}",
         )
     values, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
-        ends = {
+        amplitudes = {
             "saturation": (MIN_SATURATION_SHARE * largest, largest),
             "dead_zone": (0.0, MAX_DEAD_ZONE_SHARE * largest),
         }
         effects: tuple[InputEffect, InputEffect] = ("saturation", "dead_zone")
         for effect in effects:
-            starts = [{**values, input_name(effect, name): share * largest} for share in LIMIT_GUESS_SHARES]
-            limits = {effect: {name: ends[effect]}}
+            starts = [{**values, input_name(effect, name): fraction * largest} for fraction in LIMIT_GUESS_SHARES]
+            limits = {effect: {name: amplitudes[effect]}}
             add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
         square = Term(name, Order(0.0), coefficient, expression=power(channel(name), 2.0))
         text, flat = f"{coefficient} {name}^2", {**values, coefficient: 0.0}
@@ -504,33 +523,36 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
     The second one is omitted if y never changes sign, because its friction is then nearly constant.
     """
-    (item,) = structure.equations
+    (equation,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
     # A simulation with friction starts from a level and a velocity.
     initial = "caputo" if isinstance(structure.initial, History) else structure.initial
     extensions = []
     values = joint.values_by_name
-    sizes = {n: max(float(np.nanmax(np.abs(run[n]))) for run in runs) for n in runs[0].inputs if n in item.signals}
-    drives = [
-        abs(t.factor * (values[t.coefficient] if isinstance(t.coefficient, str) else t.coefficient)) * sizes[t.signal]
-        for t in item.terms
-        if t.signal in sizes
+    amplitudes = {
+        n: max(float(np.nanmax(np.abs(run[n]))) for run in runs) for n in runs[0].inputs if n in equation.signals
+    }
+    forces = [
+        abs(t.factor * (values[t.coefficient] if isinstance(t.coefficient, str) else t.coefficient))
+        * amplitudes[t.signal]
+        for t in equation.terms
+        if t.signal in amplitudes
     ]
-    local_start = {**values, name: LOCAL_FRICTION_SHARE * max(drives)}
+    local_start = {**values, name: LOCAL_FRICTION_SHARE * max(forces)}
 
     def add(text: str, **changes: Any) -> None:
         # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
         with contextlib.suppress(FtlmError):
-            wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
-            extension = Extension("friction_fits", wider, 1, [], local_start=local_start, term_text=text)
+            extended = replace(structure, equations=(replace(equation, **changes),), initial=initial)
+            extension = Extension("friction_fits", extended, 1, [], local_start=local_start, term_text=text)
             extensions.append(replace(extension, positive_coefficient=name))
 
-    add(friction_term(item.output, name), coulomb=Friction(name))
-    slope = sign_tanh_slope([run[item.output] for run in runs])
+    add(friction_term(equation.output, name), coulomb=Friction(name))
+    slope = sign_tanh_slope([run[equation.output] for run in runs])
     if math.isfinite(slope):
-        smooth = apply("tanh", multiply(constant(slope), channel(item.output)))
-        term = Term(item.output, Order(0.0), name, factor=-1.0, expression=smooth)
-        add(friction_term(item.output, name, slope), terms=(*item.terms, term))
+        smooth_sign = apply("tanh", multiply(constant(slope), channel(equation.output)))
+        term = Term(equation.output, Order(0.0), name, factor=-1.0, expression=smooth_sign)
+        add(friction_term(equation.output, name, slope), terms=(*equation.terms, term))
     return extensions
 
 
@@ -541,11 +563,11 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
     parameter changes explain most of the residuals, and then fits the model with this load. Both are repeated until
     the time no longer changes or the residuals no longer decrease.
     """
-    (item,), (run, *others) = structure.equations, runs
-    if others or run.sample_times is not None:
+    (equation,), (run, *other_runs) = structure.equations, runs
+    if other_runs or run.sample_times is not None:
         return []
     (name,) = _unused_names("load", 1, structure, run)
-    wider = replace(structure, equations=(_with_terms(item, [Term(name, Order(0.0), name)]),))
+    extended = replace(structure, equations=(_with_terms(equation, [Term(name, Order(0.0), name)]),))
 
     def with_load(row: int) -> Run:
         return run_with_inputs(run, {name: np.where(np.arange(run.length) >= row, 1.0, 0.0)})
@@ -556,12 +578,12 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
             # The load is excluded here, so that the residuals alone determine its size.
             values = {n: values[n] for n in starts[0].names}
             row = _load_start_index(
-                *_residuals_at(values, structure, run), _load_response(item, structure, values, run)
+                *_residuals_at(values, structure, run), _load_response(equation, structure, values, run)
             )
             if row is None or row == best[1]:
                 break
-            fit = fit_output_error([with_load(row)], wider, start={name: 0.0, **values}, refine=False)
-            noise, values = fit.noise[item.output], fit.values_by_name
+            fit = fit_output_error([with_load(row)], extended, start={name: 0.0, **values}, refine=False)
+            noise, values = fit.noise[equation.output], fit.values_by_name
             if not noise < best[0]:
                 break
             best = noise, row, values
@@ -575,7 +597,7 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
     if not math.isfinite(noise):
         return []
     time = run.start + row * run.step
-    return [Extension("load_step_fits", wider, 2, [name], [values], runs=as_runs(with_load(row)), load_time=time)]
+    return [Extension("load_step_fits", extended, 2, [name], [values], runs=as_runs(with_load(row)), load_time=time)]
 
 
 def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -> tuple[Floats, Floats]:
@@ -587,19 +609,19 @@ def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -
     return np.asarray(point.outcome["residuals"]), np.asarray(point.outcome["jacobian"])
 
 
-def _load_response(item: Equation, structure: Structure, values: Mapping[str, float], run: Run) -> Floats:
+def _load_response(equation: Equation, structure: Structure, values: Mapping[str, float], run: Run) -> Floats:
     """Return the response of the output to a unit load that starts at sample 0, at samples 1 to N - 1 of the run.
 
     The load is added to the right-hand side of the equation, and `values` are the parameters by name.
     """
-    own = (t for t in item.terms if t.signal == item.output)
-    alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
-    single = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
-    single = single.with_orders({n: values[n] for n in single.order_names})
-    model = Model(single.with_coefficients({n: values[n] for n in single.coefficient_names}))
+    output_terms = (t for t in equation.terms if t.signal == equation.output)
+    loaded = replace(equation, terms=(*output_terms, Term("load", Order(0.0), 1.0)))
+    loaded_structure = replace(structure, equations=(loaded,), delay={}, free_delays={}, initial="rest", offset="none")
+    loaded_structure = loaded_structure.with_orders({n: values[n] for n in loaded_structure.order_names})
+    model = Model(loaded_structure.with_coefficients({n: values[n] for n in loaded_structure.coefficient_names}))
     ones, zeros = np.ones(run.length), np.zeros(run.length)
-    rest = Run.from_arrays(step=run.step, inputs={"load": ones}, outputs={item.output: zeros})
-    return simulate(model, rest)[item.output][1:]
+    unit_load = Run.from_arrays(step=run.step, inputs={"load": ones}, outputs={equation.output: zeros})
+    return simulate(model, unit_load)[equation.output][1:]
 
 
 def _load_start_index(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
@@ -617,33 +639,37 @@ def _load_start_index(residuals: Floats, sensitivities: Floats, response: Floats
     basis = orthonormal(sensitivities.T, 1e-12)
     series = series - basis @ (basis.T @ series)
     # Dot products with the response to a load from each sample on. Padding prevents circular correlation by the FFT.
-    padded = 2 * series.size
-    spectra = np.fft.rfft(np.column_stack([basis, series]), padded, axis=0)
-    products = np.fft.irfft(spectra * np.conj(np.fft.rfft(load, padded))[:, None], axis=0)[: series.size]
+    padded_length = 2 * series.size
+    spectra = np.fft.rfft(np.column_stack([basis, series]), padded_length, axis=0)
+    products = np.fft.irfft(spectra * np.conj(np.fft.rfft(load, padded_length))[:, None], axis=0)[: series.size]
     power = np.cumsum(load**2)[::-1]
     free_power = power - np.sum(products[:, :-1] ** 2, axis=1)
     is_free = free_power > LOAD_COLLINEARITY_TOLERANCE * power
-    explained = np.where(is_free, products[:, -1] ** 2 / np.where(is_free, free_power, 1.0), 0.0)[edge:-edge]
+    explained_power = np.where(is_free, products[:, -1] ** 2 / np.where(is_free, free_power, 1.0), 0.0)[edge:-edge]
     # A load from sample k on first affects sample k + 1, which is element k of these arrays.
-    return edge + int(np.argmax(explained)) if np.any(explained > 0.0) else None
+    return edge + int(np.argmax(explained_power)) if np.any(explained_power > 0.0) else None
 
 
-def _with_lag(item: Equation, coefficient: str) -> Equation:
+def _with_lag(equation: Equation, coefficient: str) -> Equation:
     """Return an equation whose dynamics have one further lag.
 
     The order of the left-hand side rises by 1, and its former derivative becomes a term with the named coefficient.
     """
-    return replace(item, order=item.order + Order(1.0), terms=(Term(item.output, item.order, coefficient), *item.terms))
+    return replace(
+        equation,
+        order=equation.order + Order(1.0),
+        terms=(Term(equation.output, equation.order, coefficient), *equation.terms),
+    )
 
 
-def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
+def _with_terms(equation: Equation, terms: Sequence[Term]) -> Equation:
     """Return an equation with additional terms."""
-    return replace(item, terms=(*item.terms, *terms))
+    return replace(equation, terms=(*equation.terms, *terms))
 
 
-def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
+def _next_derivative(equation: Equation, name: str, coefficient: str) -> Term:
     """Return a term of the input `name` whose order is 1 above the highest order of that input in the equation."""
-    highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
+    highest = max((t.order for t in equation.terms if t.signal == name), key=lambda order: order.constant)
     return Term(name, highest + Order(1.0), coefficient)
 
 
@@ -657,7 +683,7 @@ def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, add
     total, samples = 0.0, 0
     sensitivities = output_sensitivities(joint, structure, runs)
     for name in joint.noise:
-        series = [joint.noise[name] * part[name] for part in joint.residuals]
+        series = [joint.noise[name] * run_residuals[name] for run_residuals in joint.residuals]
         series = NoiseModel.fit(series, [], DEFAULT_LAGS).subtract(series, sensitivities.get(name, []))
         _, _, innovations, parameters = _core.arx_model(series, [], DEFAULT_LAGS)
         innovation = np.concatenate(innovations)
@@ -693,10 +719,10 @@ def _passes_residual_tests(extension_fit: FittedExtension, default_runs: Runs) -
     return not failed and not any(o.follows_direction for o in outputs)
 
 
-def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset], JointFit]) -> list[Finding]:
+def undetermined_start_findings(fit: Fit, known_fits: Mapping[tuple[Initial, Offset], JointFit]) -> list[Finding]:
     """Return a finding if other initial conditions fit the runs equally well but give another steady-state gain.
 
-    `known` has the fits that exist already, by (initial conditions, offset). Other alternatives are fitted here.
+    `known_fits` has the fits that exist already, by (initial conditions, offset). Other alternatives are fitted here.
     """
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
@@ -710,7 +736,7 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
     if joint.exact_outputs(runs) == set(joint.noise):
         # A ratio of rounding errors is meaningless.
         return []
-    own_setting = joint.initial if joint.initial == "rest" else "caputo", structure.offset
+    fitted_setting = joint.initial if joint.initial == "rest" else "caputo", structure.offset
 
     def squares_ratio(other: JointFit) -> float:
         return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
@@ -718,31 +744,31 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
     def fits_alike(other: JointFit) -> bool:
         return squares_ratio(other) <= MAX_SQUARES_RATIO
 
-    own = _gains(joint, structure)
+    fitted_gains = _gains(joint, structure)
     worst: tuple[float, Finding] | None = None
-    for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
-        if (initial, offset) == own_setting:
+    for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if fitted_gains else ():
+        if (initial, offset) == fitted_setting:
             continue
-        other = known.get((initial, offset))
+        other = known_fits.get((initial, offset))
         if other is None:
             request = replace(structure, initial=initial, offset=offset)
             other = refit_after_screening(joint, runs, request, fits_alike, refine=False)
         if other is None or other.unstable_optimum is not None or not fits_alike(other):
             continue
         for pair, (gain, error) in _gains(other, structure).items():
-            own_gain, own_error = own.get(pair, (math.nan, math.nan))
-            distance = abs(gain - own_gain) / max(math.hypot(error, own_error), 1e-300)
-            far = abs(gain - own_gain) > MIN_GAIN_CHANGE * max(abs(gain), abs(own_gain))
-            if far and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
+            fitted_gain, fitted_error = fitted_gains.get(pair, (math.nan, math.nan))
+            distance = abs(gain - fitted_gain) / max(math.hypot(error, fitted_error), 1e-300)
+            is_different = abs(gain - fitted_gain) > MIN_GAIN_CHANGE * max(abs(gain), abs(fitted_gain))
+            if is_different and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
                 ratio = squares_ratio(other)
-                numbers = {"gain": own_gain, "error": own_error, "other_gain": gain, "other_error": error}
-                words = {
-                    "taken": _initial_condition_text(*own_setting),
+                details = {"gain": fitted_gain, "error": fitted_error, "other_gain": gain, "other_error": error}
+                texts = {
+                    "taken": _initial_condition_text(*fitted_setting),
                     "other": _initial_condition_text(initial, offset),
                     "ratio": ratio,
                 }
-                about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
-                worst = distance, make_finding("gain_depends_on_initial_conditions", **about, **numbers, **words)
+                location = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
+                worst = distance, make_finding("gain_depends_on_initial_conditions", **location, **details, **texts)
     return [worst[1]] if worst else []
 
 

@@ -57,16 +57,16 @@ class Fit:
 
 
 def make_model(
-    task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any
+    task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **estimate_details: Any
 ) -> Model:
     """Return a model of a structure with fixed orders and coefficients, which records its method and runs.
 
-    `m` is the number of block pulses. `about` adds entries to the field `about` of the model.
+    `m` is the number of block pulses. `estimate_details` adds entries to the field `estimate_details` of the model.
     """
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
-    steps = {run.step for run in task.runs}
-    step_entry = {"step": steps.pop()} if len(steps) == 1 else {}
-    details = {"method": method, "runs": ", ".join(r.name for r in task.runs), **step_entry, **about}
+    step_sizes = {run.step for run in task.runs}
+    step_entry = {"step": step_sizes.pop()} if len(step_sizes) == 1 else {}
+    details = {"method": method, "runs": ", ".join(r.name for r in task.runs), **step_entry, **estimate_details}
     return Model(structure, orders=orders, units=units, m=m, about=details)
 
 

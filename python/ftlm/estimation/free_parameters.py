@@ -96,9 +96,9 @@ class FreeProblem:
         """
         return self.core.bounds
 
-    def feasible_point(self, at: Floats, towards: Floats) -> Floats:
+    def feasible_point(self, at: Floats, target: Floats) -> Floats:
         """Return the last point within all constraints on the line from a feasible point to another point."""
-        return self.core.feasible(at, towards)
+        return self.core.feasible(at, target)
 
     def coefficients_by_name(self, values: Sequence[float]) -> dict[str, float]:
         """Return all coefficients of the structure by name, from the values of the free ones."""
@@ -116,28 +116,30 @@ class FreeProblem:
         if present, followed by coefficient and speed of a Stribeck term. Input parameters have no rows.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
-        count, idle = len(self.orders), len(self.inputs)
+        count, input_count = len(self.orders), len(self.inputs)
         rows = []
 
         def of_order(order: Order) -> Floats:
-            return np.array(affine(order, self.orders)[1] + [0.0] * (len(free) + idle))
+            return np.array(affine(order, self.orders)[1] + [0.0] * (len(free) + input_count))
 
-        for item in self.structure.equations:
-            rows.append(of_order(item.order))
-            for term in item.terms:
-                row = np.zeros(count + len(free) + idle)
+        for equation in self.structure.equations:
+            rows.append(of_order(equation.order))
+            for term in equation.terms:
+                row = np.zeros(count + len(free) + input_count)
                 if isinstance(term.coefficient, str):
                     sign, factors = self.products.get(term.coefficient, (1.0, (term.coefficient,)))
                     for k, name in enumerate(factors):
-                        others = [free[f] for j, f in enumerate(factors) if j != k]
-                        row[count + list(free).index(name)] += term.factor * sign * math.prod(others)
+                        other_factors = [free[f] for j, f in enumerate(factors) if j != k]
+                        row[count + list(free).index(name)] += term.factor * sign * math.prod(other_factors)
                 rows += [of_order(term.order), row]
-            friction, stribeck = item.friction, None if item.friction is None else item.friction.stribeck
-            numbers = [] if friction is None else [friction.coefficient]
-            for number in numbers + ([] if stribeck is None else [stribeck.coefficient, stribeck.speed]):
-                row = np.zeros(count + len(free) + idle)
-                if isinstance(number, str):
-                    row[count + list(free).index(number)] = 1.0
+            friction, stribeck = equation.friction, None if equation.friction is None else equation.friction.stribeck
+            friction_parameters = [] if friction is None else [friction.coefficient]
+            for friction_parameter in friction_parameters + (
+                [] if stribeck is None else [stribeck.coefficient, stribeck.speed]
+            ):
+                row = np.zeros(count + len(free) + input_count)
+                if isinstance(friction_parameter, str):
+                    row[count + list(free).index(friction_parameter)] = 1.0
                 rows.append(row)
         return np.stack(rows)
 
@@ -149,8 +151,8 @@ def core_arguments(structure: Structure) -> Any:
     # The free parameters do not depend on an offset that is not decided yet.
     offset: Offset = "none" if structure.offset == "auto" else structure.offset
 
-    def order(of: Order) -> tuple[float, list[tuple[str, float]]]:
-        return of.constant, list(of.weights)
+    def order(value: Order) -> tuple[float, list[tuple[str, float]]]:
+        return value.constant, list(value.weights)
 
     def friction(term: Friction | None) -> list[tuple[float, str | float]] | None:
         if term is None:
@@ -218,23 +220,23 @@ def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[s
             raise ModelError(
                 f"{parameter('start')} has {name} = {value:g}, out of its bounds {low:g} to {high:g}; widen them"
             )
-    places: dict[str, list[float]] = {}
+    grid_values: dict[str, list[float]] = {}
     for name, (low, high) in bounds.items():
         if name in guess:
-            places[name] = [float(guess[name])]
+            grid_values[name] = [float(guess[name])]
         elif name in problem.orders:
-            places[name] = [v for v in DEFAULT_START_ORDERS if low <= v <= high] or [0.5 * (low + high)]
+            grid_values[name] = [v for v in DEFAULT_START_ORDERS if low <= v <= high] or [0.5 * (low + high)]
         else:
-            places[name] = [0.0 if low <= 0.0 <= high else low if math.isfinite(low) else high]
-    points = itertools.islice(itertools.product(*places.values()), MAX_WARM_STARTS)
-    return [dict(zip(places, point, strict=True)) for point in points]
+            grid_values[name] = [0.0 if low <= 0.0 <= high else low if math.isfinite(low) else high]
+    points = itertools.islice(itertools.product(*grid_values.values()), MAX_WARM_STARTS)
+    return [dict(zip(grid_values, point, strict=True)) for point in points]
 
 
-def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float]) -> dict[str, float]:
+def values_of_model(problem: FreeProblem, model: Model, additional_values: Mapping[str, float]) -> dict[str, float]:
     """Return the values that a model of the same outputs assigns to the free parameters of a problem, by name.
 
-    `more` adds values of the factors of a coefficient law. A fixed order of the model gives a value to the free order
-    of the term that has the same coefficient.
+    `additional_values` adds values of the factors of a coefficient law. A fixed order of the model gives a value to the
+    free order of the term that has the same coefficient.
 
     Raises
     ------
@@ -242,20 +244,20 @@ def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float
         If the model has an output that the problem lacks.
     """
     check_known("output of start", model.outputs, problem.structure.outputs)
-    values = {**model.orders, **model.coefficients, **more}
+    values = {**model.orders, **model.coefficients, **additional_values}
     items = {e.output: e for e in model.equations}
 
     def set_order(order: Order, value: Order) -> None:
         if order.is_single and not value.names:
             values.setdefault(order.names[0], value.constant)
 
-    for item in problem.structure.equations:
-        other = items.get(item.output)
+    for equation in problem.structure.equations:
+        other = items.get(equation.output)
         if other is None:
             continue
-        set_order(item.order, other.order)
+        set_order(equation.order, other.order)
         terms_by_name = {t.name: t for t in other.terms if t.name is not None}
-        for term in item.terms:
+        for term in equation.terms:
             if term.coefficient in terms_by_name:
                 set_order(term.order, terms_by_name[str(term.coefficient)].order)
     return {n: v for n, v in values.items() if n in problem.names}
@@ -267,23 +269,26 @@ COLLINEARITY_TOLERANCE = 1e-9
 
 def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return a message that names two proportional inputs which enter one equation with the same order, or None."""
-    for item in structure.equations:
-        linear = [t for t in item.terms if t.nonlinear is None]
-        driving = [
+    for equation in structure.equations:
+        linear = [t for t in equation.terms if t.nonlinear is None]
+        input_terms = [
             t
             for t in linear
-            if t.signal != item.output and isinstance(t.coefficient, str) and all(t.signal in run for run in runs)
+            if t.signal != equation.output and isinstance(t.coefficient, str) and all(t.signal in run for run in runs)
         ]
-        for one, other in itertools.combinations(driving, 2):
-            if one.signal == other.signal or one.order != other.order:
+        for term, other_term in itertools.combinations(input_terms, 2):
+            if term.signal == other_term.signal or term.order != other_term.order:
                 continue
-            first, second = (np.concatenate([interpolate_gaps(run[t.signal]) for run in runs]) for t in (one, other))
-            size = dot(first, first)
-            ratio = dot(first, second) / size if size > 0 else 0.0
+            first, second = (
+                np.concatenate([interpolate_gaps(run[t.signal]) for run in runs]) for t in (term, other_term)
+            )
+            power = dot(first, first)
+            ratio = dot(first, second) / power if power > 0 else 0.0
             if vector_norm(second - ratio * first) <= COLLINEARITY_TOLERANCE * vector_norm(second):
                 return (
-                    f"{other.signal} is {ratio:.6g} times {one.signal} on every run, so their effects are not "
-                    f"separately identifiable: leave out the term of {other.coefficient} or that of {one.coefficient}, "
+                    f"{other_term.signal} is {ratio:.6g} times {term.signal} on every run, so their effects are not "
+                    f"separately identifiable: leave out the term of {other_term.coefficient} or that of "
+                    f"{term.coefficient}, "
                     "fix one of them, or add a run in which the two signals differ"
                 )
     return None

@@ -122,23 +122,25 @@ def identify_frequency(
         return _identify_circuit(
             as_frequency_data(data), structure, weights, fixed, bounds, start, progress, orders, delay
         )
-    wanted_structure, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
-    records = _match_records(as_frequency_data(data), wanted_structure)
+    full_structure, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
+    records = _match_records(as_frequency_data(data), full_structure)
     kind, weight = _weights(records, weights)
-    _user_start(ResponseProblem(wanted_structure, records, weight), start)
+    _user_start(ResponseProblem(full_structure, records, weight), start)
 
-    def fit(form: Structure, only: Mapping[str, float] | None) -> tuple[FrequencyIdentification, Mapping[str, float]]:
-        problem = ResponseProblem(form, records, weight)
-        guess_source = start if only is None else only
+    def fit(
+        variant: Structure, single_guess: Mapping[str, float] | None
+    ) -> tuple[FrequencyIdentification, Mapping[str, float]]:
+        problem = ResponseProblem(variant, records, weight)
+        guess_source = start if single_guess is None else single_guess
         guess = (
             {n: v for n, v in guess_source.items() if n in problem.names}
             if isinstance(guess_source, Mapping)
             else guess_source
         )
-        result = _fit_response(problem, records, weight, kind, guess, progress, alone=only is not None)
+        result = _fit_response(problem, records, weight, kind, guess, progress, single_start=single_guess is not None)
         return result, result.values
 
-    result, bound_findings = fit_within_bounds(wanted_structure, limits, fit)
+    result, bound_findings = fit_within_bounds(full_structure, limits, fit)
     result = replace(result, findings=(*result.findings, *bound_findings))
     return _log_result(result)
 
@@ -146,8 +148,8 @@ def identify_frequency(
 def _log_result(result: FrequencyIdentification) -> FrequencyIdentification:
     """Write the verdict and the findings of a result to the log, and return the result."""
     PACKAGE_LOGGER.info("identified: %s", result.verdict)
-    for item in result.findings:
-        PACKAGE_LOGGER.warning("%s", item)
+    for finding in result.findings:
+        PACKAGE_LOGGER.warning("%s", finding)
     return result
 
 
@@ -159,14 +161,14 @@ def _identify_circuit(
     bounds: Bounds | None,
     start: Mapping[str, float] | None,
     progress: Callable[[int, int], None] | None,
-    *others: object,
+    *inapplicable: object,
 ) -> FrequencyIdentification:
     """Identify the parameters of a circuit from measured impedances.
 
-    Raise ModelError if a name is unknown, a bound is invalid, no parameter is free, or one of `others` is given: the
-    options `orders` and `delay`, which apply to equations.
+    Raise ModelError if a name is unknown, a bound is invalid, no parameter is free, or one of `inapplicable` is given:
+    the options `orders` and `delay`, which apply to equations.
     """
-    if any(others):
+    if any(inapplicable):
         raise ModelError(
             f"{parameter('orders')} and {parameter('delay')} apply to equations; give exponents of a circuit with "
             f"{parameter('fixed')} or {parameter('bounds')}"
@@ -181,7 +183,7 @@ def _identify_circuit(
     labeled = [replace(r, output=r.output or "U", input=r.input or "I", unit=r.unit or "Ω") for r in records]
     kind, weight = _weights(labeled, weights)
     problem = CircuitProblem(circuit, labeled, weight, bounds or {})
-    return _log_result(_fit_response(problem, labeled, weight, kind, start, progress, alone=False))
+    return _log_result(_fit_response(problem, labeled, weight, kind, start, progress, single_start=False))
 
 
 def _fit_response(
@@ -192,26 +194,28 @@ def _fit_response(
     start: Mapping[str, float] | None,
     progress: Callable[[int, int], None] | None,
     *,
-    alone: bool,
+    single_start: bool,
 ) -> FrequencyIdentification:
-    """Fit a response problem from automatic guesses and the user's guess; with `alone`, only from the user's guess.
+    """Fit a response problem from automatic guesses and the user's guess; with `single_start`, only from the latter.
 
     Raise DataError if there are no more measured values than parameters. Raise ConvergenceError if no initial guess has
     a finite response.
     """
-    count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
-    if count <= numbers:
+    count, parameter_count = 2 * sum(r.frequency.size for r in records), len(problem.names)
+    if count <= parameter_count:
         raise DataError(
-            f"{count // 2} frequencies give {count} values, and {numbers} parameters are free "
+            f"{count // 2} frequencies give {count} values, and {parameter_count} parameters are free "
             f"({', '.join(problem.names)}); measure more frequencies, or fix parameters"
         )
     if isinstance(progress, Progress):
         progress.expect(
             "the fit",
-            *duration_bounds(estimate_duration(0.007 * numbers**2 + 2e-6 * numbers * count, 1), DURATION_FACTOR_RANGE),
+            *duration_bounds(
+                estimate_duration(0.007 * parameter_count**2 + 2e-6 * parameter_count * count, 1), DURATION_FACTOR_RANGE
+            ),
         )
     tracker = ShareTracker(progress)
-    words = problem.constraints()[2]
+    descriptions = problem.constraints()[2]
     PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
     # The multistart uses a subset of the frequencies. Only its best candidate is fitted to all of them.
@@ -224,7 +228,7 @@ def _fit_response(
         else problem.with_records(subsampled_records, subsampled_weights)
     )
     guesses = _user_start(multistart_problem, start)
-    guesses += [] if alone else multistart_problem.initial_guesses()
+    guesses += [] if single_start else multistart_problem.initial_guesses()
     tracker.advance_to(STARTS_END_FRACTION)
     fits = []
     for values in guesses:
@@ -238,22 +242,22 @@ def _fit_response(
             "no initial guess has a finite response: the order grid is empty or singular; widen "
             f"{parameter('orders')} or {parameter('bounds')} above 0, or give {parameter('start')}"
         )
-    first = min(fits, key=lambda f: f.cost)
-    reached = sum(
-        f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
+    lowest = min(fits, key=lambda f: f.cost)
+    reached_count = sum(
+        f.cost <= lowest.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
     # Another fit from the best optimum continues steps that a bound has shortened.
-    best = _fit_again(problem, multistart_problem, first)
-    if multistart_problem is problem and first.cost < best.cost:
-        best = first
-    if start is None and np.any((placed := problem.sort_groups(best.values)) != best.values):
-        best = _fit(problem, placed)
+    best = _fit_again(problem, multistart_problem, lowest)
+    if multistart_problem is problem and lowest.cost < best.cost:
+        best = lowest
+    if start is None and np.any((sorted_values := problem.sort_groups(best.values)) != best.values):
+        best = _fit(problem, sorted_values)
     tracker.advance_to(1.0)
-    active_bounds = [words[k] for k in best.active_constraints]
+    active_bounds = [descriptions[k] for k in best.active_constraints]
     at_limit = [bound for bound in active_bounds if bound.parameter in problem.exponents]
     if at_limit and not _is_bound_significant(problem, records, best, kind):
         active_bounds = [bound for bound in active_bounds if bound not in at_limit]
-    ends = [
+    near_optima = [
         f if multistart_problem is problem else _fit_again(problem, multistart_problem, f)
         for f in _near_optima(fits, multistart_problem, kind)
     ]
@@ -262,10 +266,10 @@ def _fit_response(
         records,
         best,
         kind,
-        (reached, len(fits)),
+        (reached_count, len(fits)),
         active_bounds,
         exact=best.cost <= ROUNDING_RESIDUAL_RATIO**2 * total,
-        ends=ends,
+        near_optima=near_optima,
     )
 
 
@@ -288,14 +292,14 @@ def _structure(
     if fixed:
         check_known("fixed coefficient", fixed, target.coefficient_names)
     target = target.with_delays(delay or {}).with_orders(orders or {}).with_coefficients(fixed or {})
-    lacking = "which a fit of a frequency response does not support"
+    reason = "which a fit of a frequency response does not support"
     if target.has_friction:
-        raise ModelError(f"the equations have friction, {lacking}; identify runs over time, or leave it out")
+        raise ModelError(f"the equations have friction, {reason}; identify runs over time, or leave it out")
     check_linear(target.equations, "a frequency response")
     if target.limits:
-        raise ModelError(f"{target.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
+        raise ModelError(f"{target.limits[0].signal} saturates or has a dead zone, {reason}; identify runs over time")
     if target.offset != "none":
-        raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or {parameter('offset')}")
+        raise ModelError(f"the equations have an offset, {reason}; leave '+ c' out, or {parameter('offset')}")
     if target.sensor_filter is not None:
         raise ModelError("the structure has a sensor filter; divide the data by its response, and leave the filter out")
     if target.coefficient_law:
@@ -326,22 +330,23 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
         raise ModelError(f"the equations of {', '.join(outputs)} have no input; add an input term, as in '+ b0 u'")
     matches = []
     for record in records:
-        own = {"output": record.output, "input": record.input}
+        signals = {"output": record.output, "input": record.input}
         for side, names in (("output", outputs), ("input", inputs)):
-            if not own[side]:
+            if not signals[side]:
                 if len(names) > 1:
                     raise DataError(
                         f"{record.name} does not name its {side}, and the equations have {', '.join(names)}; give "
                         f"{parameter(side)} when loading it"
                     )
-                own[side] = names[0]
-            elif own[side] not in names:
+                signals[side] = names[0]
+            elif signals[side] not in names:
                 raise DataError(
-                    f"{record.name} has the {side} {own[side]!r}, which is not an {side} of the equations; these have "
+                    f"{record.name} has the {side} {signals[side]!r}, which is not an {side} of the equations; "
+                    "these have "
                     f"{', '.join(names)}: write the equation in the names of the data, or give {parameter(side)} when "
                     "loading"
                 )
-        matches.append(replace(record, output=own["output"], input=own["input"]))
+        matches.append(replace(record, output=signals["output"], input=signals["input"]))
     for output in outputs:
         if not any(r.output == output for r in matches):
             raise DataError(
@@ -375,21 +380,22 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
         )
     deviations = [r.deviation for r in records]
     if weights == "deviation" or (weights == "auto" and all(d is not None for d in deviations)):
-        without = [r.name for r, d in zip(records, deviations, strict=True) if d is None]
-        if without:
+        unweighted = [r.name for r, d in zip(records, deviations, strict=True) if d is None]
+        if unweighted:
             raise DataError(
-                f"{without[0]} states no standard deviation; use {parameter('weights', 'relative')} or give "
+                f"{unweighted[0]} states no standard deviation; use {parameter('weights', 'relative')} or give "
                 f"{parameter('deviation')}"
             )
         return "deviation", [1.0 / d for d in deviations if d is not None]
     if weights == "uniform":
         return "uniform", [np.ones(r.frequency.size) for r in records]
     for record in records:
-        size = np.abs(record.response)
-        if not np.all(size > 0):
-            at = int(np.argmin(size))
+        magnitude = np.abs(record.response)
+        if not np.all(magnitude > 0):
+            at = int(np.argmin(magnitude))
             raise DataError(
-                f"{record.name}: the response is 0 at row {at}, {int(np.sum(size == 0))} in all, and has no relative "
+                f"{record.name}: the response is 0 at row {at}, {int(np.sum(magnitude == 0))} in all, and has no "
+                "relative "
                 f"weight; leave such rows out, or use {parameter('weights', 'uniform')}"
             )
     return "relative", [1.0 / np.abs(r.response) for r in records]
@@ -432,8 +438,8 @@ def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> 
     if not isinstance(start, Mapping):
         raise ModelError(f"start is {type(start).__name__}; give values by name, such as {{'alpha': 0.8}}")
     check_known("start", start, problem.names)
-    usual = problem.default_start()
-    values = np.array([float(start.get(n, usual.get(n, 0.0))) for n in problem.names])
+    defaults = problem.default_start()
+    values = np.array([float(start.get(n, defaults.get(n, 0.0))) for n in problem.names])
     point, (rows, limits, _) = problem.in_problem_units(values), problem.constraints()
     if not (np.all(np.isfinite(values)) and np.all(rows @ point <= limits + 1e-9)):
         raise ModelError(
@@ -458,15 +464,15 @@ class ResponseFit:
 
 def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
     rows, limits, _ = problem.constraints()
-    size = math.sqrt(sum(float(np.sum(np.abs(r.response * r.weight) ** 2)) for r in problem.records))
+    norm = math.sqrt(sum(float(np.sum(np.abs(r.response * r.weight) ** 2)) for r in problem.records))
 
-    def residuals(numbers: Floats) -> Floats:
-        return problem.residuals(numbers, jacobian=False)[0]
+    def residuals(point: Floats) -> Floats:
+        return problem.residuals(point, jacobian=False)[0]
 
     if not np.all(np.isfinite(residuals(values))):
         return ResponseFit(values, math.inf, False, ())
     optimum, cost, status, _, active = _core.minimize(
-        residuals, lambda numbers: problem.residuals(numbers)[1], values, rows, limits, signal_norm=size
+        residuals, lambda point: problem.residuals(point)[1], values, rows, limits, signal_norm=norm
     )
     return ResponseFit(optimum, cost, status == "converged", active)
 
@@ -480,19 +486,19 @@ def _optimum_and_cost(problem: ResponseProblem, values: Floats) -> tuple[Floats,
     return fit.values, fit.cost
 
 
-def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
-    """Fit `problem`, starting from `end`, the optimum of a problem `other` that has the same parameters."""
-    return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
+def _fit_again(problem: ResponseProblem, first_problem: ResponseProblem, optimum: ResponseFit) -> ResponseFit:
+    """Fit `problem`, starting from `optimum`, the optimum of a problem `first_problem` that has the same parameters."""
+    return _fit(problem, problem.in_problem_units(first_problem.in_seconds(optimum.values)))
 
 
-def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) -> float:
-    """Return the decrease of the log likelihood when the sum of `count` squared residuals rises from `best` to `cost`.
+def _log_likelihood_difference(cost: float, lowest_cost: float, kind: str, count: int) -> float:
+    """Return the log-likelihood decrease when the sum of `count` squared residuals rises from `lowest_cost` to `cost`.
 
     The noise level is known for weights of the `kind` ``"deviation"``, and otherwise estimated.
     """
     if kind == "deviation":
-        return (cost - best) / 2.0
-    return 0.5 * count * math.log(max(cost, 1e-300) / max(best, 1e-300))
+        return (cost - lowest_cost) / 2.0
+    return 0.5 * count * math.log(max(cost, 1e-300) / max(lowest_cost, 1e-300))
 
 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
@@ -526,71 +532,71 @@ def _result(
     records: list[FrequencyData],
     best: ResponseFit,
     kind: str,
-    reached: tuple[int, int],
+    start_counts: tuple[int, int],
     active_bounds: list[ConstraintText],
     *,
     exact: bool,
-    ends: Sequence[ResponseFit] = (),
+    near_optima: Sequence[ResponseFit] = (),
 ) -> FrequencyIdentification:
     values = problem.in_seconds(best.values)
     rising = _frequency_order(records)
     residual_values = problem.residuals(best.values)[0][rising]
     series = _series(records, residual_values)
-    pinned = problem.on_user_bound(best.active_constraints)
-    kept = np.array([n not in pinned for n in problem.names], dtype=bool)
-    names = tuple(n for n in problem.names if n not in pinned)
+    names_on_bound = problem.names_on_user_bound(best.active_constraints)
+    is_free = np.array([n not in names_on_bound for n in problem.names], dtype=bool)
+    names = tuple(n for n in problem.names if n not in names_on_bound)
     free = residual_values.size - len(names)
     chi = best.cost / free
-    too_large = kind == "deviation" and best.cost > chi_squared_99(free)
+    is_cost_too_large = kind == "deviation" and best.cost > chi_squared_99(free)
     findings: list[Finding] = []
 
-    def covariance_at(end: ResponseFit) -> Floats:
-        residuals, jacobian = problem.residuals(end.values)
-        steep = problem.jacobian_in_seconds(end.values, jacobian)[rising][:, kept]
-        if kind == "deviation" and not too_large:
-            return covariance_of(steep.T, [np.zeros(e.size) for e in series], float(free))
-        return covariance_of(steep.T, _series(records, residuals[rising]), end.cost)
+    def covariance_at(optimum: ResponseFit) -> Floats:
+        residuals, jacobian = problem.residuals(optimum.values)
+        free_jacobian = problem.jacobian_in_seconds(optimum.values, jacobian)[rising][:, is_free]
+        if kind == "deviation" and not is_cost_too_large:
+            return covariance_of(free_jacobian.T, [np.zeros(e.size) for e in series], float(free))
+        return covariance_of(free_jacobian.T, _series(records, residuals[rising]), optimum.cost)
 
     def errors_of(covariance: Floats) -> dict[str, float]:
         return dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
 
     covariance = covariance_at(best)
-    white = exact or all(is_white(e, min(WHITENESS_LAGS, max(e.size // 4, 1))) for e in series)
-    factor = float(_student(free)) if kind != "deviation" or too_large else NormalDist().inv_cdf(0.975)
+    is_whitened = exact or all(is_white(e, min(WHITENESS_LAGS, max(e.size // 4, 1))) for e in series)
+    factor = float(_student(free)) if kind != "deviation" or is_cost_too_large else NormalDist().inv_cdf(0.975)
     standard = errors_of(covariance)
-    if too_large:
+    if is_cost_too_large:
         findings.append(make_finding("deviations_exceeded", ratio=math.sqrt(chi)))
-    if not white:
+    if not is_whitened:
         findings.append(make_finding("response_not_white"))
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
     likelihood_differences = [
-        (end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in ends
+        (end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in near_optima
     ]
     optima = [
-        (problem.in_seconds(end.values)[kept], difference, errors_of(covariance_at(end)))
+        (problem.in_seconds(end.values)[is_free], difference, errors_of(covariance_at(end)))
         for end, difference in likelihood_differences
         if difference <= SECOND_OPTIMUM_LOG_LIKELIHOOD
     ]
-    findings += second_optimum_findings(names, values[kept], standard, optima)
+    findings += second_optimum_findings(names, values[is_free], standard, optima)
     values_by_name = dict(zip(problem.names, values.tolist(), strict=True))
     intervals = problem.intervals(values, {n: factor * standard.get(n, math.nan) for n in problem.names})
     intervals = {n: intervals[n] for n in names}
     model: Model | Circuit
-    absent: list[tuple[str, str]] = []
+    compatible_limits: list[tuple[str, str]] = []
     if isinstance(problem, CircuitProblem):
         model = problem.circuit.with_values(values_by_name)
-        noise = 1.0 if kind == "deviation" and not too_large else chi
-        own, absent = profile_intervals(
+        noise = 1.0 if kind == "deviation" and not is_cost_too_large else chi
+        profiles, compatible_limits = profile_intervals(
             problem, records, (best.values, best.cost), standard, noise, factor, _optimum_and_cost
         )
-        intervals |= own
-        for name, limit in absent:
-            low, high = (format_bound(v, ".3g") for v in own[name])
+        intervals |= profiles
+        for name, limit in compatible_limits:
+            low, high = (format_bound(v, ".3g") for v in profiles[name])
             findings.append(make_finding("parameter_at_limit", parameter=name, limit=limit, low=low, high=high))
     else:
         model = _model(problem, records, values_by_name, values, covariance, standard, findings)
-    reported = [name for name, _ in absent]
+    reported_names = [name for name, _ in compatible_limits]
     for bound in active_bounds:
         limited = bound.parameter or ""
         if (
@@ -598,11 +604,13 @@ def _result(
             and limited in problem.orders
             and values_by_name[limited] == MAX_EXPONENT
         ):
-            words = {"element": limited.removesuffix("_alpha"), "capacitor": problem.capacitor_of(limited)}
-            findings.append(make_finding("cpe_is_capacitor", parameter=limited, **words))
-        elif limited not in reported:
+            texts = {"element": limited.removesuffix("_alpha"), "capacitor": problem.capacitor_of(limited)}
+            findings.append(make_finding("cpe_is_capacitor", parameter=limited, **texts))
+        elif limited not in reported_names:
             findings.append(make_finding("response_on_bound", bound=bound.text))
-    findings += _identifiability_findings(problem, {n: values_by_name[n] for n in names if n not in reported}, standard)
+    findings += _identifiability_findings(
+        problem, {n: values_by_name[n] for n in names if n not in reported_names}, standard
+    )
     return FrequencyIdentification(
         model,
         tuple(records),
@@ -614,8 +622,8 @@ def _result(
         covariance,
         chi if kind == "deviation" else None,
         best.converged,
-        reached,
-        white,
+        start_counts,
+        is_whitened,
         tuple(findings),
         information=_information(problem, best.cost, kind),
     )
@@ -626,13 +634,13 @@ def _information(problem: ResponseProblem, cost: float, kind: str) -> Informatio
 
     The noise level counts as a parameter unless standard deviations are given.
     """
-    sizes = [math.log(w) for record in problem.records for w in record.weight.tolist()]
-    count = 2 * len(sizes)
+    log_weights = [math.log(w) for record in problem.records for w in record.weight.tolist()]
+    count = 2 * len(log_weights)
     if kind == "deviation":
-        spread, parameters = cost, len(problem.names)
+        residual_scale, parameters = cost, len(problem.names)
     else:
-        spread, parameters = count * (math.log(max(cost, 1e-300) / count) + 1.0), len(problem.names) + 1
-    likelihood = 2.0 * sum(sizes) - 0.5 * (count * math.log(2.0 * math.pi) + spread)
+        residual_scale, parameters = count * (math.log(max(cost, 1e-300) / count) + 1.0), len(problem.names) + 1
+    likelihood = 2.0 * sum(log_weights) - 0.5 * (count * math.log(2.0 * math.pi) + residual_scale)
     return criteria_of_likelihood(likelihood, parameters, count)
 
 
@@ -641,19 +649,19 @@ def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
 
     The vector has all real parts, then all imaginary parts.
     """
-    places, at = [], 0
+    frequencies, at = [], 0
     for record in records:
-        places.append(at + np.argsort(record.frequency, kind="stable"))
+        frequencies.append(at + np.argsort(record.frequency, kind="stable"))
         at += record.frequency.size
-    every = np.concatenate(places)
-    return np.concatenate([every, at + every])
+    all_frequencies = np.concatenate(frequencies)
+    return np.concatenate([all_frequencies, at + all_frequencies])
 
 
 def _series(records: Sequence[FrequencyData], residuals: Floats) -> list[Floats]:
     """Split a residual vector into the real part of each record, then the imaginary part of each record."""
-    ends = np.cumsum([r.frequency.size for r in records])
+    stops = np.cumsum([r.frequency.size for r in records])
     half = residuals.size // 2
-    return [*np.split(residuals[:half], ends[:-1]), *np.split(residuals[half:], ends[:-1])]
+    return [*np.split(residuals[:half], stops[:-1]), *np.split(residuals[half:], stops[:-1])]
 
 
 def _identifiability_findings(
@@ -683,14 +691,14 @@ def _model(
 ) -> Model:
     """Return the identified model with the estimate that a model file stores (covariance, errors, findings)."""
     orders = {n: round(values_by_name[n], 9) for n in problem.orders}
-    late = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
-    structure = problem.structure.with_delays(late).with_orders(orders)
+    delays = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
+    structure = problem.structure.with_delays(delays).with_orders(orders)
     structure = structure.with_coefficients({n: values_by_name[n] for n in problem.coefficients})
-    spread = None
+    coefficient_covariance = None
     if np.all(np.isfinite(covariance)):
         rows = []
-        for item in problem.structure.equations:
-            for order, term in [(item.order, None), *((t.order, t) for t in item.terms)]:
+        for equation in problem.structure.equations:
+            for order, term in [(equation.order, None), *((t.order, t) for t in equation.terms)]:
                 row = np.zeros(values.size)
                 for n, w in order.weights:
                     row[problem.names.index(n)] = w
@@ -702,7 +710,7 @@ def _model(
                     rows.append(row)
         rows += [np.array([float(n == name) for n in problem.names]) for name in structure.fixed_inputs]
         table = np.array(rows)
-        spread = tuple(tuple(row) for row in (table @ covariance @ table.T).tolist())
+        coefficient_covariance = tuple(tuple(row) for row in (table @ covariance @ table.T).tolist())
     units: dict[str, str] = {}
     if all(r.unit == "Ω" for r in records):
         units = {r.output: "V" for r in records} | {r.input: "A" for r in records}
@@ -711,7 +719,7 @@ def _model(
         runs=tuple(dict.fromkeys(r.name for r in records)),
         values=dict(values_by_name),
         standard_errors={n: e if math.isfinite(e) else None for n, e in standard.items()},
-        covariance=spread,
+        covariance=coefficient_covariance,
         findings=tuple(f.to_file() for f in findings),
     )
     return Model(structure, orders, units, None, {"identified from": "frequency response"}, estimate)

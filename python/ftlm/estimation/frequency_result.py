@@ -50,9 +50,9 @@ def curve_frequencies(record: FrequencyData) -> Floats:
     measured value. Measured points are therefore drawn as separate dots.
     """
     frequencies = np.unique(record.frequency)
-    between = np.sqrt(frequencies[1:] * frequencies[:-1])
-    smooth = np.geomspace(frequencies[0], frequencies[-1], CURVE_POINTS) if frequencies.size > 1 else frequencies
-    return np.unique(np.concatenate([frequencies, between, smooth]))
+    midpoints = np.sqrt(frequencies[1:] * frequencies[:-1])
+    curve = np.geomspace(frequencies[0], frequencies[-1], CURVE_POINTS) if frequencies.size > 1 else frequencies
+    return np.unique(np.concatenate([frequencies, midpoints, curve]))
 
 
 def _response_indices(model: Model, record: FrequencyData) -> tuple[int, int]:
@@ -78,7 +78,7 @@ def model_curve(
     response = model_response(model, record, omega)
     if isinstance(model, Circuit) or covariance_of(model) is None:
         return response, None, None
-    gain, phase = (part[_response_indices(model, record)] for part in response_deviation(model, omega))
+    gain, phase = (deviation[_response_indices(model, record)] for deviation in response_deviation(model, omega))
     return response, DECIBELS_PER_NEPER * NORMAL_95 * gain, np.degrees(NORMAL_95 * phase)
 
 
@@ -108,7 +108,7 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
     For an impedance, the first chart shows the magnitude over the frequency in Hz.
     """
     omega = curve_frequencies(record)
-    response, wide, turned = model_curve(model, record, omega)
+    response, uncertain_response, wrapped = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
     order = np.argsort(record.frequency, kind="stable")
     at = np.searchsorted(omega, record.frequency[order])
@@ -123,8 +123,8 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
         return frequency_chart(f"{title}: {kind}", label, omega, lines, half_width)
 
     size = f"gain [dB of {record.unit}]" if record.unit else "gain [dB]"
-    gains = chart("gain", size, DECIBELS_PER_NEPER * np.log(np.abs(response)), wide, record.gain[order])
-    phases = chart("phase", "phase [degrees]", phase, turned, angles)
+    gains = chart("gain", size, DECIBELS_PER_NEPER * np.log(np.abs(response)), uncertain_response, record.gain[order])
+    phases = chart("phase", "phase [degrees]", phase, wrapped, angles)
     if not is_impedance(record):
         return gains, phases
     hertz: dict[str, Any] = {"x": omega / (2.0 * math.pi), "x_label": "frequency [Hz]"}
@@ -167,8 +167,10 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> L
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
     response = model_response(model, record, omega)
-    size = np.abs(record.response[order])
-    relative_errors = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
+    magnitude = np.abs(record.response[order])
+    relative_errors = (
+        100.0 * (response - record.response[order]) / np.where(magnitude > 0, magnitude, np.max(magnitude) or 1.0)
+    )
     hertz = is_impedance(record)
     return LineChart(
         omega / (2.0 * math.pi) if hertz else omega,
@@ -341,10 +343,10 @@ class FrequencyIdentification:
         """
         if isinstance(self.system, Model):
             return self.system
-        top, bottom = self.system.polynomials()
+        numerator, denominator = self.system.polynomials()
         output, input = self.data[0].output, self.data[0].input
         # An inductor in series is a derivative of the current.
-        model = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
+        model = Ratio(numerator, denominator, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
         return replace(model, units={output: "V", input: "A"})
 
     @property
@@ -381,17 +383,21 @@ class FrequencyIdentification:
         DataError
             If a record has signals that the model lacks.
         """
-        others = tuple(assign_signals(self.system, record) for record in as_frequency_data(data))
-        errors = tuple(error_of(self.system, record) for record in others)
-        return FrequencyValidation(others, errors, self._assess(errors, others), self._validation_findings(errors))
+        records = tuple(assign_signals(self.system, record) for record in as_frequency_data(data))
+        errors = tuple(error_of(self.system, record) for record in records)
+        return FrequencyValidation(records, errors, self._assess(errors, records), self._validation_findings(errors))
 
-    def _validation_findings(self, others: Sequence[ResponseError]) -> tuple[Finding, ...]:
+    def _validation_findings(self, validation_errors: Sequence[ResponseError]) -> tuple[Finding, ...]:
         """Return a finding on each response with a large error, and one on an error far above the estimation errors."""
-        findings = _large_error_findings(others)
-        most = max(e.rms for e in self.errors)
-        failures = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
+        findings = _large_error_findings(validation_errors)
+        largest_error = max(e.rms for e in self.errors)
+        failures = [
+            e
+            for e in validation_errors
+            if e.rms > VALIDATION_ERROR_RATIO * largest_error and e.rms > 100 * MIN_VALIDATION_ERROR
+        ]
         if failures:
-            findings.append(make_finding("response_lost", run=failures[0].name, own=most, rms=failures[0].rms))
+            findings.append(make_finding("response_lost", run=failures[0].name, own=largest_error, rms=failures[0].rms))
         return tuple(findings)
 
     @property
@@ -428,17 +434,23 @@ class FrequencyIdentification:
         """
         return self._assess(None)
 
-    def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
-        findings = [*_large_error_findings(self.errors), *_large_error_findings(others or ()), *self._unstable_poles()]
+    def _assess(
+        self, validation_errors: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()
+    ) -> Verdict:
+        findings = [
+            *_large_error_findings(self.errors),
+            *_large_error_findings(validation_errors or ()),
+            *self._unstable_poles(),
+        ]
         findings += [group.first_finding for group in group_findings(self.findings)]
-        findings += [f for f in self._validation_findings(others or ()) if f not in findings]
-        same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
-        if others is None or same:
+        findings += [f for f in self._validation_findings(validation_errors or ()) if f not in findings]
+        is_same_data = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
+        if validation_errors is None or is_same_data:
             findings.append(make_finding("response_not_validated"))
-        against = verdict_from(findings)
-        if against is not None:
-            return against
-        errors_text = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
+        limiting = verdict_from(findings)
+        if limiting is not None:
+            return limiting
+        errors_text = ", ".join(f"{e.name} {e.rms:.2g} %" for e in validation_errors or ())
         return Verdict(TRUST_LEVEL, f"it predicts validation responses (error {errors_text}), residuals are noise")
 
     def _unstable_poles(self) -> list[Finding]:
@@ -457,20 +469,20 @@ class FrequencyIdentification:
         """Return the summary as text: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
-        judgement = self.verdict if validation is None else validation.verdict
-        lines = [*wrap_text(str(judgement)), ""]
+        verdict = self.verdict if validation is None else validation.verdict
+        lines = [*wrap_text(str(verdict)), ""]
         lines += [str(self.system)] if isinstance(self.system, Circuit) else equation_lines(self.system)
         lines.append("")
-        lines += self._numbers()
+        lines += self._parameter_lines()
         lines += [*([] if isinstance(self.system, Circuit) else behavior_lines(self.system)), ""]
         lines += _errors_in_words(self.errors)
         if validation is not None:
             lines += ["validation", *_errors_in_words(validation.errors)[1:]]
         if self.chi_squared is not None:
             lines.append(f"residuals over stated deviations: {math.sqrt(self.chi_squared):.3g} (1 of a right model)")
-        same, total = self.start_counts
+        same_count, total = self.start_counts
         lines.append(
-            f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {total} "
+            f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same_count} of {total} "
             "initial guesses ended here"
         )
         if self.information is not None:
@@ -483,13 +495,13 @@ class FrequencyIdentification:
             ]
         )
 
-    def _numbers(self) -> list[str]:
+    def _parameter_lines(self) -> list[str]:
         rows = []
         for p in self.parameters.values():
             low, high = p.interval
-            ends = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
+            interval = f"[{format_bound(low, '.5g')}, {format_bound(high, '.5g')}]"
             error = "fixed" if p.fixed else f"± {format_bound(p.standard_error)}"
-            rows.append((p.name, f"{p.value:.6g}", error, "" if p.fixed else ends, p.unit))
+            rows.append((p.name, f"{p.value:.6g}", error, "" if p.fixed else interval, p.unit))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines = [
             f"  {a:<{widths[0]}}  {b:>{widths[1]}} {c:<{widths[2]}}  {d:<{widths[3]}}  {e}".rstrip()
@@ -535,42 +547,42 @@ class FrequencyIdentification:
         """Return the content of the report."""
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
 
-        first, more = first_findings(self.findings)
+        main_findings, further_findings = first_findings(self.findings)
         source = self.system
-        new = () if validation is None else validation.data
+        validation_data = () if validation is None else validation.data
         charts = Section(
-            f"{'Validation' if new else 'Estimation'}: measured and modeled response",
-            figures=[f for record in new or self.data for f in response_figures(self.system, record)],
+            f"{'Validation' if validation_data else 'Estimation'}: measured and modeled response",
+            figures=[f for record in validation_data or self.data for f in response_figures(self.system, record)],
             small=True,
         )
-        about = Section(
+        data_section = Section(
             "Model",
             [self._equations_html()],
-            warnings=first,
-            more=more,
+            warnings=main_findings,
+            more=further_findings,
             tables=[self._parameter_table(), *([] if isinstance(source, Circuit) else behavior_tables(source))],
             figures=[] if isinstance(source, Circuit) else behavior_figures(source),
             small=True,
         )
         rows: list[list[Cell]] = [_error_row("estimation", e) for e in self.errors]
         rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
-        heads = ("data", "record", "response", "error, % rms", "largest, %", "at [Hz]")
+        headings = ("data", "record", "response", "error, % rms", "largest, %", "at [Hz]")
         notes = [w for r in self.data for w in r.warnings]
         figures = [relative_residual_figure(self.system, record) for record in self.data]
         residuals = Section(
-            "Residuals" if not new else "Residuals, and the fit to the estimation data",
+            "Residuals" if not validation_data else "Residuals, and the fit to the estimation data",
             [f"Weights: {self.weights}. Residuals white: {'yes' if self.white else 'no'} (99 %).", *notes],
             tables=[
-                Table("Error over the size of the measured response", heads, rows),
+                Table("Error over the size of the measured response", headings, rows),
                 *([] if self.information is None else [information_table(self.information)]),
             ],
-            figures=self.figures() if new else figures,
+            figures=self.figures() if validation_data else figures,
             small=True,
-            collapsed=bool(new),
+            collapsed=bool(validation_data),
         )
         return Page(
             f"Impedance of {source}" if isinstance(source, Circuit) else title_of(source),
-            [charts, about, residuals],
+            [charts, data_section, residuals],
             "",
             verdict_box(self.verdict if validation is None else validation.verdict),
         )
@@ -578,13 +590,16 @@ class FrequencyIdentification:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
         if isinstance(self.system, Circuit):
-            what: dict[str, Any] = {"circuit": str(self.system)}
+            contents: dict[str, Any] = {"circuit": str(self.system)}
         else:
-            what = {"equations": [str(e) for e in self.system.equations]}
+            contents = {"equations": [str(e) for e in self.system.equations]}
         names = ("weights", "values", "standard_errors", "intervals", "chi_squared", "errors", "converged")
         starts = {"starts": list(self.start_counts)}
         return (
-            what | attributes(self, names) | starts | attributes(self, ("white", "information", "findings", "warnings"))
+            contents
+            | attributes(self, names)
+            | starts
+            | attributes(self, ("white", "information", "findings", "warnings"))
         )
 
     def __str__(self) -> str:
@@ -612,8 +627,8 @@ class FrequencyIdentification:
             return parameter_table(self.system)
         rows: list[list[Cell]] = []
         for p in self.parameters.values():
-            numbers = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
-            rows.append([p.name, p.value, *numbers, p.unit])
+            finite_values = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
+            rows.append([p.name, p.value, *finite_values, p.unit])
         return Table("Parameters", ("name", "value", "standard error", "95 % from", "to", "unit"), rows)
 
 
@@ -639,9 +654,9 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
 
 def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
     """Return the relative error of a model on one measured frequency response."""
-    size = np.abs(record.response)
+    magnitude = np.abs(record.response)
     relative_errors = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
-        size > 0, size, np.max(size) or 1.0
+        magnitude > 0, magnitude, np.max(magnitude) or 1.0
     )
     at = int(np.argmax(relative_errors))
     rms = 100 * float(np.sqrt(np.mean(relative_errors**2)))
@@ -664,7 +679,7 @@ def _fit_of(errors: Sequence[ResponseError]) -> dict[str, float]:
     squares: dict[str, list[float]] = {}
     for error in errors:
         squares.setdefault(error.output, []).append(error.rms**2)
-    return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
+    return {output: 100.0 - math.sqrt(sum(terms) / len(terms)) for output, terms in squares.items()}
 
 
 def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:
@@ -677,10 +692,10 @@ def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:
     return lines
 
 
-def _error_row(what: str, error: ResponseError) -> list[Cell]:
+def _error_row(label: str, error: ResponseError) -> list[Cell]:
     pair = f"{error.output} from {error.input}"
     return [
-        what,
+        label,
         error.name,
         pair,
         number(error.rms, 3),

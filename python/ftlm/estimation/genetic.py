@@ -82,23 +82,23 @@ class GeneticRun:
 class _CandidateMap:
     """Linear map from genes to candidates of one equation: ``genes @ weights + constants``.
 
-    A candidate is a row with alpha (the order of the equation), the orders and the coefficients of the terms. ``own``
-    is True for terms in the output of the equation, ``points`` computes the errors of candidates, and ``scale`` divides
-    these errors.
+    A candidate is a row with alpha (the order of the equation), the orders and the coefficients of the terms.
+    ``is_output_term`` is True for terms in the output of the equation, ``points`` computes the errors of candidates,
+    and ``scale`` divides these errors.
     """
 
     points: _core.Points
     weights: Floats
     constants: Floats
-    own: NDArray[np.bool_]
+    is_output_term: NDArray[np.bool_]
     scale: float
 
     def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
         """Return one candidate per row of `genes`; `repaired` limits the orders of terms to that of the equation."""
         rows = genes @ self.weights + self.constants
         if repaired:
-            highest = rows[:, :1] - np.where(self.own, ORDER_RESOLUTION, 0.0)
-            n = self.own.size
+            highest = rows[:, :1] - np.where(self.is_output_term, ORDER_RESOLUTION, 0.0)
+            n = self.is_output_term.size
             rows[:, 1 : 1 + n] = np.minimum(rows[:, 1 : 1 + n], highest)
         return rows
 
@@ -135,35 +135,35 @@ class GeneticProblem:
         self.threads = threads
         self.size = self._candidates(structure, records, values)
 
-    def _candidate_map(self, item: Equation, records: list[Record], norm: str) -> _CandidateMap:
+    def _candidate_map(self, equation: Equation, records: list[Record], norm: str) -> _CandidateMap:
         signals, inputs = records[0].signals, list(records[0].inputs)
-        n = len(item.terms)
+        n = len(equation.terms)
         weights, constants = np.zeros((len(self.names), 1 + 2 * n)), np.zeros(1 + 2 * n)
 
-        def place(column: int, order: Order) -> None:
+        def set_order(column: int, order: Order) -> None:
             constants[column] = order.constant
             for name, weight in order.weights:
                 weights[self.names.index(name), column] = weight
 
-        place(0, item.order)
-        for k, term in enumerate(item.terms):
-            place(1 + k, term.order)
+        set_order(0, equation.order)
+        for k, term in enumerate(equation.terms):
+            set_order(1 + k, term.order)
             if isinstance(term.coefficient, str):
                 weights[self.names.index(term.coefficient), 1 + n + k] = term.factor
             else:
                 constants[1 + n + k] = term.factor * term.coefficient
         points = _core.Points(
             [r.core() for r in records],
-            signals.index(item.output),
-            [signals.index(t.signal) for t in item.terms],
+            signals.index(equation.output),
+            [signals.index(t.signal) for t in equation.terms],
             inputs,
             norm == "l2",
         )
-        own = np.array([t.signal == item.output for t in item.terms])
+        is_output_term = np.array([t.signal == equation.output for t in equation.terms])
         count = sum(r.m for r in records)
-        spread = math.sqrt(sum(float(np.var(r.of(item.output)) * r.m) for r in records) / count)
-        scale = 1.0 if not self.law else spread * count if norm == "l1" else spread
-        return _CandidateMap(points, weights, constants, own, scale)
+        deviation = math.sqrt(sum(float(np.var(r.of(equation.output)) * r.m) for r in records) / count)
+        scale = 1.0 if not self.law else deviation * count if norm == "l1" else deviation
+        return _CandidateMap(points, weights, constants, is_output_term, scale)
 
     def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
         """Return the number of candidates of the order grid; under an order law an upper bound of this number."""
@@ -181,11 +181,11 @@ class GeneticProblem:
 
     def errors(self, genes: Floats, limit: float) -> Floats:
         """Return the simulation error of the candidate in each row of genes; infinite if it exceeds the limit."""
-        rounded, total = self.round_orders(genes), np.zeros(genes.shape[0])
-        for part in self.rows:
-            rows = np.ascontiguousarray(part.candidates(rounded, repaired=not self.law))
-            total += part.points.scores(rows, limit * part.scale, self.threads) / part.scale
-        return np.where(total <= limit, total, np.inf)
+        rounded, sums = self.round_orders(genes), np.zeros(genes.shape[0])
+        for candidate_map in self.rows:
+            rows = np.ascontiguousarray(candidate_map.candidates(rounded, repaired=not self.law))
+            sums += candidate_map.points.scores(rows, limit * candidate_map.scale, self.threads) / candidate_map.scale
+        return np.where(sums <= limit, sums, np.inf)
 
     def values_by_name(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
         """Return orders and coefficients of one row of genes, by name."""
@@ -193,10 +193,10 @@ class GeneticProblem:
         n = len(self.order_names)
         values = dict(zip(self.names, rounded[0].tolist(), strict=True))
         if not self.law:
-            part = self.rows[0]
-            row = part.candidates(rounded, repaired=True)[0]
-            for column, value in enumerate(row[: 1 + part.own.size].tolist()):
-                gene = np.flatnonzero(part.weights[:n, column])
+            candidate_map = self.rows[0]
+            row = candidate_map.candidates(rounded, repaired=True)[0]
+            for column, value in enumerate(row[: 1 + candidate_map.is_output_term.size].tolist()):
+                gene = np.flatnonzero(candidate_map.weights[:n, column])
                 if gene.size:
                     values[self.names[int(gene[0])]] = value
         orders = {name: round(values[name], 9) for name in self.order_names}
@@ -210,15 +210,15 @@ def default_bounds(
     reference = structure.reference.get(name, 0.0)
     if reference:
         return -STATED_RANGE * abs(reference), STATED_RANGE * abs(reference)
-    middle = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
-    item, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
-    eta = max(item.order.at(middle) - term.order.at(middle), 0.0)
+    midpoints = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
+    equation, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
+    eta = max(equation.order.at(midpoints) - term.order.at(midpoints), 0.0)
     largest = 0.0
     for record in records:
         kernel = block_pulse_kernel(eta, record.m, step=record.step)
         integral = _core.series_multiply(kernel, record.of(term.signal), record.m)
-        size = float(np.linalg.norm(integral))
-        largest = max(largest, float(np.linalg.norm(record.of(item.output))) / size if size else 0.0)
+        norm = float(np.linalg.norm(integral))
+        largest = max(largest, float(np.linalg.norm(record.of(equation.output))) / norm if norm else 0.0)
     limit = SCALE_RANGE * (largest or 1.0) / abs(term.factor)
     return -limit, limit
 
@@ -276,20 +276,20 @@ def genetic_search(
     if isinstance(progress, Progress):
         name = "the stage" if structure.has_order_law else structure.outputs[0]
         progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
-    ends: dict[int, _ParentThreshold] = {}
+    results: dict[int, _ParentThreshold] = {}
     for number, seed in enumerate(settings.seeds):
 
         def report_evaluations(count: int, count_before: int = number * evaluations) -> None:
             if progress is not None:
                 progress(min(count_before + count, total), total)
 
-        ends[int(seed)] = _evolve(pygad.GA, problem, settings.population, int(seed), evaluations, report_evaluations)
-    best = min(ends.values(), key=lambda end: end.best)
+        results[int(seed)] = _evolve(pygad.GA, problem, settings.population, int(seed), evaluations, report_evaluations)
+    best = min(results.values(), key=lambda end: end.best)
     if not math.isfinite(best.best):
         raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
     orders, coefficients = problem.values_by_name(best.genes)
-    errors = {seed: end.best for seed, end in ends.items()}
-    return GeneticRun(orders, coefficients, errors, {s: end.count for s, end in ends.items()}, problem.bounds)
+    errors = {seed: end.best for seed, end in results.items()}
+    return GeneticRun(orders, coefficients, errors, {s: end.count for s, end in results.items()}, problem.bounds)
 
 
 def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tuple[float, float]:
@@ -298,8 +298,8 @@ def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tupl
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
     start_time = time.perf_counter()
     problem.errors(genes, math.inf)
-    each = (time.perf_counter() - start_time) / population
-    return DURATION_FACTOR_RANGE[0] * each * evaluations, DURATION_FACTOR_RANGE[1] * each * evaluations
+    seconds_each = (time.perf_counter() - start_time) / population
+    return DURATION_FACTOR_RANGE[0] * seconds_each * evaluations, DURATION_FACTOR_RANGE[1] * seconds_each * evaluations
 
 
 def _evolve(
@@ -324,11 +324,13 @@ def _evolve(
     def check_budget(_: Any) -> str | None:
         return "stop" if threshold.count >= evaluations else None
 
-    def crossover(parents: Any, size: tuple[int, int], running: Any) -> Floats:
-        return simulated_binary_crossover(np.asarray(parents, dtype=np.float64), size, running.numpy_random_generator)
+    def crossover(parents: Any, shape: tuple[int, int], algorithm: Any) -> Floats:
+        return simulated_binary_crossover(
+            np.asarray(parents, dtype=np.float64), shape, algorithm.numpy_random_generator
+        )
 
-    def mutation(children: Any, running: Any) -> Floats:
-        return polynomial_mutation(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
+    def mutation(children: Any, algorithm: Any) -> Floats:
+        return polynomial_mutation(np.asarray(children, dtype=np.float64), low, high, algorithm.numpy_random_generator)
 
     def fitness(_: Any, genes: Any, __: Any) -> list[float]:
         candidates = np.asarray(genes, dtype=np.float64)
@@ -346,7 +348,7 @@ def _evolve(
         num_genes=len(bounds),
         fitness_func=fitness,
         fitness_batch_size=population,
-        gene_space=[{"low": start, "high": end} for start, end in bounds],
+        gene_space=[{"low": first, "high": stop} for first, stop in bounds],
         parent_selection_type="sss",
         crossover_type=crossover,
         mutation_type=mutation,
@@ -357,26 +359,28 @@ def _evolve(
     return threshold
 
 
-def simulated_binary_crossover(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
+def simulated_binary_crossover(parents: Floats, shape: tuple[int, int], random: Any) -> Floats:
     """Return children by simulated binary crossover (Deb and Agrawal, Complex Systems 9, 1995)."""
-    pairs = (size[0] + 1) // 2
-    first, second = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
-    u = random.random_sample(first.shape)
+    pairs = (shape[0] + 1) // 2
+    mothers, fathers = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
+    u = random.random_sample(mothers.shape)
     with np.errstate(divide="ignore"):
-        spread = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_DISTRIBUTION_INDEX + 1.0))
-    crossed = (random.random_sample(first.shape) < 0.5) & (random.random_sample((pairs, 1)) < CROSSOVER_PROBABILITY)
-    spread = np.where(crossed, spread, 1.0)
-    middle, half = 0.5 * (first + second), 0.5 * (first - second)
-    return np.concatenate([middle + spread * half, middle - spread * half])[: size[0]]
+        factor = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_DISTRIBUTION_INDEX + 1.0))
+    is_crossed = (random.random_sample(mothers.shape) < 0.5) & (
+        random.random_sample((pairs, 1)) < CROSSOVER_PROBABILITY
+    )
+    factor = np.where(is_crossed, factor, 1.0)
+    means, half_differences = 0.5 * (mothers + fathers), 0.5 * (mothers - fathers)
+    return np.concatenate([means + factor * half_differences, means - factor * half_differences])[: shape[0]]
 
 
 def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
     """Return children after polynomial mutation of one gene per child on average (Deb and Goyal 1996)."""
     u = random.random_sample(children.shape)
     power = 1.0 / (MUTATION_DISTRIBUTION_INDEX + 1.0)
-    move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
+    change = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
     is_mutated = random.random_sample(children.shape) < 1.0 / children.shape[1]
-    return np.clip(children + np.where(is_mutated, move * (high - low), 0.0), low, high)
+    return np.clip(children + np.where(is_mutated, change * (high - low), 0.0), low, high)
 
 
 class _ParentThreshold:
@@ -400,9 +404,9 @@ class _ParentThreshold:
     def add_generation(self, errors: Floats, genes: Floats) -> None:
         """Add the errors and genes of one generation, which has one row of genes per error."""
         self.count += errors.size
-        first = int(np.argmin(errors))
-        if errors[first] < self.best:
-            self.best, self.genes = float(errors[first]), genes[first].copy()
+        best_index = int(np.argmin(errors))
+        if errors[best_index] < self.best:
+            self.best, self.genes = float(errors[best_index]), genes[best_index].copy()
         self._errors = np.sort(np.concatenate([self._errors, errors]))[: self._errors.size]
 
 
@@ -452,9 +456,9 @@ def differential_evolution_search(
         with np.errstate(divide="ignore"):
             return np.clip(np.log(problem.errors(rows, math.inf)), -MAX_LOG_ERROR, MAX_LOG_ERROR)
 
-    ends: dict[int, Any] = {}
+    results: dict[int, Any] = {}
     for seed in settings.seeds:
-        ends[int(seed)] = differential_evolution(
+        results[int(seed)] = differential_evolution(
             errors,
             bounds,
             maxiter=generations,
@@ -465,14 +469,14 @@ def differential_evolution_search(
             vectorized=True,
             rng=np.random.default_rng(int(seed)),
         )
-    best = min(ends.values(), key=lambda end: float(end.fun))
+    best = min(results.values(), key=lambda end: float(end.fun))
     if best.fun >= MAX_LOG_ERROR:
         raise ModelError("no candidate of differential evolution had a finite error; narrow its bounds")
     orders, coefficients = problem.values_by_name(np.asarray(best.x, dtype=np.float64))
-    each = {seed: math.exp(end.fun) if end.fun < MAX_LOG_ERROR else math.inf for seed, end in ends.items()}
+    final_errors = {seed: math.exp(end.fun) if end.fun < MAX_LOG_ERROR else math.inf for seed, end in results.items()}
     # SciPy counts calls, each of which evaluates one generation.
-    evaluations = {seed: int(end.nfev) * generation for seed, end in ends.items()}
-    return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)
+    evaluations = {seed: int(end.nfev) * generation for seed, end in results.items()}
+    return GeneticRun(orders, coefficients, final_errors, evaluations, problem.bounds)
 
 
 @check_arguments
@@ -551,24 +555,24 @@ class GeneticAlgorithm:
         check_linear(structure.equations, "the genetic baseline")
         check_order_grid_names(self.order_grid, structure)
         task = Task(tuple(runs), structure, self.order_grid)
-        parts = (
+        groups = (
             {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
         )
-        free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
-        names = [n for own in free.values() for n in own]
+        free = {name: (*group.order_names, *group.coefficient_names) for name, group in groups.items()}
+        names = [n for group_names in free.values() for n in group_names]
         unknown = [n for n in self.bounds if n not in names]
         if unknown:
             raise ModelError(f"bounds of {unknown[0]!r}: not a free parameter; free are {', '.join(names)}")
         record = prepare(task.runs, structure, m, power_of_two=True)[0]
-        ends = {}
-        for name, part in parts.items():
+        results = {}
+        for name, group in groups.items():
             bounded = {n: b for n, b in self.bounds.items() if n in free[name]}
-            own = replace(self, order_grid=task.part_order_grid(part), bounds=bounded)
-            records = prepare(task.runs, part, record.m, power_of_two=True)
-            ends[name] = genetic_search(records, part, own, threads=threads, progress=progress)
-        orders = {n: v for end in ends.values() for n, v in end.orders.items()}
-        coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
-        bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
+            group_names = replace(self, order_grid=task.part_order_grid(group), bounds=bounded)
+            records = prepare(task.runs, group, record.m, power_of_two=True)
+            results[name] = genetic_search(records, group, group_names, threads=threads, progress=progress)
+        orders = {n: v for result in results.values() for n, v in result.orders.items()}
+        coefficients = {n: v for result in results.values() for n, v in result.coefficients.items()}
+        bounds = {n: b for result in results.values() for n, b in result.bounds.items()}
         seeds, identified = list(self.seeds), structure.with_orders(orders).with_coefficients(coefficients)
         model = make_model(task, self.name, identified, orders, record.m, seeds=str(seeds))
         findings = coefficient_law_findings(model)
@@ -576,8 +580,8 @@ class GeneticAlgorithm:
             value = {**orders, **coefficients}[name]
             if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
                 findings.append(make_finding("genetic_on_bound", parameter=name, value=value))
-        for name, end in ends.items():
-            low, high = min(end.errors.values()), max(end.errors.values())
+        for name, result in results.items():
+            low, high = min(result.errors.values()), max(result.errors.values())
             if high > MAX_SEED_ERROR_RATIO * low:
                 findings.append(make_finding("seeds_disagree", output=name, low=low, high=high))
         options = {
@@ -588,7 +592,7 @@ class GeneticAlgorithm:
             "seeds": seeds,
             "population": self.population,
             "bounds": {n: list(b) for n, b in bounds.items()},
-            "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
-            "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
+            "errors": {name: {str(seed): e for seed, e in result.errors.items()} for name, result in results.items()},
+            "evaluations": {name: sum(result.evaluations.values()) for name, result in results.items()},
         }
         return Fit(task, self.name, model, len(orders) + len(coefficients), options, findings, at_optimum=False)

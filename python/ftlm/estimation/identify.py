@@ -152,7 +152,7 @@ def identify(
     ConvergenceError
         If regressors are linearly dependent at the given orders, or the executor has lost its workers.
     """
-    several = as_runs(runs)
+    run_list = as_runs(runs)
     estimator = resolve_method(method)
     if bounds is not None:
         estimator = method_with_options(estimator.name, {**vars(estimator), "bounds": bounds})
@@ -168,20 +168,20 @@ def identify(
         _check_offset_test(structure, estimator)
 
     PACKAGE_LOGGER.info(
-        "identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), estimator.name
+        "identifying %s from %s by %s", structure.name, ", ".join(r.name for r in run_list), estimator.name
     )
-    fit = _fit_runs(several, structure, estimator, offset is None, m=m, threads=threads, progress=progress)
+    fit = _fit_runs(run_list, structure, estimator, offset is None, m=m, threads=threads, progress=progress)
     result = assess_fit(fit)
     duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
     without_reference = isinstance(estimator, OutputError) and estimator.reference is None
     if duration is not None and structure.initial == "auto" and without_reference:
         # If the pieces cannot be fitted, the result for whole runs is returned.
         with contextlib.suppress(FtlmError):
-            split = identify_pieces(several, structure, float(duration), method=estimator, m=m, threads=threads)
+            split = identify_pieces(run_list, structure, float(duration), method=estimator, m=m, threads=threads)
             result = split if any(f.code == "plant_unstable" for f in split.findings) else result
     PACKAGE_LOGGER.info("identified: %s", result.verdict)
-    for item in result.findings:
-        PACKAGE_LOGGER.warning("%s", item)
+    for finding in result.findings:
+        PACKAGE_LOGGER.warning("%s", finding)
     return result
 
 
@@ -204,9 +204,9 @@ def _fit_runs(
         request: Structure,
         method: EstimationMethod = estimator,
         report: Callable[[int, int], None] | None = progress,
-        **more: JointFit | None,
+        **options: JointFit | None,
     ) -> Fit:
-        fit = method.fit(runs, request, m=m, threads=threads, progress=report, **more)
+        fit = method.fit(runs, request, m=m, threads=threads, progress=report, **options)
         if not isinstance(fit, Fit):
             raise ModelError(
                 f"the method {estimator.name!r} fitted a {type(fit).__name__}; return a Fit from its fit method"
@@ -266,8 +266,8 @@ def identify_pieces(
     findings = (*result.findings, *notes, make_finding("runs_split", pieces=len(pieces), seconds=duration))
     estimate = result.model.estimate
     assert estimate is not None
-    about = msgspec.structs.replace(estimate, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
-    return replace(result, model=replace(result.model, estimate=about), findings=findings)
+    details = msgspec.structs.replace(estimate, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
+    return replace(result, model=replace(result.model, estimate=details), findings=findings)
 
 
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
@@ -311,8 +311,8 @@ def assess_fit(fit: Fit) -> Identification:
     )
     if fit.joint is not None and any(f.code == "simulation_chaotic" for f in findings):
         # The cost is nowhere quadratic, and a profile follows one of its many minima.
-        unknown = np.diag(np.full(len(fit.joint.names), np.inf))
-        fit = replace(fit, joint=replace(fit.joint, covariance=unknown, profiles={}))
+        infinite_covariance = np.diag(np.full(len(fit.joint.names), np.inf))
+        fit = replace(fit, joint=replace(fit.joint, covariance=infinite_covariance, profiles={}))
     tests, criteria = None, None
     try:
         tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))
@@ -333,38 +333,38 @@ def assess_fit(fit: Fit) -> Identification:
         findings = [_undecided_color(f) if f.code == "residuals_not_white" else f for f in findings]
     else:
         extensions = run_extension_tests(fit, tests)
-        missing = extensions.findings
-        if extensions.friction_tested:
+        extension_findings = extensions.findings
+        if extensions.has_friction_test:
             # The fit of the structure with friction replaces the correlation test for friction.
             outputs = {n: replace(o, direction=None) for n, o in tests.outputs.items()}
             tests = replace(tests, outputs=outputs)
         directed = [o for o, r in tests.outputs.items() if r.follows_direction]
         findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
-        explained = bool(missing) and all(f.code != "dynamics_missing" for f in missing)
-        if directed and not explained:
+        is_explained = bool(extension_findings) and all(f.code != "dynamics_missing" for f in extension_findings)
+        if directed and not is_explained:
             # No linear structure explains the residuals, so the finding on the direction of motion is more specific.
-            missing = []
-        if not missing:
-            white = {o for o, r in tests.outputs.items() if r.whiteness.passed}
-            findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in white]
+            extension_findings = []
+        if not extension_findings:
+            white_outputs = {o for o, r in tests.outputs.items() if r.whiteness.passed}
+            findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in white_outputs]
             findings = [_noise_finding(f, tests) for f in findings]
         findings += _residual_findings(fit, tests)
-        if explained:
+        if is_explained:
             findings = [f for f in findings if f.code not in SHOWN_BY_RESIDUALS]
-        if any(f.code in HAVE_MEAN_CODES for f in missing):
+        if any(f.code in HAVE_MEAN_CODES for f in extension_findings):
             findings = [f for f in findings if f.code != "offset_missing"]
-        findings += missing
+        findings += extension_findings
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
-    every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
-    estimate = _estimate(fit, comparison, criteria, every)
+    all_findings = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
+    estimate = _estimate(fit, comparison, criteria, all_findings)
     result = Identification(
         replace(model, estimate=estimate),
         fit.method,
         comparison,
         fit.searches,
         fit.settings,
-        every,
+        all_findings,
         fit.joint,
         tests,
         criteria,
@@ -372,10 +372,10 @@ def assess_fit(fit: Fit) -> Identification:
         fit.errors,
         _offset_errors(fit, comparison),
     )
-    against = tuple(f.to_file() for f in unique(result_findings(result)))
-    if not against:
+    limiting = tuple(f.to_file() for f in unique(result_findings(result)))
+    if not limiting:
         return result
-    return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=against)))
+    return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=limiting)))
 
 
 def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str, float]], ...]:
@@ -398,33 +398,33 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
     return lambda: output_sensitivities(joint, request, fit.task.runs)
 
 
-def _undecided_color(item: Finding) -> Finding:
+def _undecided_color(finding: Finding) -> Finding:
     """Return the finding on colored residuals for data that do not distinguish noise from missing dynamics."""
-    return make_finding("color_undecided", output=item.output)
+    return make_finding("color_undecided", output=finding.output)
 
 
-def _noise_finding(item: Finding, tests: Residuals) -> Finding:
+def _noise_finding(finding: Finding, tests: Residuals) -> Finding:
     """Return a finding, replaced by a less severe one if the residuals are noise that no input explains.
 
     Findings on colored residuals and on a poor fit are replaced. Residual tests omit the first and the last sample. If
     the fit is poor only because of these two samples, the finding states that they are outliers.
     """
-    if item.code == "explains_little" and tests.outputs[item.output].nr <= MAX_NORMALIZED_RESIDUAL:
-        inner = 100.0 * (1.0 - tests.outputs[item.output].nr)
-        return make_finding("end_row_far_off", output=item.output, inner=inner, **item.numbers)
-    if item.code == "explains_little" and is_buried(tests.outputs[item.output]):
-        return make_finding("buried_in_noise", output=item.output, **item.numbers)
-    if item.code == "residuals_not_white" and tests.outputs[item.output].is_undecided:
-        return _undecided_color(item)
-    colored = item.code == "residuals_not_white" and tests.outputs[item.output].is_noise
-    return make_finding("noise_coloured", output=item.output) if colored else item
+    if finding.code == "explains_little" and tests.outputs[finding.output].nr <= MAX_NORMALIZED_RESIDUAL:
+        remainder = 100.0 * (1.0 - tests.outputs[finding.output].nr)
+        return make_finding("end_row_far_off", output=finding.output, inner=remainder, **finding.numbers)
+    if finding.code == "explains_little" and is_buried(tests.outputs[finding.output]):
+        return make_finding("buried_in_noise", output=finding.output, **finding.numbers)
+    if finding.code == "residuals_not_white" and tests.outputs[finding.output].is_undecided:
+        return _undecided_color(finding)
+    colored = finding.code == "residuals_not_white" and tests.outputs[finding.output].is_noise
+    return make_finding("noise_coloured", output=finding.output) if colored else finding
 
 
-def _coupling_finding(item: Finding, structure: Structure) -> Finding:
+def _coupling_finding(finding: Finding, structure: Structure) -> Finding:
     """Return a finding, changed to ``coupling_missing`` if it reports an input that no equation uses."""
-    if item.code != "residuals_follow_input" or item.input in structure.signals:
-        return item
-    return msgspec.structs.replace(item, code="coupling_missing")
+    if finding.code != "residuals_follow_input" or finding.input in structure.signals:
+        return finding
+    return msgspec.structs.replace(finding, code="coupling_missing")
 
 
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
@@ -452,8 +452,8 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
         if test.response
     }
     runs = fit.task.runs
-    plain = fit.task.structure.is_linear and all(run.sample_times is None for run in runs)
-    if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not plain:
+    is_supported = fit.task.structure.is_linear and all(run.sample_times is None for run in runs)
+    if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not is_supported:
         return tests
     noise_free_runs = [
         run_with_inputs(run, {n: run[n] - np.pad(v[k], 1) for n, v in fed.items()}) for k, run in enumerate(runs)
@@ -604,12 +604,12 @@ def identify_many(
         raise ModelError(f"the method has an executor besides {parameter('executor')}; leave one of the two out")
     options = {"method": estimator, "offset": offset, "m": m, "threads": threads}
     if executor is None:
-        every = []
+        batch = []
         for name, item in zip(names, items, strict=True):
-            every.append(BatchResult(name, *identify_one(item, structure, options)))
+            batch.append(BatchResult(name, *identify_one(item, structure, options)))
             if progress is not None:
-                progress(len(every), len(items))
-        return every
+                progress(len(batch), len(items))
+        return batch
     options["threads"] = threads_per_task(threads, executor)
     pending: list[Future[Any]] = []
     try:
@@ -634,8 +634,8 @@ def _future_result(future: Future[Any]) -> tuple[Identification | None, FtlmErro
     try:
         pair: tuple[Identification | None, FtlmError | None] = future.result()
     except (Exception, CancelledError) as error:
-        what = f"{type(error).__name__}: {error}"
+        message = f"{type(error).__name__}: {error}"
         return None, ConvergenceError(
-            f"the executor lost this run ({what}); start a new executor and identify the run again"
+            f"the executor lost this run ({message}); start a new executor and identify the run again"
         )
     return pair

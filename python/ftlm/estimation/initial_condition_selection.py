@@ -67,8 +67,10 @@ def fit_with_offset_decision(
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
     constant_name = constant_input(runs, structure)
     if constant_name is not None:
-        words = f"none: {constant_name} is constant on every run, from which an offset is not separately identifiable"
-        return _with_offset_decision(estimate(replace(structure, offset="none")), words)
+        decision_text = (
+            f"none: {constant_name} is constant on every run, from which an offset is not separately identifiable"
+        )
+        return _with_offset_decision(estimate(replace(structure, offset="none")), decision_text)
     fit = estimate(request)
     if fit.task.structure.offset == "level":
         return _with_offset_decision(fit, "level: the runs rest at their own level before an input moves")
@@ -91,7 +93,7 @@ class InitialConditionFits:
         Function that fits a structure.
     may_add_offset
         Whether a level or a constant may be added; False if the user gave an offset.
-    complete
+    complete_fit
         Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`estimate` already
         gives them.
     joint_fits
@@ -100,7 +102,7 @@ class InitialConditionFits:
 
     estimate: Callable[[Structure], Fit]
     may_add_offset: bool
-    complete: Callable[[Structure, JointFit | None], Fit] | None = None
+    complete_fit: Callable[[Structure, JointFit | None], Fit] | None = None
     joint_fits: dict[tuple[Initial, Offset], JointFit] = field(default_factory=dict)
 
     def fit(self, structure: Structure) -> Fit:
@@ -112,16 +114,17 @@ class InitialConditionFits:
 
     def with_intervals(self, structure: Structure, fit: Fit) -> Fit:
         """Return the chosen fit with all requested confidence intervals."""
-        return fit if self.complete is None else self.complete(structure, fit.joint)
+        return fit if self.complete_fit is None else self.complete_fit(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
         """Return a fit of a structure whose initial conditions differ from those of `fit`; None if not accepted.
 
-        The new fit starts from the optimum of `fit` if `fit` has a joint fit and :attr:`complete` is given, otherwise
-        from automatic initial guesses. The function `accepts` decides from the new joint fit whether it is accepted.
+        The new fit starts from the optimum of `fit` if `fit` has a joint fit and :attr:`complete_fit` is given,
+        otherwise from automatic initial guesses. The function `accepts` decides from the new joint fit whether it is
+        accepted.
         """
         joint, runs = fit.joint, fit.task.runs
-        if joint is None or self.complete is None:
+        if joint is None or self.complete_fit is None:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
@@ -185,9 +188,9 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
     if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
         return None
-    whole = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
+    complete_fit = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
-    return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **context)])
+    return replace(complete_fit, findings=[*complete_fit.findings, make_finding("constant_estimated", **context)])
 
 
 def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
@@ -205,14 +208,14 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     automatic = structure.initial == "auto" and structure.is_linear
     if joint is None or not automatic or joint.initial != "rest":
         return None
-    slow = has_colored_residuals(joint)
-    if not slow and has_white_residuals(joint):
+    is_colored = has_colored_residuals(joint)
+    if not is_colored and has_white_residuals(joint):
         return None
     evidence = [rest_evidence(run, structure) for run in runs]
     if any(item is not None and item.rows == 0 for item in evidence):
         # A constant input gives no evidence of rest.
         return None
-    is_quiet, least, candidate = _has_quiet_samples(fit), math.inf, None
+    is_quiet, lowest_score, candidate = _has_quiet_samples(fit), math.inf, None
     starts: list[tuple[Initial, Offset]] = [("caputo", structure.offset)]
     if structure.offset == "none" and fits.may_add_offset:
         starts.insert(0, ("caputo", "level"))
@@ -221,25 +224,25 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     for k, (initial, offset) in enumerate(starts):
         request = replace(structure, initial=initial, offset=offset)
 
-        def is_better(candidate: JointFit, *, least: float = least) -> bool:
+        def is_better(candidate: JointFit, *, lowest_score: float = lowest_score) -> bool:
             is_complete = not is_quiet and has_independent_residuals(candidate, runs, structure)
             gain = fit_score_gain(candidate, joint, candidate if is_complete else joint)
-            return gain > START_SETTINGS.history_margin and fit_score(candidate, joint) < least
+            return gain > START_SETTINGS.history_margin and fit_score(candidate, joint) < lowest_score
 
         # The optimum from rest may be far from that of the most general start. With integer orders, automatic guesses
         # cost little.
-        fresh = k == 0 and not has_memory(structure)
+        is_new_fit = k == 0 and not has_memory(structure)
         previous_fit = fit if candidate is None else candidate[1]
         try:
-            other = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_better)
+            alternative = fits.fit(request) if is_new_fit else fits.refit(request, previous_fit, is_better)
         except FtlmError:
             continue
-        if other is None or other.joint is None or other.joint.unstable_optimum is not None:
+        if alternative is None or alternative.joint is None or alternative.joint.unstable_optimum is not None:
             continue
-        if not is_better(other.joint):
+        if not is_better(alternative.joint):
             continue
-        if slow or has_white_residuals(other.joint):
-            least, candidate = fit_score(other.joint, joint), (request, other)
+        if is_colored or has_white_residuals(alternative.joint):
+            lowest_score, candidate = fit_score(alternative.joint, joint), (request, alternative)
     if candidate is None:
         return None
     return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=True)
@@ -266,10 +269,10 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
         request = replace(structure, initial=initial, offset="level")
         try:
             # With integer orders, automatic guesses cost little and lead to the best optimum.
-            fresh = candidate is None and (is_suggested or not has_memory(structure))
+            is_new_fit = candidate is None and (is_suggested or not has_memory(structure))
             previous_fit = fit if candidate is None else candidate[1]
-            level = fits.fit(request) if fresh else fits.refit(request, previous_fit, is_preferred)
-            if level is not None and level.joint is not None and not (fresh or level.joint.converged):
+            level = fits.fit(request) if is_new_fit else fits.refit(request, previous_fit, is_preferred)
+            if level is not None and level.joint is not None and not (is_new_fit or level.joint.converged):
                 # There is no optimum under these initial conditions near the optimum under the others.
                 level = fits.fit(request)
         except FtlmError:
@@ -294,8 +297,8 @@ def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bo
     if is_rest_rejected and initial != "rest":
         findings.append(make_finding("rest_rejected", run=names))
     if fit.task.structure.offset == "level" and structure.offset != "level":
-        verb = "rested" if initial == "rest" else "moved"
-        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=verb))
+        state = "rested" if initial == "rest" else "moved"
+        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=state))
     if is_rest_rejected and initial != "rest":
         return replace(fit, findings=findings)
     model = replace(fit.model, structure=replace(fit.model.structure, initial=structure.initial))
@@ -325,8 +328,8 @@ def _may_hide_level(fit: Fit) -> bool:
     joint = fit.joint
     if joint is None or not _has_estimated_initial_conditions(fit):
         return False
-    sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
-    is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
+    deviations = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
+    is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * deviations[o] for o, noise in joint.noise.items())
     return not is_negligible and not has_white_residuals(joint)
 
 
@@ -363,11 +366,13 @@ def fit_offset_test(fit: Fit) -> OffsetTest | None:
     if fit.joint is not None:
         values = fit.joint.values_by_name
         request = replace(structure, initial=fit.joint.initial)
-        return offset_test(fit.task.runs, request, values, every=fit.joint.refinement)
+        return offset_test(fit.task.runs, request, values, pulses_per_sample=fit.joint.refinement)
     if not fit.at_optimum:
         return None
     values = {**fit.model.orders, **fit.model.coefficients}
-    return offset_test(fit.task.runs, replace(structure, coefficient_law=()), values, every=DEFAULT_PULSES_PER_SAMPLE)
+    return offset_test(
+        fit.task.runs, replace(structure, coefficient_law=()), values, pulses_per_sample=DEFAULT_PULSES_PER_SAMPLE
+    )
 
 
 def _with_offset_decision(fit: Fit, decision: str) -> Fit:

@@ -75,8 +75,11 @@ def estimate_coefficients(
     if settings.coefficients == "instrumental-variables":
         check_linear(structure.equations, "an instrument")
     if not has_derivative_channels(structure):
-        return _estimate_coefficients(runs, structure, settings, m, smooth=True)[0]
-    fits = [_estimate_coefficients(runs, structure, settings, m, smooth=smooth) for smooth in (True, False)]
+        return _estimate_coefficients(runs, structure, settings, m, local_smoothing=True)[0]
+    fits = [
+        _estimate_coefficients(runs, structure, settings, m, local_smoothing=local_smoothing)
+        for local_smoothing in (True, False)
+    ]
     tracks = [record_run(rec, structure) for rec in fits[0][1]]
 
     def score(pair: tuple[CoefficientFit, list[Record]]) -> float:
@@ -87,45 +90,49 @@ def estimate_coefficients(
 
 
 def _estimate_coefficients(
-    runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None, *, smooth: bool
+    runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None, *, local_smoothing: bool
 ) -> tuple[CoefficientFit, list[Record]]:
     """Return the coefficients at given orders, and the block-pulse records that they were estimated from.
 
-    With `smooth`, derivatives in non-linear terms are computed from smoothed signals.
+    With `local_smoothing`, derivatives in non-linear terms are computed from smoothed signals.
     """
-    records = prepare(runs, structure, m, power_of_two=settings.needs_haar, smooth=smooth)
+    records = prepare(runs, structure, m, power_of_two=settings.needs_haar, local_smoothing=local_smoothing)
     fit = CoefficientFit(records[0].m, records[0].initial)
     if settings.coefficients == "instrumental-variables":
         _instrumental(fit, structure, records)
         return fit, records
-    for item in structure.equations:
+    for equation in structure.equations:
         if settings.coefficients == "least-squares":
-            raw = _core.least_squares(*_linear(item, records))[0]
+            estimates = _core.least_squares(*_linear(equation, records))[0]
         else:
-            raw = _multi_innovation(item, records, settings, settings.prior_covariance)
+            estimates = _multi_innovation(equation, records, settings, settings.prior_covariance)
             if settings.prior_covariance is not None:
-                weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
-                fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
-        fit.values.update(named_coefficients(item, raw))
+                weak_prior_estimates = _multi_innovation(
+                    equation, records, settings, min(settings.prior_covariance * 1e12, 1e300)
+                )
+                fit.findings.extend(_prior_findings(equation.output, estimates, weak_prior_estimates, settings))
+        fit.values.update(named_coefficients(equation, estimates))
     return fit, records
 
 
 def _linear(
-    item: Equation, records: list[Record]
+    equation: Equation, records: list[Record]
 ) -> tuple[list[Any], Any, list[bool], list[float | None], InitialTuple]:
     """Return one equation and its records as positional arguments of the core's linear estimators."""
     first = records[0]
-    fixed, structure = [t.fixed for t in item.terms], structure_tuple(item, first.signals)
+    fixed, structure = [t.fixed for t in equation.terms], structure_tuple(equation, first.signals)
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
 def _multi_innovation(
-    item: Equation, records: list[Record], settings: SearchSettings, prior: float | None
+    equation: Equation, records: list[Record], settings: SearchSettings, prior: float | None
 ) -> list[float]:
     """Return the multi-innovation estimate of the coefficients in closed form, eq. (44) of the paper."""
     haar = settings.row_basis == "haar"
-    (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
-    return raw
+    (estimates, *_), _ = _core.multi_innovation(
+        *_linear(equation, records), settings.innovation_length, prior, haar, False
+    )
+    return estimates
 
 
 def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Record]) -> None:
@@ -153,11 +160,13 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             )
         if answer["damped"]:
             fit.findings.append(make_finding("instruments_unstable", output=outputs))
-        for item, (raw, _, _, _), covariance in zip(group, answer["estimates"], answer["covariances"], strict=True):
-            fit.values.update(named_coefficients(item, raw))
-            free = [t for t in item.terms if t.fixed is None]
-            spread = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
-            pairs = zip(free, spread.tolist(), strict=True)
+        for equation, (estimate, _, _, _), covariance in zip(
+            group, answer["estimates"], answer["covariances"], strict=True
+        ):
+            fit.values.update(named_coefficients(equation, estimate))
+            free = [t for t in equation.terms if t.fixed is None]
+            errors = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
+            pairs = zip(free, errors.tolist(), strict=True)
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
 
 
@@ -177,27 +186,30 @@ def step_bias_findings(
         # Without an estimate on the coarser step there is no estimate of the bias.
         return []
     changes = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
-    worst = max(changes, key=lambda n: changes[n], default="")
-    if not worst or changes[worst] <= MAX_STEP_BIAS_ERRORS:
+    most_changed = max(changes, key=lambda n: changes[n], default="")
+    if not most_changed or changes[most_changed] <= MAX_STEP_BIAS_ERRORS:
         return []
-    carried = min(run.length - 1 for run in runs)
-    finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
+    max_m = min(run.length - 1 for run in runs)
+    finer_text = f"raise m, up to {max_m}, or " if fit.m < max_m else ""
     # Far from the limit of zero step, a third of the change is only a rough estimate of the bias.
-    amount = f"about {changes[worst]:.2g}" if changes[worst] <= 10 else "more than 10"
-    return [make_finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
+    amount = f"about {changes[most_changed]:.2g}" if changes[most_changed] <= 10 else "more than 10"
+    return [make_finding("step_bias", parameter=most_changed, m=fit.m, amount=amount, finer=finer_text)]
 
 
-def _prior_findings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[Finding]:
+def _prior_findings(
+    output: str, estimates: list[float], weak_prior_estimates: list[float], settings: SearchSettings
+) -> list[Finding]:
     """Return a finding if the prior covariance, not the data, determines the size of a coefficient.
 
-    `raw` are the coefficients with the prior of the settings, `weak` the coefficients with a weak prior.
+    `estimates` are the coefficients with the prior of the settings, `weak_prior_estimates` the coefficients with a weak
+    prior.
     """
-    shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
-    worst = max(shares, default=0.0)
-    if worst <= MAX_PRIOR_SHIFT:
+    relative_changes = [abs(a - b) / abs(b) for a, b in zip(estimates, weak_prior_estimates, strict=True) if b]
+    largest_change = max(relative_changes, default=0.0)
+    if largest_change <= MAX_PRIOR_SHIFT:
         return []
-    numbers = {"prior": settings.prior_covariance, "share": 100 * min(worst, 9.99)}
-    return [make_finding("prior_shifts_estimate", output=output, length=settings.innovation_length, **numbers)]
+    details = {"prior": settings.prior_covariance, "share": 100 * min(largest_change, 9.99)}
+    return [make_finding("prior_shifts_estimate", output=output, length=settings.innovation_length, **details)]
 
 
 @dataclass(frozen=True)
@@ -277,17 +289,17 @@ def multi_innovation_trace(
             f"{parameter('offset', 'none')}"
         )
     stride = check_integer("every", every, 1)
-    rest = replace(equation, initial="rest")
-    rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
-    item = equation.equations[0]
-    check_linear([item], "a trace")
-    core_structure = structure_tuple(item, rec.signals)
+    rest_structure = replace(equation, initial="rest")
+    rec = prepare([run], rest_structure, m, power_of_two=settings.needs_haar)[0]
+    single_equation = equation.equations[0]
+    check_linear([single_equation], "a trace")
+    core_structure = structure_tuple(single_equation, rec.signals)
     inputs = list(rec.inputs)
     _, trace = _core.multi_innovation(
         [rec.core()],
         core_structure,
         inputs,
-        [t.fixed for t in item.terms],
+        [t.fixed for t in single_equation.terms],
         (False, []),
         settings.innovation_length,
         settings.prior_covariance,
@@ -300,7 +312,9 @@ def multi_innovation_trace(
     history = np.ascontiguousarray(trace[step - 1])
     error = _core.trace_errors(rec.core(), core_structure, inputs, history)
     names = {
-        t.coefficient: history[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)
+        t.coefficient: history[:, k] / t.factor
+        for k, t in enumerate(single_equation.terms)
+        if isinstance(t.coefficient, str)
     }
     return MultiInnovationTrace(step, names, error, settings.innovation_length)
 
@@ -327,14 +341,14 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
     """
     if not traces:
         raise DataError("a convergence chart needs at least one trace; give (name, trace) pairs")
-    steps = traces[0][1].step
+    step = traces[0][1].step
     for name, trace in traces:
-        if not np.array_equal(trace.step, steps):
+        if not np.array_equal(trace.step, step):
             raise DataError(
                 f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same {parameter('every')}"
             )
     return LineChart(
-        steps,
+        step,
         [(name, trace.error) for name, trace in traces],
         title=title,
         x_label="step of the recursion",
@@ -410,8 +424,8 @@ class Streaming:
         step, longest = check_step(step, "step"), check_step(longest, "longest")
         self.step = step
         self._recursions: list[Recursion] = []
-        for item in structure.equations:
-            output, alpha, terms = structure_tuple(item, self.signals)
+        for equation in structure.equations:
+            output, alpha, terms = structure_tuple(equation, self.signals)
             self._recursions.append(
                 Recursion(
                     [alpha, *(order for _, order in terms)],
@@ -422,7 +436,7 @@ class Streaming:
                     p=length,
                     prior_covariance=prior_covariance,
                     longest=max(2, round(longest / step) + 1),
-                    fixed=[t.fixed for t in item.terms],
+                    fixed=[t.fixed for t in equation.terms],
                 )
             )
 
@@ -448,8 +462,8 @@ class Streaming:
         pairs = zip(self.structure.equations, self._recursions, strict=True)
         return {
             name: c
-            for item, recursion in pairs
-            for name, c in named_coefficients(item, recursion.coefficients.tolist()).items()
+            for equation, recursion in pairs
+            for name, c in named_coefficients(equation, recursion.coefficients.tolist()).items()
         }
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 
 from ftlm.data.run import Run
 from ftlm.errors import InternalError, ModelError
-from ftlm.estimation.closed_loop import instrument_runs, mark_reference_fit
+from ftlm.estimation.closed_loop import instrument_runs, with_reference_findings
 from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.estimators import estimate_order_search, estimate_output_error, number_covariance
@@ -80,15 +80,15 @@ def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
     sum of squared prediction errors, whose minimum is consistent in a closed loop with a delay (Ljung, System
     Identification, 1999, chapter 13). The covariance of the parameters includes the uncertainty of A(q).
     """
-    first, runs, plain = fit, fit.task.runs, fit.joint
-    if plain is None:
+    first_fit, runs, first_joint = fit, fit.task.runs, fit.joint
+    if first_joint is None:
         raise InternalError("a fit by output error has no optimum; please report it")
-    joint = plain
+    joint = first_joint
     for _ in range(MAX_ALTERNATIONS):
-        residuals = _residuals(first, joint, runs)
-        colour = _noise_model(residuals)
-        white = tuple(whiten(run, colour) for run in runs)
-        fit = refit(Task(white, replace(first.task.structure, initial=joint.initial)), joint)
+        residuals = _residuals(first_fit, joint, runs)
+        noise_filter = _noise_model(residuals)
+        whitened_runs = tuple(whiten(run, noise_filter) for run in runs)
+        fit = refit(Task(whitened_runs, replace(first_fit.task.structure, initial=joint.initial)), joint)
         joint_before, joint = joint, fit.joint or joint
         errors = np.sqrt(np.diag(joint.covariance))
         if np.all(np.abs(joint.values - joint_before.values) <= ALTERNATION_TOLERANCE * errors):
@@ -96,16 +96,16 @@ def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
             break
     else:
         findings = [*fit.findings, make_finding("not_converged")]
-    order = colour.size - 1
-    joint = replace(joint, starts=plain.starts, covariance=_with_noise_model_errors(fit, joint, residuals, order))
+    order = noise_filter.size - 1
+    joint = replace(joint, starts=first_joint.starts, covariance=_with_noise_model_errors(fit, joint, residuals, order))
     return replace(
         fit,
-        task=first.task,
-        model=replace(fit.model, structure=replace(fit.model.structure, initial=first.model.structure.initial)),
+        task=first_fit.task,
+        model=replace(fit.model, structure=replace(fit.model.structure, initial=first_fit.model.structure.initial)),
         findings=findings,
         joint=joint,
         covariance=number_covariance(joint, FreeProblem.of(replace(fit.task.structure, initial=joint.initial))),
-        settings={**fit.settings, "starts": len(joint.starts), "noise_model": colour[1:].tolist()},
+        settings={**fit.settings, "starts": len(joint.starts), "noise_model": noise_filter[1:].tolist()},
     )
 
 
@@ -114,9 +114,11 @@ def _noise_model(residuals: Sequence[Floats]) -> Floats:
     order = autoregression(residuals, DEFAULT_LAGS).size - 1
     if order == 0:
         return np.ones(1)
-    past, now = _lag_columns(residuals, order), np.concatenate(residuals)
-    is_complete = np.isfinite(now) & np.isfinite(past).all(axis=1)
-    return np.concatenate([[1.0], -minimum_norm_solution(past[is_complete], now[is_complete], LAG_RANK_TOLERANCE)])
+    regressors, targets = _lag_columns(residuals, order), np.concatenate(residuals)
+    is_complete = np.isfinite(targets) & np.isfinite(regressors).all(axis=1)
+    return np.concatenate(
+        [[1.0], -minimum_norm_solution(regressors[is_complete], targets[is_complete], LAG_RANK_TOLERANCE)]
+    )
 
 
 def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
@@ -128,17 +130,20 @@ def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
     return np.stack([np.concatenate(column) for column in columns], axis=1)
 
 
-def whiten(run: Run, colour: Floats) -> Run:
-    """Return a run whose signals are filtered by A(q) with coefficients `colour`; its first outputs are missing."""
-    past = colour.size - 1
+def whiten(run: Run, noise_filter: Floats) -> Run:
+    """Return a run with signals filtered by A(q), coefficients `noise_filter`; its first outputs are missing."""
+    filter_order = noise_filter.size - 1
 
     def whitened_samples(values: Floats) -> Floats:
-        return np.convolve(values, colour)[: values.size]
+        return np.convolve(values, noise_filter)[: values.size]
 
     return Run.from_arrays(
         step=run.step,
         inputs={n: whitened_samples(run[n]) for n in run.inputs},
-        outputs={n: np.concatenate([np.full(past, np.nan), whitened_samples(run[n])[past:]]) for n in run.outputs},
+        outputs={
+            n: np.concatenate([np.full(filter_order, np.nan), whitened_samples(run[n])[filter_order:]])
+            for n in run.outputs
+        },
         units={n: u for n, u in run.units.items() if u},
         intersample=run.intersample,
         name=run.name,
@@ -150,13 +155,15 @@ def _at_estimate(fit: Fit, joint: JointFit, runs: Sequence[Run], weight: float) 
     """Return the objective of a fit for `runs`, with the output weight `weight`, and its estimate as an iterate."""
     problem = FreeProblem.of(replace(fit.task.structure, initial=joint.initial))
     values = joint.values_by_name
-    return Objective(problem, runs, [weight], every=joint.refinement), start_from_values(problem, values)
+    return Objective(problem, runs, [weight], pulses_per_sample=joint.refinement), start_from_values(problem, values)
 
 
 def _residuals(fit: Fit, joint: JointFit, runs: Sequence[Run]) -> list[Floats]:
     """Return the residuals of the simulation by run; NaN for missing samples."""
-    grid, start = _at_estimate(fit, joint, runs, 1.0)
-    return [series for part in grid.residuals(grid.evaluate(start)) for series in part.values()]
+    objective, start = _at_estimate(fit, joint, runs, 1.0)
+    return [
+        series for run_residuals in objective.residuals(objective.evaluate(start)) for series in run_residuals.values()
+    ]
 
 
 def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floats], order: int) -> Floats:
@@ -168,8 +175,8 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
     """
     if order == 0:
         return joint.covariance
-    grid, start = _at_estimate(fit, joint, fit.task.runs, 1.0 / max(*joint.noise.values(), 1e-300))
-    rows = np.asarray(grid.minimize(start, 1, plain=True).outcome["jacobian"])
+    objective, start = _at_estimate(fit, joint, fit.task.runs, 1.0 / max(*joint.noise.values(), 1e-300))
+    rows = np.asarray(objective.minimize(start, 1, linear_scale=True).outcome["jacobian"])
     scale = 1.0 / np.maximum(column_norms(rows.T), 1e-300)
     rows = rows * scale[:, None]
     # Lagged residuals are set to 0 at missing samples, at which the sensitivities are 0.
@@ -177,8 +184,8 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
         np.nan_to_num(_lag_columns(residuals, order)) * np.any(rows != 0.0, axis=0)[:, None], LAG_RANK_TOLERANCE
     )
     residual_rows = rows - (rows @ basis) @ basis.T
-    added = np.linalg.pinv(residual_rows @ residual_rows.T) - np.linalg.pinv(rows @ rows.T)
-    covariance: Floats = joint.covariance + scale[:, None] * added * scale
+    additional_covariance = np.linalg.pinv(residual_rows @ residual_rows.T) - np.linalg.pinv(rows @ rows.T)
+    covariance: Floats = joint.covariance + scale[:, None] * additional_covariance * scale
     return covariance
 
 
@@ -270,9 +277,11 @@ class OutputError:
                 f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
             )
         if self.noise == "ar" and (self.reference is not None or self.intervals == "profile" or self.loss != "squares"):
-            other = "reference" if self.reference is not None else "loss" if self.loss != "squares" else "intervals"
+            conflicting_option = (
+                "reference" if self.reference is not None else "loss" if self.loss != "squares" else "intervals"
+            )
             raise ModelError(
-                f"{parameter('noise', 'ar')} is not used with {parameter(other)}; leave one of the two out"
+                f"{parameter('noise', 'ar')} is not used with {parameter(conflicting_option)}; leave one of the two out"
             )
 
     def fit(
@@ -297,26 +306,39 @@ class OutputError:
             )
         if self.reference is not None:
             check_linear(structure.equations, f"the instrument {parameter('reference', self.reference)}")
-        workers, answers, weak = check_threads(threads), None, list[Finding]()
+        workers, noise_free_runs, instrument_findings = check_threads(threads), None, list[Finding]()
         if self.reference is not None:
-            answers, weak = instrument_runs(runs, structure, self.reference)
-        begin = self.start.model if isinstance(self.start, Identification) else self.start
+            noise_free_runs, instrument_findings = instrument_runs(runs, structure, self.reference)
+        start_model = self.start.model if isinstance(self.start, Identification) else self.start
         values = self.start.parameters.items() if isinstance(self.start, Identification) else ()
-        more = {n: p.value for n, p in values if not p.fixed}
-        structure, bounds = check_bounds(structure, self.bounds, begin)
+        start_values = {n: p.value for n, p in values if not p.fixed}
+        structure, bounds = check_bounds(structure, self.bounds, start_model)
         if self.noise == "ar":
             check_noise_model(runs, structure)
 
-        def estimate(variant: Structure, only: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
+        def estimate(variant: Structure, single_guess: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
             fixed = set(structure.coefficient_names) - set(variant.coefficient_names)
-            guess = begin
-            if fixed and isinstance(begin, Mapping):
-                guess = {n: v for n, v in begin.items() if n not in fixed} or None
-            task, first, alone = Task(tuple(runs), variant), guess if only is None else only, only is not None
+            guess = start_model
+            if fixed and isinstance(start_model, Mapping):
+                guess = {n: v for n, v in start_model.items() if n not in fixed} or None
+            task, guess_or_start, single_start = (
+                Task(tuple(runs), variant),
+                guess if single_guess is None else single_guess,
+                single_guess is not None,
+            )
             if self.noise == "ar":
                 fit = fit_noise_model(
                     estimate_output_error(
-                        task, m, workers, progress, None, self.loss, "quadratic", first, more, alone=alone
+                        task,
+                        m,
+                        workers,
+                        progress,
+                        None,
+                        self.loss,
+                        "quadratic",
+                        guess_or_start,
+                        start_values,
+                        alone=single_start,
                     ),
                     lambda white, joint: estimate_output_error(
                         white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, alone=True
@@ -324,13 +346,23 @@ class OutputError:
                 )
             else:
                 fit = estimate_output_error(
-                    task, m, workers, progress, answers, self.loss, self.intervals, first, more, alone, fitted
+                    task,
+                    m,
+                    workers,
+                    progress,
+                    noise_free_runs,
+                    self.loss,
+                    self.intervals,
+                    guess_or_start,
+                    start_values,
+                    single_start,
+                    fitted,
                 )
             return fit, {} if fit.joint is None else fit.joint.values_by_name
 
         fit, bound_findings = fit_within_bounds(structure, bounds, estimate)
         fit = replace(fit, findings=[*fit.findings, *bound_findings])
-        return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
+        return fit if self.reference is None else with_reference_findings(fit, self.reference, instrument_findings)
 
     @property
     def hypothesis(self) -> OutputError | None:
@@ -496,17 +528,16 @@ def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMeth
     """Return the named method with the given options; raise ModelError for an option that it lacks."""
     check_choice("method", name, METHODS_BY_NAME)
     names = {method: [f.name for f in fields(kind)] for method, kind in METHODS_BY_NAME.items()}
-    foreign = [option for option in options if option not in names[name]]
-    if foreign:
+    unused = [option for option in options if option not in names[name]]
+    if unused:
         users = " or ".join(
-            parameter("method", method)
-            for method, options_of_method in names.items()
-            if foreign[0] in options_of_method
+            parameter("method", method) for method, options_of_method in names.items() if unused[0] in options_of_method
         )
-        count = len(foreign) - 1
-        others = f", nor {count} other{'s' if count > 1 else ''} given here" if count else ""
+        count = len(unused) - 1
+        further_options = f", nor {count} other{'s' if count > 1 else ''} given here" if count else ""
         raise ModelError(
-            f"{parameter(foreign[0])} is not used by {parameter('method', name)}{others}; leave it out, or use {users}"
+            f"{parameter(unused[0])} is not used by {parameter('method', name)}{further_options}; leave it out, or "
+            f"use {users}"
         )
     estimator: EstimationMethod = METHODS_BY_NAME[name](**options)
     return estimator

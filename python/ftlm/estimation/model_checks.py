@@ -141,13 +141,14 @@ def second_optimum_findings(
     as (values, decrease of the log likelihood, standard errors by name). Each difference is compared with the larger of
     the two standard errors.
     """
-    for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
-        if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
+    for optimum_values, likelihood_decrease, optimum_errors in sorted(optima, key=lambda optimum: optimum[1]):
+        if likelihood_decrease > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
         differences_text = [
             f"{n} = {other_value:.4g} for {value:.4g}"
-            for n, value, other_value in zip(names, values.tolist(), other.tolist(), strict=True)
-            if math.isfinite(errors[n]) and abs(other_value - value) > SECOND_OPTIMUM_ERRORS * max(errors[n], own[n])
+            for n, value, other_value in zip(names, values.tolist(), optimum_values.tolist(), strict=True)
+            if math.isfinite(errors[n])
+            and abs(other_value - value) > SECOND_OPTIMUM_ERRORS * max(errors[n], optimum_errors[n])
         ]
         if differences_text:
             differences = ", ".join(text.partition(" = ")[0] for text in differences_text)
@@ -156,7 +157,7 @@ def second_optimum_findings(
                     "second_optimum",
                     parameter=differences,
                     shown=", ".join(differences_text),
-                    difference=max(fall, 0.0),
+                    difference=max(likelihood_decrease, 0.0),
                 )
             ]
     return []
@@ -169,7 +170,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
     """
     errors = [joint.standard_errors[n] for n in joint.names]
     best_cost = min((cost for cost, _ in joint.survivors), default=0.0)
-    far = [
+    distinct = [
         np.array(values)
         for cost, values in joint.survivors
         if cost <= MAX_SECOND_COST_RATIO * best_cost
@@ -178,22 +179,33 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
             for a, b, e in zip(joint.values.tolist(), values, errors, strict=True)
         )
     ]
-    exact = len(joint.exact_outputs(runs)) == len(problem.structure.outputs)
-    if not far or exact or joint.robust is not None or not problem.structure.is_linear:
+    is_exact = len(joint.exact_outputs(runs)) == len(problem.structure.outputs)
+    if not distinct or is_exact or joint.robust is not None or not problem.structure.is_linear:
         return []
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-    first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
-    parts = [run.window(0.0, first * run.step) if run.length > 2 * first else run for run in runs]
-    optima = [(values, 0.0) for values in far]
+    sample_limit = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
+    shortened_runs = [
+        run.window(0.0, sample_limit * run.step) if run.length > 2 * sample_limit else run for run in runs
+    ]
+    optima = [(values, 0.0) for values in distinct]
     # A second optimum on all samples is also one on the first part, on which the search is cheaper.
-    for some in [parts, runs] if any(part is not run for part, run in zip(parts, runs, strict=True)) else [runs]:
-        objective = Objective(problem, some, weights, every=joint.refinement)
+    for compared_runs in (
+        [shortened_runs, runs]
+        if any(part is not run for part, run in zip(shortened_runs, runs, strict=True))
+        else [runs]
+    ):
+        objective = Objective(problem, compared_runs, weights, pulses_per_sample=joint.refinement)
         optima = _other_optima(objective, joint.values, [values for values, _ in optima]) if optima else []
-    own = joint.standard_errors
-    return second_optimum_findings(joint.names, joint.values, own, [(values, fall, own) for values, fall in optima])
+    standard_errors = joint.standard_errors
+    return second_optimum_findings(
+        joint.names,
+        joint.values,
+        standard_errors,
+        [(values, likelihood_decrease, standard_errors) for values, likelihood_decrease in optima],
+    )
 
 
-def _other_optima(objective: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
+def _other_optima(objective: Objective, optimum: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
     """Return other optima that are almost as likely as the best one but have other simulated outputs.
 
     Each is returned as (values, decrease of the log likelihood). The result is [] if a fit from one of `starts` fails.
@@ -202,17 +214,17 @@ def _other_optima(objective: Objective, best: Floats, starts: Sequence[Floats]) 
     def fit(values: Floats) -> tuple[Floats, float, Floats]:
         orders, coefficients, inputs = objective.problem.split(values.tolist())
         start = Iterate(orders, coefficients, "second optimum", {}, inputs)
-        end = objective.minimize(start, MAX_SECOND_EVALUATIONS, plain=True)
-        return end.values, float(end.outcome["cost"]), np.asarray(end.outcome["residuals"])
+        fitted = objective.minimize(start, MAX_SECOND_EVALUATIONS, linear_scale=True)
+        return fitted.values, float(fitted.outcome["cost"]), np.asarray(fitted.outcome["residuals"])
 
     optima = []
     try:
-        _, cost, residuals = fit(best)
+        _, cost, residuals = fit(optimum)
         for start in starts:
-            values, cost_there, series = fit(start)
+            values, reference_cost, series = fit(start)
             is_other = float(np.sum((series - residuals) ** 2)) > SAME_MODEL_POWER
-            if is_other and cost_there - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
-                optima.append((values, cost_there - cost))
+            if is_other and reference_cost - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
+                optima.append((values, reference_cost - cost))
     except FtlmError:
         # The path between the optima has no finite simulation.
         return []
@@ -241,16 +253,16 @@ def _has_bounded_interval(joint: JointFit, name: str) -> bool:
 
 def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) -> list[Finding]:
     """Return a finding on parameters whose confidence interval is unbounded, except unidentifiable ones."""
-    sides = {
+    unbounded_sides = {
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items()
         if n not in unidentifiable
     }
-    open_ended = {n: s for n, s in sides.items() if s}
+    open_ended = {n: s for n, s in unbounded_sides.items() if s}
     if not open_ended:
         return []
-    words = [f"{n} {' or '.join(s)}" for n, s in open_ended.items()]
-    return [make_finding("interval_open", parameter=", ".join(open_ended), sides=", ".join(words))]
+    texts = [f"{n} {' or '.join(s)}" for n, s in open_ended.items()]
+    return [make_finding("interval_open", parameter=", ".join(open_ended), sides=", ".join(texts))]
 
 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
@@ -261,7 +273,9 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
     """
     exact = joint.exact_outputs(runs)
     outputs = [o for o in problem.structure.outputs if o not in exact]
-    colored_outputs = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
+    colored_outputs = [
+        o for o in sorted(outputs) if not all(is_white(run_residuals[o]) for run_residuals in joint.residuals)
+    ]
     findings = []
     if outputs and not joint.step_converged:
         findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
@@ -294,8 +308,8 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
             inputs = enumerate_names([n for n in first_changes if np.any(run[n])])
             findings.append(make_finding("rest_assumed", run=run.name, input=inputs, row=row, shown=levels))
         elif evidence.rows and resolved.offset == "level":
-            driven = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
-            other_inputs = f" with {enumerate_names(driven)}" if driven else ""
+            nonzero_inputs = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
+            other_inputs = f" with {enumerate_names(nonzero_inputs)}" if nonzero_inputs else ""
             level_text = f"the run rests at {levels}{other_inputs}"
             findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=level_text))
         findings += _early_output_findings(run, structure, evidence)
@@ -312,24 +326,24 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         return []
     changes = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
     findings = []
-    for item in structure.equations:
-        driven = [t for t in item.terms if t.signal in changes]
-        direct = any(t.order == item.order for t in driven)
-        if not driven or direct or any(run.intersample[t.signal] != ZERO_ORDER_HOLD for t in driven):
+    for equation in structure.equations:
+        input_terms = [t for t in equation.terms if t.signal in changes]
+        direct = any(t.order == equation.order for t in input_terms)
+        if not input_terms or direct or any(run.intersample[t.signal] != ZERO_ORDER_HOLD for t in input_terms):
             continue
-        y, level = run[item.output], evidence.levels[item.output]
+        y, level = run[equation.output], evidence.levels[equation.output]
         noise = noise_at_start(y)
-        early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
-        rows = early / slope if slope else math.inf
+        excursion, slope = float(y[row]) - level, float(y[row + 1] - y[row])
+        rows = excursion / slope if slope else math.inf
         # A drifting output also deviates from its mean level, but its last increment is not larger than the others.
         increments = np.diff(drop_missing(y[: row + 1]))
-        usual = max(noise, float(np.sqrt(np.mean(increments[:-1] ** 2))))
-        is_early = abs(early) > EARLY_SIGMAS * noise and abs(increments[-1]) > EARLY_SIGMAS * usual
+        usual_increment = max(noise, float(np.sqrt(np.mean(increments[:-1] ** 2))))
+        is_early = abs(excursion) > EARLY_SIGMAS * noise and abs(increments[-1]) > EARLY_SIGMAS * usual_increment
         if is_early and EARLY_ROWS[0] <= rows <= EARLY_ROWS[1]:
-            numbers = {"row": row, "size": abs(early) / noise, "rows": rows}
-            inputs = enumerate_names([t.signal for t in driven])
-            about = {"run": run.name, "output": item.output, "input": inputs}
-            findings.append(make_finding("moves_before_input", **about, **numbers))
+            details = {"row": row, "size": abs(excursion) / noise, "rows": rows}
+            inputs = enumerate_names([t.signal for t in input_terms])
+            location = {"run": run.name, "output": equation.output, "input": inputs}
+            findings.append(make_finding("moves_before_input", **location, **details))
     return findings
 
 
@@ -338,37 +352,39 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
     if joint.robust is not None:
         return []
     series = [joint.noise[output] * part[output] for part in joint.residuals]
-    every = drop_missing(np.concatenate(series))
+    all_residuals = drop_missing(np.concatenate(series))
     outputs = [compared_values(run, structure, output) for run in runs]
     speeds = [_simulated_speeds(y, part) for y, part in zip(outputs, series, strict=True)]
-    usual = _usual_deviations(np.concatenate(series), np.concatenate(speeds))
-    power, far, first = 0.0, 0, ""
-    limits = np.split(OUTLIER_DEVIATIONS * usual, np.cumsum([part.size for part in series])[:-1])
+    usual_deviations = _usual_deviations(np.concatenate(series), np.concatenate(speeds))
+    power, outlier_count, first_text = 0.0, 0, ""
+    limits = np.split(OUTLIER_DEVIATIONS * usual_deviations, np.cumsum([part.size for part in series])[:-1])
     for run, part, limit in zip(runs, series, limits, strict=True):
         rows = np.flatnonzero(np.abs(part) > limit)
         power += float(np.sum(part[rows] ** 2))
-        if rows.size and not far:
+        if rows.size and not outlier_count:
             # The first residual belongs to the second sample of a run.
-            first = f"first at row {int(rows[0]) + 1} of {run.name}"
-        far += rows.size
-    count = every.size
-    share = power / max(dot(every, every), 1e-300)
-    if not np.any(usual > 0.0) or (
-        share < MIN_OUTLIER_POWER_FRACTION and far < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)
+            first_text = f"first at row {int(rows[0]) + 1} of {run.name}"
+        outlier_count += rows.size
+    count = all_residuals.size
+    power_fraction = power / max(dot(all_residuals, all_residuals), 1e-300)
+    if not np.any(usual_deviations > 0.0) or (
+        power_fraction < MIN_OUTLIER_POWER_FRACTION and outlier_count < max(MIN_OUTLIERS, MIN_OUTLIER_FRACTION * count)
     ):
         return []
-    verb, holds, noun = ("lies", "contributes", "an outlier") if far == 1 else ("lie", "contribute", "outliers")
+    verb, contribution_verb, noun = (
+        ("lies", "contributes", "an outlier") if outlier_count == 1 else ("lie", "contribute", "outliers")
+    )
     return [
         make_finding(
-            "outliers_dominate" if share >= MIN_OUTLIER_POWER_FRACTION else "outliers",
+            "outliers_dominate" if power_fraction >= MIN_OUTLIER_POWER_FRACTION else "outliers",
             output=output,
-            count=far,
+            count=outlier_count,
             total=count,
             deviations=OUTLIER_DEVIATIONS,
-            power=100 * share,
-            first=first,
+            power=100 * power_fraction,
+            first=first_text,
             verb=verb,
-            holds=holds,
+            holds=contribution_verb,
             noun=noun,
         )
     ]
@@ -380,8 +396,8 @@ def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
     The simulated output is the measured one minus the residuals, so outliers of the measurement do not affect it.
     """
     simulated = interpolate_gaps(samples[1 : 1 + residuals.size] - residuals)
-    steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
-    return np.maximum(steps[:-1], steps[1:])
+    increments = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
+    return np.maximum(increments[:-1], increments[1:])
 
 
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
@@ -391,19 +407,23 @@ def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
     grow with speed, such as those of timing or gain errors, are therefore not outliers. If the machine is at rest
     during most of the run, samples in motion are not outliers either.
     """
-    usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
+    deviations = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
     finite_rows = np.flatnonzero(~np.isnan(residuals))
     for rows in np.array_split(
         finite_rows[np.argsort(speeds[finite_rows], kind="stable")], max(finite_rows.size // ROWS_OF_ONE_SPEED, 1)
     ):
-        usual[rows] = np.maximum(usual[rows], robust_deviation(residuals[rows]))
-    return usual
+        deviations[rows] = np.maximum(deviations[rows], robust_deviation(residuals[rows]))
+    return deviations
 
 
 def _quantization_findings(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> list[Finding]:
     """Return a finding if the quantization step of an output exceeds `QUANTIZATION_NOISE_RATIO` times its noise."""
-    steps = [quantization_step(drop_missing(compared_values(run, structure, output))) for run in runs]
-    coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > QUANTIZATION_NOISE_RATIO * noise]
+    quantization_steps = [quantization_step(drop_missing(compared_values(run, structure, output))) for run in runs]
+    coarse = [
+        (step, run)
+        for step, run in zip(quantization_steps, runs, strict=True)
+        if step > QUANTIZATION_NOISE_RATIO * noise
+    ]
     if not coarse:
         return []
     step, run = max(coarse, key=lambda pair: pair[0])
@@ -413,12 +433,12 @@ def _quantization_findings(runs: Sequence[Run], structure: Structure, output: st
 def correlation_findings(joint: JointFit) -> list[Finding]:
     """Return findings on groups of parameters that are not separately identifiable, one per group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
-    sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
+    magnitudes = {n: abs(v) for n, v in joint.values_by_name.items()}
     # Negated so that a NaN standard error counts as too large.
     uncertain = [
         i
         for i, n in enumerate(joint.names)
-        if not errors[n] <= MAX_RELATIVE_STANDARD_ERROR * (1.0 if n in joint.orders else sizes[n])
+        if not errors[n] <= MAX_RELATIVE_STANDARD_ERROR * (1.0 if n in joint.orders else magnitudes[n])
     ]
     groups: list[list[int]] = []
     for i in uncertain:
@@ -426,11 +446,13 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
         groups = [g for g in groups if g not in inseparable] + [sorted([*(j for g in inseparable for j in g), i])]
     findings = []
     for group in (g for g in groups if len(g) > 1):
-        *most, last = (joint.names[i] for i in group)
+        *first_names, last = (joint.names[i] for i in group)
         finite_values = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
-        of = "correlation" if len(group) == 2 else "correlations up to"
-        why = f"{of} {max(finite_values):.4f}" if finite_values else "their standard errors are not finite"
-        findings.append(make_finding("parameters_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
+        noun = "correlation" if len(group) == 2 else "correlations up to"
+        why = f"{noun} {max(finite_values):.4f}" if finite_values else "their standard errors are not finite"
+        findings.append(
+            make_finding("parameters_correlated", parameter=f"{', '.join(first_names)} and {last}", why=why)
+        )
     return findings
 
 
@@ -447,14 +469,16 @@ def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bo
 
 def excitation_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
     """Return a finding for each equation whose free parameters are not excited in any run."""
-    lacking = [{f.output: f for f in check_excitation(run, structure)} for run in runs]
-    return [item for output, item in lacking[0].items() if all(output in other for other in lacking)]
+    findings_by_run = [{f.output: f for f in check_excitation(run, structure)} for run in runs]
+    return [
+        finding for output, finding in findings_by_run[0].items() if all(output in other for other in findings_by_run)
+    ]
 
 
 def dead_channel_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
     """Return findings on measured outputs that are constant during part of a run although they vary otherwise."""
     channels = [(r.with_interpolated_gaps(), n) for r in runs for n in r.outputs if n in structure.signals]
-    return [item for run, name in channels for item in find_dead_channel(run, name)]
+    return [finding for run, name in channels for finding in find_dead_channel(run, name)]
 
 
 def coefficient_law_findings(model: Model) -> list[Finding]:
@@ -472,14 +496,14 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
     for name, sign, factors in law:
         free = [f for f in factors if f not in values]
         factor_values = [values[f] for f in factors if f in values]
-        rest = math.prod(factor_values)
-        if name in values and len(free) == 1 and factor_values and rest:
-            ratios.setdefault(free[0], []).append((name, sign * values[name] / rest))
-    for ratio, entries in ratios.items():
-        wrong = [(n, v) for n, v in entries if not v > 1]
-        if wrong:
-            listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
-            findings.append(make_finding("inertia_ratio_broken", parameter=ratio, listed=listed))
+        other_factors = math.prod(factor_values)
+        if name in values and len(free) == 1 and factor_values and other_factors:
+            ratios.setdefault(free[0], []).append((name, sign * values[name] / other_factors))
+    for ratio, estimates in ratios.items():
+        violating = [(n, v) for n, v in estimates if not v > 1]
+        if violating:
+            values_text = ", ".join(f"{v:.4g} by {n}" for n, v in violating)
+            findings.append(make_finding("inertia_ratio_broken", parameter=ratio, listed=values_text))
     return findings
 
 
@@ -490,15 +514,15 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
     The discretization then has an unstable mode at the Nyquist frequency, which the model does not have.
     """
     findings = []
-    for item in model.equations:
-        own = [
-            (float(t.fixed or 0.0), item.order.constant - t.order.constant)
-            for t in item.terms
-            if t.column == item.output
+    for equation in model.equations:
+        output_terms = [
+            (float(t.fixed or 0.0), equation.order.constant - t.order.constant)
+            for t in equation.terms
+            if t.column == equation.output
         ]
-        margin = min(_core.nyquist_margin(own, step) for step in comparison.step)
+        margin = min(_core.nyquist_margin(output_terms, step) for step in comparison.step)
         if margin <= 0:
-            findings.append(make_finding("scheme_unstable", output=item.output, m=comparison.m, margin=margin))
+            findings.append(make_finding("scheme_unstable", output=equation.output, m=comparison.m, margin=margin))
     return findings
 
 
@@ -507,35 +531,40 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
 
-    def turns(samples: Floats) -> bool:
-        steps, least = np.diff(samples), MIN_MOTION_RANGE_FRACTION * float(np.ptp(samples))
-        return bool(np.any(steps > least) and np.any(steps < -least))
+    def reverses(samples: Floats) -> bool:
+        increments, threshold = np.diff(samples), MIN_MOTION_RANGE_FRACTION * float(np.ptp(samples))
+        return bool(np.any(increments > threshold) and np.any(increments < -threshold))
 
     return [
         make_finding("friction_unsigned", output=model.outputs[i])
         for i in model.structure.friction_equations
-        if not any(turns(run.outputs[i]) for run in free)
+        if not any(reverses(run.outputs[i]) for run in free)
     ]
 
 
 def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
     """Return findings if no run distinguishes friction at low speed from friction at high speed."""
     findings = []
-    for item in model.equations:
-        near = None if item.friction is None else item.friction.stribeck
-        if near is None or (near.name is None and near.speed_name is None):
+    for equation in model.equations:
+        stribeck = None if equation.friction is None else equation.friction.stribeck
+        if stribeck is None or (stribeck.name is None and stribeck.speed_name is None):
             continue
-        vs, column = float(near.speed), model.outputs.index(item.output)
-        paces = [
+        vs, column = float(stribeck.speed), model.outputs.index(equation.output)
+        speeds_by_run = [
             np.abs(np.diff(simulated.outputs[column])) / run.step for run, simulated in zip(runs, free, strict=True)
         ]
-        pace = np.concatenate([p[p > MIN_MOTION_RANGE_FRACTION * p.max(initial=0.0)] for p in paces])
-        slow = int(np.sum(pace < SLOW_SPEED_RATIO * vs))
-        if slow < MIN_SLOW_INTERVALS:
-            numbers = {"ratio": SLOW_SPEED_RATIO, "speed": SLOW_SPEED_RATIO * vs, "slow": slow, "total": pace.size}
-            findings.append(make_finding("slow_motion_missing", output=item.output, **numbers))
-        elif pace.max(initial=0.0) < vs:
-            findings.append(make_finding("fast_motion_missing", output=item.output, speed=vs))
+        speeds = np.concatenate([p[p > MIN_MOTION_RANGE_FRACTION * p.max(initial=0.0)] for p in speeds_by_run])
+        slow_count = int(np.sum(speeds < SLOW_SPEED_RATIO * vs))
+        if slow_count < MIN_SLOW_INTERVALS:
+            details = {
+                "ratio": SLOW_SPEED_RATIO,
+                "speed": SLOW_SPEED_RATIO * vs,
+                "slow": slow_count,
+                "total": speeds.size,
+            }
+            findings.append(make_finding("slow_motion_missing", output=equation.output, **details))
+        elif speeds.max(initial=0.0) < vs:
+            findings.append(make_finding("fast_motion_missing", output=equation.output, speed=vs))
     return findings
 
 
@@ -572,8 +601,8 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
     if samples >= MIN_SAMPLES_PER_PERIOD:
         return []
     loss = 100.0 * (1.0 - float(np.sinc(1.0 / samples)))
-    about = {"frequency": fastest, "samples": samples, "phase": 180.0 / samples, "loss": loss}
-    return [make_finding("mode_sampled_coarsely", **about)]
+    details = {"frequency": fastest, "samples": samples, "phase": 180.0 / samples, "loss": loss}
+    return [make_finding("mode_sampled_coarsely", **details)]
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
@@ -599,7 +628,7 @@ def _has_significant_growth(model: Model, coupling: str) -> bool:
         (mode.damping, mode.damping_error) if mode.oscillatory else (mode.frequency, mode.frequency_error)
         for mode in unstable
     ]
-    return not ratios or any(not error or abs(part) > GROWTH_SIGMAS * error for part, error in ratios)
+    return not ratios or any(not error or abs(real_part) > GROWTH_SIGMAS * error for real_part, error in ratios)
 
 
 def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
@@ -613,22 +642,25 @@ def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
         return False
     matrix, values = covariance.copy(), parameter_vector(model)
     at, terms = 0, list[int]()
-    for item in model.equations:
-        terms += [at + 2 + 2 * k for k, t in enumerate(item.terms) if t.column in model.outputs]
-        at += 1 + 2 * len(item.terms)
+    for equation in model.equations:
+        terms += [at + 2 + 2 * k for k, t in enumerate(equation.terms) if t.column in model.outputs]
+        at += 1 + 2 * len(equation.terms)
     variances, statistic = np.diagonal(matrix).copy(), 0.0
     for eliminated in range(1, len(terms) + 1):
         # A coefficient without remaining variance is fixed, or determined by the eliminated ones.
         free = [i for i in terms if matrix[i, i] > MIN_VARIANCE_RATIO * variances[i]]
         if not free:
             return False
-        least = min(free, key=lambda i: values[i] ** 2 / matrix[i, i])
-        statistic += values[least] ** 2 / matrix[least, least]
+        least_significant = min(free, key=lambda i: values[i] ** 2 / matrix[i, i])
+        statistic += values[least_significant] ** 2 / matrix[least_significant, least_significant]
         if not statistic <= chi_squared(eliminated, 2.0 * (1.0 - GROWTH_LEVEL)):
             return False
-        column = matrix[:, least] / matrix[least, least]
-        values, matrix = values - column * values[least], matrix - np.outer(column, matrix[least])
-        values[least], matrix[least], matrix[:, least] = 0.0, 0.0, 0.0
+        column = matrix[:, least_significant] / matrix[least_significant, least_significant]
+        values, matrix = (
+            values - column * values[least_significant],
+            matrix - np.outer(column, matrix[least_significant]),
+        )
+        values[least_significant], matrix[least_significant], matrix[:, least_significant] = 0.0, 0.0, 0.0
         try:
             if not with_parameter_vector(model, values).stability(coupling=coupling).unstable_poles > 0:
                 return True

@@ -51,7 +51,7 @@ def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comp
     not tested. An estimation run may not excite the dynamics that a model lacks, so that only a validation run shows
     them.
     """
-    estimate, several = model.estimate, as_runs(runs)
+    estimate, run_list = model.estimate, as_runs(runs)
     if estimate is None or estimate.covariance is None:
         return []
     if any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings):
@@ -59,13 +59,13 @@ def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comp
 
     def sensitivities() -> dict[str, list[Floats]]:
         with contextlib.suppress(FtlmError):
-            every = simulation_sensitivities(model, several, comparison)
-            return {name: [rows[:, 1:-1] for rows in each] for name, each in every.items()}
+            by_output = simulation_sensitivities(model, run_list, comparison)
+            return {name: [rows[:, 1:-1] for rows in each] for name, each in by_output.items()}
         return {}
 
     try:
-        free = simulate_runs(model, several)
-        tests = run_residual_tests(model, several, free, lags=DEFAULT_LAGS, sensitivities=sensitivities)
+        free = simulate_runs(model, run_list)
+        tests = run_residual_tests(model, run_list, free, lags=DEFAULT_LAGS, sensitivities=sensitivities)
     except FtlmError:
         # The runs are too short for correlations, or a simulation fails, which other findings report.
         return []
@@ -73,9 +73,9 @@ def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comp
     for name, output in tests.outputs.items():
         signals = [s for s, test in output.informative_tests.items() if test.failed]
         if signals and output.nr > NEGLIGIBLE_RESIDUAL_RATIO:
-            words = enumerate_names(signals)
+            names_text = enumerate_names(signals)
             findings.append(
-                make_finding("validation_follows_input", output=name, input=", ".join(signals), shown=words)
+                make_finding("validation_follows_input", output=name, input=", ".join(signals), shown=names_text)
             )
     return findings
 
@@ -109,6 +109,6 @@ def simulation_sensitivities(
         step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
         shifted = compare(with_parameter_vector(model, values + step * np.eye(values.size)[k]), runs)
         for name, each in comparison.simulated.items():
-            for column, centre, other in zip(columns[name], each, shifted.simulated[name], strict=True):
-                column.append((other - centre) / step)
+            for column, reference_samples, other in zip(columns[name], each, shifted.simulated[name], strict=True):
+                column.append((other - reference_samples) / step)
     return {name: [np.array(column) for column in each] for name, each in columns.items()}

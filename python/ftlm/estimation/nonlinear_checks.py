@@ -34,7 +34,7 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputS
     if not model.structure.has_nonlinear_terms or not finite or any(run.sample_times is not None for run in runs):
         return []
     values = [_signal_values(model, run, samples) for run, samples in zip(runs, free, strict=True)]
-    findings = [f for item in model.equations for f in _term_findings(item, runs, values)]
+    findings = [f for equation in model.equations for f in _term_findings(equation, runs, values)]
     return [*findings, *_sensitivity_growth_findings(model, runs, free)]
 
 
@@ -54,7 +54,7 @@ def _derive(values: Floats, order: float, step: float) -> Floats:
         return values
     if order < 0:
         return integrate(values, -order, step=step)
-    return differentiate(values - values[0], order, step, smooth=False)
+    return differentiate(values - values[0], order, step, local_smoothing=False)
 
 
 def _channel_values(values: dict[str, Floats], one: Channel, step: float) -> Floats:
@@ -65,22 +65,22 @@ def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
     """Return the value of a term at every sample, from samples of the signals."""
     shape = term.nonlinear
     if shape is None:
-        inner = values[term.signal]
+        argument = values[term.signal]
     else:
-        inner = np.asarray(shape.evaluate({c: _channel_values(values, c, step) for c in shape.channels}))
-        inner = np.broadcast_to(inner, values[term.signal].shape)
-    return (term.fixed or 0.0) * _derive(inner, term.order.constant, step)
+        argument = np.asarray(shape.evaluate({c: _channel_values(values, c, step) for c in shape.channels}))
+        argument = np.broadcast_to(argument, values[term.signal].shape)
+    return (term.fixed or 0.0) * _derive(argument, term.order.constant, step)
 
 
-def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:
+def _term_findings(equation: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:
     """Yield a note on each non-linear term: its size relative to the highest derivative, and its signals' range."""
     pairs = list(zip(values, (run.step for run in runs), strict=True))
-    whole = [sum((_term_values(t, v, h) for t in item.terms), np.zeros(1)) for v, h in pairs]
-    size = _rms(whole)
-    for term in item.nonlinear_terms:
+    right_sides = [sum((_term_values(t, v, h) for t in equation.terms), np.zeros(1)) for v, h in pairs]
+    amplitude = _rms(right_sides)
+    for term in equation.nonlinear_terms:
         shape = term.nonlinear
-        share = _rms([_term_values(term, v, h) for v, h in pairs]) / size if size > 0 else math.nan
-        if shape is None or not math.isfinite(share):
+        fraction = _rms([_term_values(term, v, h) for v, h in pairs]) / amplitude if amplitude > 0 else math.nan
+        if shape is None or not math.isfinite(fraction):
             continue
         ranges = []
         for one in shape.channels:
@@ -88,10 +88,10 @@ def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[st
             ranges.append(f"{channel(*one)} from {ranges_seen.min():.3g} to {ranges_seen.max():.3g}")
         yield make_finding(
             "nonlinear_range",
-            output=item.output,
+            output=equation.output,
             term=term.format_operand({}),
-            share=100 * share,
-            whole=derivative(replace(item.order, constant=round(item.order.constant, 4)), item.output),
+            share=100 * fraction,
+            whole=derivative(replace(equation.order, constant=round(equation.order.constant, 4)), equation.output),
             ranges=", ".join(ranges),
         )
 
@@ -107,12 +107,12 @@ def _sensitivity_growth_findings(model: Model, runs: Sequence[Run], free: Sequen
     The output itself must not grow. As in chaotic motion, the end of the run then depends too strongly on the
     parameters for a meaningful fit to the whole run.
     """
-    numbers = parameter_vector(model)
+    theta = parameter_vector(model)
     worst: tuple[float, float, str] | None = None
     for run, samples in zip(runs, free, strict=True):
         half = run.length // 2
-        for k in np.flatnonzero(numbers):
-            perturbed = numbers.copy()
+        for k in np.flatnonzero(theta):
+            perturbed = theta.copy()
             perturbed[k] *= 1.0 + RELATIVE_CHANGE
             try:
                 simulations = [
@@ -122,14 +122,19 @@ def _sensitivity_growth_findings(model: Model, runs: Sequence[Run], free: Sequen
             except FtlmError:
                 continue
             y, change = simulations[0], np.abs(simulations[1] - simulations[0])
-            early, late = change[:, :half].max(), change[:, half:].max()
+            early_change, late_change = change[:, :half].max(), change[:, half:].max()
             is_growing = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
-            if is_growing or not early > 0 or not late > EXPONENTIAL_GROWTH * early or not math.isfinite(late):
+            if (
+                is_growing
+                or not early_change > 0
+                or not late_change > EXPONENTIAL_GROWTH * early_change
+                or not math.isfinite(late_change)
+            ):
                 continue
-            if worst is None or late / early > worst[0]:
-                first = float(change[:, : max(half // 4, 1)].max())
-                at = int(np.argmax(change.max(axis=0) > EXPONENTIAL_GROWTH * first))
-                worst = late / early, at * run.step, run.name
+            if worst is None or late_change / early_change > worst[0]:
+                initial_change = float(change[:, : max(half // 4, 1)].max())
+                at = int(np.argmax(change.max(axis=0) > EXPONENTIAL_GROWTH * initial_change))
+                worst = late_change / early_change, at * run.step, run.name
     if worst is None:
         return []
     return [make_finding("simulation_chaotic", run=worst[2], growth=worst[0], seconds=worst[1])]

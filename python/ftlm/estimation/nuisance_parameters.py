@@ -133,99 +133,110 @@ class OffsetTest:
 
 
 def evaluate_at_point(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], pulses_per_sample: int
 ) -> tuple[Objective, Iterate]:
     """Return the output-error objective and its evaluation at given parameters.
 
-    Output weights are the reciprocal RMS residuals, and `every` is the number of block pulses per sample. Raise
-    ConvergenceError if the residuals of an output are 0.
+    Output weights are the reciprocal RMS residuals, and `pulses_per_sample` is the number of block pulses per sample.
+    Raise ConvergenceError if the residuals of an output are 0.
     """
     structure = resolve_start(runs, structure)
     problem = FreeProblem.of(replace(structure, initial=resolve_common_initial_conditions(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Iterate(orders, coefficients, "given", {}, inputs)
-    grid = Objective(problem, runs, [1.0] * len(structure.outputs), every=every)
-    point = grid.minimize(start, 1, plain=True)
-    levels = grid.rms_residuals(point)
-    exact = [output for output, level in levels.items() if not level * MAX_SAMPLE_VALUE > 1.0]
-    if exact:
+    objective = Objective(problem, runs, [1.0] * len(structure.outputs), pulses_per_sample=pulses_per_sample)
+    point = objective.minimize(start, 1, linear_scale=True)
+    levels = objective.rms_residuals(point)
+    exact_outputs = [output for output, level in levels.items() if not level * MAX_SAMPLE_VALUE > 1.0]
+    if exact_outputs:
         raise ConvergenceError(
-            f"the residuals of {', '.join(exact)} are 0, so no statistic can be computed; use a longer record"
+            f"the residuals of {', '.join(exact_outputs)} are 0, so no statistic can be computed; use a longer record"
         )
     weights = [1.0 / level for level in levels.values()]
-    grid = replace(grid, weights=weights)
+    objective = replace(objective, weights=weights)
     if len(weights) > 1:
         # Initial terms are fitted to all outputs together, so they depend on the weights.
-        return grid, grid.minimize(point, 1, plain=True)
+        return objective, objective.minimize(point, 1, linear_scale=True)
     scaled = {n: weights[0] * np.asarray(point.outcome[n]) for n in ("residuals", "jacobian")}
     cost = weights[0] ** 2 * float(point.outcome["cost"])
-    return grid, replace(point, outcome={**point.outcome, **scaled, "cost": cost})
+    return objective, replace(point, outcome={**point.outcome, **scaled, "cost": cost})
 
 
 def offset_test(
-    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = DEFAULT_PULSES_PER_SAMPLE
+    runs: Sequence[Run],
+    structure: Structure,
+    values: Mapping[str, float],
+    *,
+    pulses_per_sample: int = DEFAULT_PULSES_PER_SAMPLE,
 ) -> OffsetTest | None:
     """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
     Two linear regressions of the residuals under autoregressive noise are compared. The regressors of the first one are
     the sensitivities to all free parameters and initial terms. The second regression also has, as regressors, the
     responses to a constant in each equation. The statistic is twice the logarithm of the likelihood ratio of their
-    one-step prediction errors. `values` are consistent estimates by name, and `every` is the number of block pulses per
-    sampling interval.
+    one-step prediction errors. `values` are consistent estimates by name, and `pulses_per_sample` is the number of
+    block pulses per sampling interval.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
-    one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
-    names = [f"{one}_{k}" for k in range(len(structure.equations))]
+    constant_name = next(
+        n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names
+    )
+    names = [f"{constant_name}_{k}" for k in range(len(structure.equations))]
     equations = tuple(
-        replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
+        replace(e, terms=(*e.terms, Term(constant_name, Order(), n)))
+        for e, n in zip(structure.equations, names, strict=True)
     )
     initial = without_offset_equivalents(resolve_common_initial_conditions(runs, structure), structure, values)
-    extended = replace(structure, equations=equations, offset="none", initial=initial)
+    extended_structure = replace(structure, equations=equations, offset="none", initial=initial)
     try:
-        whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
-        grid, point = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
+        extended_runs = [run.with_outputs({constant_name: np.ones(run.length)}) for run in runs]
+        objective, point = evaluate_at_point(
+            extended_runs, extended_structure, {**values, **dict.fromkeys(names, 0.0)}, pulses_per_sample
+        )
     except FtlmError:
         # No statistic can be computed without a finite simulation on this grid.
         return None
-    first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
+    first_row = len(objective.problem.orders) + objective.problem.coefficients.index(names[0])
     rows = np.asarray(point.outcome["jacobian"])
-    others = np.delete(rows, range(first, first + len(names)), axis=0)
+    other_rows = np.delete(rows, range(first_row, first_row + len(names)), axis=0)
     residuals = np.asarray(point.outcome["residuals"])
-    blocks = _residual_blocks(grid)
+    blocks = _residual_blocks(objective)
     columns = []
-    for row in rows[first : first + len(names)]:
-        for start, stop in ((own[0][0], own[-1][1]) for own in blocks):
+    for row in rows[first_row : first_row + len(names)]:
+        for start, stop in ((run_blocks[0][0], run_blocks[-1][1]) for run_blocks in blocks):
             column = np.zeros(residuals.size)
             column[start:stop] = row[start:stop]
             columns.append(column)
     columns_before = np.stack(columns, axis=1)
     norms = column_norms(columns_before)
     scaled = columns_before / np.where(norms > 0, norms, 1.0)
-    basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
+    basis = orthonormal(other_rows.T, 1e-12) if other_rows.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         scaled = scaled - basis @ (basis.T @ scaled)
-    directions, spread, _ = thin_svd(scaled)
-    basis_part = directions[:, spread > OFFSET_COLLINEARITY_TOLERANCE]
+    directions, singular_values, _ = thin_svd(scaled)
+    basis_part = directions[:, singular_values > OFFSET_COLLINEARITY_TOLERANCE]
     count = basis_part.shape[1]
-    total = dot(residuals, residuals)
-    if count == 0 or not total > 0:
+    residual_power = dot(residuals, residuals)
+    if count == 0 or not residual_power > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
-    along = projections(basis_part, residuals)
+    components = projections(basis_part, residuals)
     # The sensitivities are orthogonal to the responses to initial terms. These responses are regressors as well,
     # because the regression under colored noise estimates the initial terms again.
     common = np.column_stack([basis, *_initial_responses(point, blocks, residuals.size)])
-    nested, full = (np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part])))
-    by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
-    statistic = _core.prediction_ratio(nested, full, residuals, by_output, DEFAULT_LAGS)
-    explained = basis_part @ along
-    sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
-    weights = [w for _ in runs for w in grid.weights]
-    places = [place for own in blocks for place in own]
-    size = max(
-        math.sqrt(float(np.mean(explained[a:b] ** 2))) / (w * s) if w * s > 0 else 0.0
-        for (a, b), w, s in zip(places, weights, sizes, strict=True)
+    nested_regressors, extended_regressors = (
+        np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part]))
     )
-    return OffsetTest(statistic, count, float(along @ along) / total, size)
+    by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
+    statistic = _core.prediction_ratio(nested_regressors, extended_regressors, residuals, by_output, DEFAULT_LAGS)
+    offset_effect = basis_part @ components
+    deviations = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
+    weights = [w for _ in runs for w in objective.weights]
+    output_blocks = [block for run_blocks in blocks for block in run_blocks]
+    relative_size = max(
+        math.sqrt(float(np.mean(offset_effect[a:b] ** 2))) / (w * s) if w * s > 0 else 0.0
+        for (a, b), w, s in zip(output_blocks, weights, deviations, strict=True)
+    )
+    return OffsetTest(statistic, count, float(components @ components) / residual_power, relative_size)
 
 
 def offset_errors(
@@ -237,8 +248,8 @@ def offset_errors(
     the Jacobian has a row for each offset. It is the response to the input 1 for a constant, and to the input t for a
     ramp. For a level, it is 1 at the samples of the output.
     """
-    listed = [(k, o, kind) for k, run in enumerate(offsets) for o, own in run.items() for kind in own]
-    if not listed or len(offsets) != len(runs):
+    entries = [(k, o, kind) for k, run in enumerate(offsets) for o, by_kind in run.items() for kind in by_kind]
+    if not entries or len(offsets) != len(runs):
         return ()
     values, has_level = joint.values_by_name, structure.offset == "level"
     terms: dict[str, list[Term]] = {o: [] for o in structure.outputs}
@@ -246,53 +257,57 @@ def offset_errors(
     prefix = "one"
     while any(name.startswith(prefix) for name in reserved_names):
         prefix += "_"
-    names = [] if has_level else [f"{prefix}_{kind}_{k}_{output}" for k, output, kind in listed]
-    for name, (k, output, kind) in zip(names, listed, strict=False):
+    names = [] if has_level else [f"{prefix}_{kind}_{k}_{output}" for k, output, kind in entries]
+    for name, (k, output, kind) in zip(names, entries, strict=False):
         values[name] = offsets[k][output][kind]
         terms[output].append(Term(f"{prefix}_{kind}_{k}", Order(), name))
-    whole = []
+    extended_runs = []
     for k, run in enumerate(runs):
         if has_level:
-            whole.append(deviations(run, structure, {o: own["level"] for o, own in offsets[k].items() if own})[0])
+            extended_runs.append(
+                deviations(run, structure, {o: by_kind["level"] for o, by_kind in offsets[k].items() if by_kind})[0]
+            )
             continue
         shapes = {"constant": np.ones(run.length), "ramp": run.step * np.arange(run.length, dtype=float)}
-        own_inputs = {f"{prefix}_{kind}_{j}": shapes[kind] * float(k == j) for j, _, kind in listed}
-        whole.append(run.with_outputs(own_inputs))
+        constant_inputs = {f"{prefix}_{kind}_{j}": shapes[kind] * float(k == j) for j, _, kind in entries}
+        extended_runs.append(run.with_outputs(constant_inputs))
     initial = joint.initial
     if structure.is_linear and not has_level:
         initial = without_offset_equivalents(initial, structure, values)
     equations = tuple(replace(e, terms=(*e.terms, *terms[e.output])) for e in structure.equations)
     problem = FreeProblem.of(replace(structure, equations=equations, offset="none", initial=initial))
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
-    grid = Objective(problem, whole, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
+    objective = Objective(
+        problem, extended_runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights
+    )
     try:
-        point = grid.minimize(start_from_values(problem, values), 1, plain=True)
+        point = objective.minimize(start_from_values(problem, values), 1, linear_scale=True)
         rows = np.asarray(point.outcome["jacobian"])
         if has_level:
-            rows = np.vstack([rows, *_level_responses(grid, point, listed)])
+            rows = np.vstack([rows, *_level_responses(objective, point, entries)])
             point = replace(point, outcome={**point.outcome, "jacobian": rows})
-        spread = np.diag(covariance(point, grid))
+        variances = np.diag(covariance(point, objective))
     except FtlmError:
         return ()
-    places = range(len(rows) - len(listed), len(rows)) if has_level else [problem.names.index(n) for n in names]
+    indices = range(len(rows) - len(entries), len(rows)) if has_level else [problem.names.index(n) for n in names]
     errors: tuple[dict[str, dict[str, float]], ...] = tuple({o: {} for o in run} for run in offsets)
-    for (k, output, kind), place in zip(listed, places, strict=True):
-        errors[k][output][kind] = math.sqrt(spread[place])
+    for (k, output, kind), index in zip(entries, indices, strict=True):
+        errors[k][output][kind] = math.sqrt(variances[index])
     return errors
 
 
-def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int, str, str]]) -> list[Floats]:
+def _level_responses(objective: Objective, point: Iterate, entries: Sequence[tuple[int, str, str]]) -> list[Floats]:
     """Return derivatives of weighted residuals with respect to levels, orthogonal to responses to initial terms.
 
-    Each entry of `listed` is (index of the run, output, kind). The result has one array over all residuals per entry.
+    Each entry of `entries` is (index of the run, output, kind). The result has one array over all residuals per entry.
     """
-    shares, blocks = grid.residual_weights, _residual_blocks(grid)
-    bases, columns = _initial_responses(point, blocks, shares.size), []
-    for k, output, _ in listed:
-        place = grid.problem.structure.outputs.index(output)
-        own = slice(*blocks[k][place])
-        column = np.zeros(shares.size)
-        column[own] = grid.weights[place] * shares[own]
+    robust_weights, blocks = objective.residual_weights, _residual_blocks(objective)
+    bases, columns = _initial_responses(point, blocks, robust_weights.size), []
+    for k, output, _ in entries:
+        output_index = objective.problem.structure.outputs.index(output)
+        block = slice(*blocks[k][output_index])
+        column = np.zeros(robust_weights.size)
+        column[block] = objective.weights[output_index] * robust_weights[block]
         for basis in bases * 2:
             column -= basis @ projections(basis, column)
         columns.append(column)
@@ -305,11 +320,14 @@ def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[R
     Their projection on the responses to initial terms is subtracted. The result is {} if the evaluation fails.
     """
     try:
-        grid, point = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
+        objective, point = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
     except FtlmError:
         return {}
-    rows, blocks = np.asarray(point.outcome["jacobian"]), _residual_blocks(grid)
-    return {name: [rows[:, slice(*own[k])] for own in blocks] for k, name in enumerate(grid.problem.structure.outputs)}
+    rows, blocks = np.asarray(point.outcome["jacobian"]), _residual_blocks(objective)
+    return {
+        name: [rows[:, slice(*run_blocks[k])] for run_blocks in blocks]
+        for k, name in enumerate(objective.problem.structure.outputs)
+    }
 
 
 def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
@@ -320,21 +338,21 @@ def without_offset_equivalents(initial: Initial, structure: Structure, values: M
     if initial != "caputo":
         return initial
     exponents: set[float] = set()
-    for item in (e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations):
-        own = offset_exponents(item.order.constant, "constant").values()
-        exponents |= set(initial_exponents(item, "caputo", "constant")) - {round(e, 9) for e in own}
+    for equation in (e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations):
+        equivalents = offset_exponents(equation.order.constant, "constant").values()
+        exponents |= set(initial_exponents(equation, "caputo", "constant")) - {round(e, 9) for e in equivalents}
     return History(sorted(exponents))
 
 
-def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
+def _residual_blocks(objective: Objective) -> list[list[tuple[int, int]]]:
     """Return, for each run, the (start, stop) indices of each output's block in the residual vector."""
     blocks, at = [], 0
-    for _, count in grid.counts:
-        own = []
-        for _ in grid.problem.structure.outputs:
-            own.append((at, at + count))
+    for _, count in objective.counts:
+        run_blocks = []
+        for _ in objective.problem.structure.outputs:
+            run_blocks.append((at, at + count))
             at += count
-        blocks.append(own)
+        blocks.append(run_blocks)
     return blocks
 
 
@@ -344,19 +362,21 @@ def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size
     The responses are 0 at the residuals of other runs, and `size` is the number of all residuals.
     """
     columns = []
-    for responses, own in zip(point.outcome["initial_responses"], blocks, strict=True):
+    for responses, run_blocks in zip(point.outcome["initial_responses"], blocks, strict=True):
         if len(responses):
             columns.append(np.zeros((size, len(responses))))
-            columns[-1][own[0][0] : own[-1][1]] = responses.T
+            columns[-1][run_blocks[0][0] : run_blocks[-1][1]] = responses.T
     return columns
 
 
 def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
     """Return the name of an input that is constant in every run and has a free coefficient at order 0, or None."""
-    for item in structure.equations:
-        for term in item.terms:
-            plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
-            if plain and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
+    for equation in structure.equations:
+        for term in equation.terms:
+            is_constant_term = (
+                term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
+            )
+            if is_constant_term and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
                 return term.signal
     return None
 
@@ -365,8 +385,8 @@ def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str])
     """Return a finding if an offset that the user did not request would explain part of the residuals."""
     if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
         return []
-    numbers = {"share": 100 * min(test.share, 1), "test": test.statistic_text}
-    return [make_finding("offset_missing", output=", ".join(outputs), **numbers)]
+    details = {"share": 100 * min(test.share, 1), "test": test.statistic_text}
+    return [make_finding("offset_missing", output=", ".join(outputs), **details)]
 
 
 def errors_with_orders(
@@ -379,15 +399,19 @@ def errors_with_orders(
     further error.
     """
     try:
-        grid, point = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE)
-        refit = grid.minimize(point, MAX_REFINEMENT_EVALUATIONS, plain=True)
-        spread = np.diag(covariance(refit, grid))
+        objective, point = evaluate_at_point(
+            runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE
+        )
+        refit = objective.minimize(point, MAX_REFINEMENT_EVALUATIONS, linear_scale=True)
+        variances = np.diag(covariance(refit, objective))
     except FtlmError:
         return None
-    at_grid = np.array([values[n] for n in grid.problem.names])
+    at_grid = np.array([values[n] for n in objective.problem.names])
     with np.errstate(invalid="ignore"):
-        errors = np.sqrt(spread + (refit.values - at_grid) ** 2)
-    return {n: e if math.isfinite(e) else math.inf for n, e in zip(grid.problem.names, errors.tolist(), strict=True)}
+        errors = np.sqrt(variances + (refit.values - at_grid) ** 2)
+    return {
+        n: e if math.isfinite(e) else math.inf for n, e in zip(objective.problem.names, errors.tolist(), strict=True)
+    }
 
 
 def fit_with_initial_conditions(
@@ -399,47 +423,53 @@ def fit_with_initial_conditions(
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
     guesses: Sequence[Mapping[str, float]] = (),
-    alone: bool = False,
+    single_start: bool = False,
 ) -> JointFit:
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
     `start` are the initial conditions suggested by the data. A fit with a history (powers of t that represent past
     inputs) is replaced by one with Caputo initial terms, of which there are fewer, if its residuals are equally small.
     A fit from rest is replaced only if a history improves it significantly. The result names the fitted terms in
-    ``initial``. With `alone`, the first of `guesses` is the only initial guess.
+    ``initial``. With `single_start`, the first of `guesses` is the only initial guess.
     """
 
     def fit_initial_terms(
         initial: Initial, *, refine: bool = True, multistart: _core.JointMultistart | None = None
     ) -> JointFit:
         request = replace(structure, initial=initial)
-        fit = partial(fit_output_error, start=guesses[0]) if alone else partial(fit_output_error, guesses=guesses)
+        fit = (
+            partial(fit_output_error, start=guesses[0]) if single_start else partial(fit_output_error, guesses=guesses)
+        )
         return fit(runs, request, threads=threads, refine=refine, progress=progress, loss=loss, multistart=multistart)
 
-    decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
-    if not decided and isinstance(start, History):
+    is_decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
+    if not is_decided and isinstance(start, History):
         # If few terms suffice on the coarsest grid, only they are fitted on finer grids: discretization errors favor
         # more terms, not fewer.
         request = replace(structure, initial=start)
-        multistart = None if alone else run_multistart(runs, request, threads, progress)
-        many = fit_initial_terms(start, refine=False, multistart=multistart)
-        simplified = _simplify_initial_terms(many, runs, structure, refine=False)
-        if simplified is many and not alone:
-            without = _fit_without_implausible_history(many, runs, structure, lambda: fit_initial_terms("caputo"))
-            if without is not None:
-                return without
+        multistart = None if single_start else run_multistart(runs, request, threads, progress)
+        history_fit = fit_initial_terms(start, refine=False, multistart=multistart)
+        simplified = _simplify_initial_terms(history_fit, runs, structure, refine=False)
+        if simplified is history_fit and not single_start:
+            caputo_fit = _fit_without_implausible_history(
+                history_fit, runs, structure, lambda: fit_initial_terms("caputo")
+            )
+            if caputo_fit is not None:
+                return caputo_fit
         request = replace(structure, initial=simplified.initial)
-        fine = fit_output_error(runs, request, near=simplified, loss=loss, multistart=multistart)
-        unstable = fine.unstable_optimum or simplified.unstable_optimum or many.unstable_optimum
-        fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
-        return fine if simplified is not many else _simplify_initial_terms(fine, runs, structure, refine=True)
+        refined = fit_output_error(runs, request, initial_fit=simplified, loss=loss, multistart=multistart)
+        unstable = refined.unstable_optimum or simplified.unstable_optimum or history_fit.unstable_optimum
+        refined = replace(refined, starts=history_fit.starts, origin=history_fit.origin, unstable_optimum=unstable)
+        return (
+            refined if simplified is not history_fit else _simplify_initial_terms(refined, runs, structure, refine=True)
+        )
     joint = fit_initial_terms(start)
-    if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
+    if is_decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
-    past = fit_initial_terms(
+    past_fit = fit_initial_terms(
         common_initial_conditions([history(run, structure) for run in runs]) or history(runs[0], structure)
     )
-    return past if fit_score(past, joint) < fit_score(joint, joint) else joint
+    return past_fit if fit_score(past_fit, joint) < fit_score(joint, joint) else joint
 
 
 def fit_score(joint: JointFit, reference: JointFit) -> float:
@@ -447,8 +477,8 @@ def fit_score(joint: JointFit, reference: JointFit) -> float:
 
     Lower is better. The noise color is taken from the fit `reference`.
     """
-    own, others = _pooled_residuals(joint), _pooled_residuals(reference)
-    return start_score(own, joint.initial_terms, others)
+    series, reference_series = _pooled_residuals(joint), _pooled_residuals(reference)
+    return start_score(series, joint.initial_terms, reference_series)
 
 
 def fit_score_gain(joint: JointFit, other: JointFit, reference: JointFit) -> float:
@@ -461,8 +491,8 @@ def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
 
     Both criteria use the noise color of the fit with the larger residuals.
     """
-    worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
-    return fit_score_gain(joint, other, worse) > -margin
+    reference = max((other, joint), key=lambda either: math.prod(either.noise.values()))
+    return fit_score_gain(joint, other, reference) > -margin
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
@@ -486,13 +516,16 @@ def has_independent_residuals(joint: JointFit, runs: Sequence[Run], structure: S
     """
     names = [n for n in structure.signals if n in runs[0].inputs]
     inputs = [[interpolate_gaps(values_at_residuals(run, structure, n)) for run in runs] for n in names]
-    series = [[part[o] for part in joint.residuals] for o in joint.noise]
-    return all(is_independent(one, inputs) for one in series)
+    series = [[run_residuals[o] for run_residuals in joint.residuals] for o in joint.noise]
+    return all(is_independent(output_series, inputs) for output_series in series)
 
 
 def _pooled_residuals(joint: JointFit) -> list[Floats]:
     """Return the residuals of each output in its unit, concatenated over all runs."""
-    return [noise * np.concatenate([part[o] for part in joint.residuals]) for o, noise in joint.noise.items()]
+    return [
+        noise * np.concatenate([run_residuals[o] for run_residuals in joint.residuals])
+        for o, noise in joint.noise.items()
+    ]
 
 
 def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Structure, *, refine: bool) -> JointFit:
@@ -528,17 +561,17 @@ def _fit_without_implausible_history(
 
 def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
     """Return the residuals of each output over all runs, simulated with initial terms fitted as in `compare`."""
-    parts = []
+    residuals = []
     for run in runs:
         simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)
-        parts.append(output_residuals(measured_samples(model, run, simulated.refinement), simulated.outputs))
-    return list(np.concatenate(parts, axis=1))
+        residuals.append(output_residuals(measured_samples(model, run, simulated.refinement), simulated.outputs))
+    return list(np.concatenate(residuals, axis=1))
 
 
 def _fitted_structure(joint: JointFit, structure: Structure) -> Structure:
     """Return a structure with the orders, coefficients and input parameters of a joint fit."""
-    numbers = FreeProblem.of(structure).coefficients_by_name(list(joint.coefficients.values()))
-    return structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
+    coefficients = FreeProblem.of(structure).coefficients_by_name(list(joint.coefficients.values()))
+    return structure.with_orders(joint.orders).with_coefficients(coefficients).with_inputs(joint.inputs)
 
 
 def refit_after_screening(
@@ -559,33 +592,34 @@ def refit_after_screening(
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
-    grid = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
+    objective = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
     loss: Loss = "squares" if joint.robust is None else "huber"
-    begin = start_from_values(problem, joint.values_by_name)
+    initial = start_from_values(problem, joint.values_by_name)
     try:
         # Limit of the increase of twice the log-likelihood in one step, per sample.
         tolerance = SCREENING_LIKELIHOOD_TOLERANCE / joint.samples
-        screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True, tolerance=tolerance)
-        share = CONVERGED_RESIDUAL_SHARE if screening.has_converged else SCREENING_RESIDUAL_SHARE
-        deviation = grid.rms_residuals(screening)
+        screening = objective.minimize(initial, MAX_SCREENING_EVALUATIONS, linear_scale=True, tolerance=tolerance)
+        factor = CONVERGED_RESIDUAL_SHARE if screening.has_converged else SCREENING_RESIDUAL_SHARE
+        deviation = objective.rms_residuals(screening)
         if joint.robust is not None:
-            deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(screening).items()}
-        screened = replace(
+            deviation = {o: robust_deviation(e) for o, e in objective.pooled_residuals(screening).items()}
+        optimistic = replace(
             joint,
-            noise={o: share * v * joint.noise[o] for o, v in deviation.items()},
+            noise={o: factor * v * joint.noise[o] for o, v in deviation.items()},
             residuals=[
-                {o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(screening)
+                {o: e / max(deviation[o], 1e-300) for o, e in run_residuals.items()}
+                for run_residuals in objective.residuals(screening)
             ],
             initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run)
             + level_count(runs, structure),
         )
-        if not accepts(screened):
+        if not accepts(optimistic):
             return None
-        fit = fit_output_error(runs, structure, near=joint, loss=loss, refine=False)
+        fit = fit_output_error(runs, structure, initial_fit=joint, loss=loss, refine=False)
         if refine and accepts(fit):
             # The refinement of a fit is that of the finer of its two last grids.
             coarser = replace(fit, refinement=max(fit.refinement // 2, 1))
-            fit = fit_output_error(runs, structure, near=coarser, loss=loss)
+            fit = fit_output_error(runs, structure, initial_fit=coarser, loss=loss)
     except FtlmError:
         return None
     return fit
@@ -597,20 +631,22 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
         fit = partial(fit_output_error, runs, start=joint.values_by_name, loss=loss, refine=False)
-        few = fit(replace(request, initial="caputo"))
+        caputo_fit = fit(replace(request, initial="caputo"))
         # Both fits use the same grids, because discretization errors of a coarse grid are no evidence of a history.
-        many = fit(replace(structure, initial=joint.initial))
+        history_fit = fit(replace(structure, initial=joint.initial))
     except FtlmError:
         return None
-    fewer = few.initial_terms < many.initial_terms
-    return few if fewer and not _fit_needs_history(few, many, runs, request) else None
+    has_fewer_terms = caputo_fit.initial_terms < history_fit.initial_terms
+    return caputo_fit if has_fewer_terms and not _fit_needs_history(caputo_fit, history_fit, runs, request) else None
 
 
-def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+def _fit_needs_history(caputo_fit: JointFit, history_fit: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether a fit with few initial terms has significantly larger residuals than one with many."""
-    caputo_residuals, history_residuals = _pooled_residuals(few), _pooled_residuals(many)
+    caputo_residuals, history_residuals = _pooled_residuals(caputo_fit), _pooled_residuals(history_fit)
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
-    return needs_history(structure, caputo_residuals, history_residuals, sizes, (few.initial_terms, many.initial_terms))
+    return needs_history(
+        structure, caputo_residuals, history_residuals, sizes, (caputo_fit.initial_terms, history_fit.initial_terms)
+    )
 
 
 def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

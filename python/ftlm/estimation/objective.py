@@ -26,18 +26,19 @@ def sample_run(
     problem: FreeProblem,
     weights: Sequence[float],
     *,
-    every: int = 1,
+    pulses_per_sample: int = 1,
     decimation: int = 1,
-    shares: Floats | None = None,
+    robust_weights: Floats | None = None,
 ) -> _core.Experiment:
     """Return a run as an object of the core, with block pulses and samples at the given resolution.
 
-    `weights` are the reciprocal noise standard deviations of the outputs, `every` is the number of block pulses per
-    sampling interval, and every `decimation`-th sample is compared.
+    `weights` are the reciprocal noise standard deviations of the outputs, `pulses_per_sample` is the number of block
+    pulses per sampling interval, and every `decimation`-th sample is compared.
 
-    `shares` are the robust weights of the compared samples, of shape (outputs, samples). Missing samples have weight 0.
+    `robust_weights` are the robust weights of the compared samples, of shape (outputs, samples). Missing samples have
+    weight 0.
     """
-    return recording(run, problem.structure).experiment(every, decimation, list(weights), shares)
+    return recording(run, problem.structure).experiment(pulses_per_sample, decimation, list(weights), robust_weights)
 
 
 @dataclass
@@ -69,26 +70,26 @@ class Iterate:
 def minimize_cost(
     problem: FreeProblem,
     experiments: Sequence[_core.Experiment],
-    attempt: Iterate,
+    iterate: Iterate,
     *,
     evaluations: int,
-    plain: bool = False,
+    linear_scale: bool = False,
     fixed: int | Sequence[int] = (),
     tolerance: float = COST_REDUCTION_TOLERANCE,
     prefer_stable: bool = False,
 ) -> Iterate:
     """Minimize the output-error cost by Levenberg-Marquardt; parameters with an index in `fixed` stay constant.
 
-    `attempt` is the initial point, and `evaluations` is the maximum number of evaluations. The optimization variables
-    are logarithms of coefficients where the signs permit it; with `plain`, they are the coefficients themselves.
+    `iterate` is the initial point, and `evaluations` is the maximum number of evaluations. The optimization variables
+    are logarithms of coefficients where the signs permit it; with `linear_scale`, they are the coefficients themselves.
 
     With `prefer_stable`, no step leads from a stable model to an unstable one.
     """
-    states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
+    states = iterate.outcome.get("states", []) if isinstance(iterate.outcome, dict) else []
     outcome = problem.core.minimize(
         experiments,
-        (attempt.values.tolist(), states),
-        plain,
+        (iterate.values.tolist(), states),
+        linear_scale,
         (fixed,) if isinstance(fixed, int) else fixed,
         evaluations,
         tolerance,
@@ -96,15 +97,15 @@ def minimize_cost(
         stop_flag(),
     )
     orders, coefficients, inputs = problem.split(outcome["values"])
-    return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs, outcome=outcome)
+    return replace(iterate, orders=orders, coefficients=coefficients, inputs=inputs, outcome=outcome)
 
 
 @dataclass(frozen=True)
 class Objective:
     """Output-error objective: an estimation problem and runs at a given resolution.
 
-    `weights` are the reciprocal noise standard deviations of the outputs, `every` is the number of block pulses per
-    sampling interval, and every `decimation`-th sample is compared.
+    `weights` are the reciprocal noise standard deviations of the outputs, `pulses_per_sample` is the number of block
+    pulses per sampling interval, and every `decimation`-th sample is compared.
 
     `robust_weights` are the weights of a robust loss: for each run an array (outputs, samples). With `prefer_stable`,
     no optimization step leads from a stable model to an unstable one.
@@ -113,7 +114,7 @@ class Objective:
     problem: FreeProblem
     runs: Sequence[Run]
     weights: Sequence[float]
-    every: int = 1
+    pulses_per_sample: int = 1
     decimation: int = 1
     robust_weights: Sequence[Floats] | None = None
     prefer_stable: bool = False
@@ -121,18 +122,25 @@ class Objective:
     @cached_property
     def experiments(self) -> list[_core.Experiment]:
         """Runs as sampled objects of the core, with which simulations are compared."""
-        shares = [None] * len(self.runs) if self.robust_weights is None else self.robust_weights
+        weights_by_run = [None] * len(self.runs) if self.robust_weights is None else self.robust_weights
         return [
-            sample_run(run, self.problem, self.weights, every=self.every, decimation=self.decimation, shares=share)
-            for run, share in zip(self.runs, shares, strict=True)
+            sample_run(
+                run,
+                self.problem,
+                self.weights,
+                pulses_per_sample=self.pulses_per_sample,
+                decimation=self.decimation,
+                robust_weights=run_weights,
+            )
+            for run, run_weights in zip(self.runs, weights_by_run, strict=True)
         ]
 
     def minimize(
         self,
-        attempt: Iterate,
+        iterate: Iterate,
         evaluations: int,
         *,
-        plain: bool = False,
+        linear_scale: bool = False,
         fixed: int | Sequence[int] = (),
         tolerance: float = COST_REDUCTION_TOLERANCE,
     ) -> Iterate:
@@ -140,33 +148,35 @@ class Objective:
         return minimize_cost(
             self.problem,
             self.experiments,
-            attempt,
+            iterate,
             evaluations=evaluations,
-            plain=plain,
+            linear_scale=linear_scale,
             fixed=fixed,
             tolerance=tolerance,
             prefer_stable=self.prefer_stable,
         )
 
-    def evaluate(self, attempt: Iterate) -> Iterate:
+    def evaluate(self, iterate: Iterate) -> Iterate:
         """Return a point with its residuals and its cost, without derivatives."""
-        return self.minimize(attempt, 0)
+        return self.minimize(iterate, 0)
 
-    def residuals(self, attempt: Iterate) -> list[dict[str, Floats]]:
+    def residuals(self, iterate: Iterate) -> list[dict[str, Floats]]:
         """Return residuals divided by noise standard deviations, by run and output, without robust weights.
 
         Missing samples are NaN.
         """
-        residuals = np.asarray(attempt.outcome["residuals"])
+        residuals = np.asarray(iterate.outcome["residuals"])
         parts, at = [], 0
-        for shares, count in self.counts:
-            part = {}
+        for robust_weights, count in self.counts:
+            run_residuals = {}
             for i, output in enumerate(self.problem.structure.outputs):
-                part[output] = residuals[at : at + count]
+                run_residuals[output] = residuals[at : at + count]
                 at += count
-                if shares is not None:
-                    part[output] = part[output] / np.where(shares[i] > 0, shares[i], np.nan)
-            parts.append(part)
+                if robust_weights is not None:
+                    run_residuals[output] = run_residuals[output] / np.where(
+                        robust_weights[i] > 0, robust_weights[i], np.nan
+                    )
+            parts.append(run_residuals)
         return parts
 
     @property
@@ -179,29 +189,32 @@ class Objective:
         """Robust weight of every residual, in the sequence of the core's residual vector."""
         outputs = len(self.problem.structure.outputs)
         return np.concatenate(
-            [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]
+            [
+                np.ones(outputs * count) if robust_weights is None else robust_weights.ravel()
+                for robust_weights, count in self.counts
+            ]
         )
 
-    def rms_residuals(self, attempt: Iterate) -> dict[str, float]:
+    def rms_residuals(self, iterate: Iterate) -> dict[str, float]:
         """Return the root mean square of the weighted residuals by output, over all runs; infinite on overflow."""
         with np.errstate(over="ignore"):
-            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled_residuals(attempt).items()}
+            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled_residuals(iterate).items()}
 
-    def pooled_residuals(self, attempt: Iterate) -> dict[str, Floats]:
+    def pooled_residuals(self, iterate: Iterate) -> dict[str, Floats]:
         """Return the weighted residuals by output, concatenated over all runs, without missing samples."""
-        parts = self.residuals(attempt)
+        parts = self.residuals(iterate)
         return {o: drop_missing(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
 
-def covariance(attempt: Iterate, grid: Objective) -> Floats:
+def covariance(iterate: Iterate, objective: Objective) -> Floats:
     """Return the covariance matrix of the parameters at an optimum, robust to colored residuals.
 
     A parameter that is not identifiable has infinite variance, because small singular values are not truncated. With a
     robust loss the matrix is the covariance of an M-estimator.
     """
-    series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
-    shares = None if grid.robust_weights is None else grid.residual_weights
-    return _core.fit_covariance(np.asarray(attempt.outcome["jacobian"]), series, shares)
+    series = [residuals for run_residuals in objective.residuals(iterate) for residuals in run_residuals.values()]
+    robust_weights = None if objective.robust_weights is None else objective.residual_weights
+    return _core.fit_covariance(np.asarray(iterate.outcome["jacobian"]), series, robust_weights)
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
@@ -214,13 +227,13 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
     return _core.covariance_of(jacobian, series, squares)
 
 
-def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
+def propagated_errors(slopes: Floats, covariance: Floats) -> Floats:
     """Return standard errors of functions of the parameters, to first order.
 
-    `slopes` are the derivatives (functions, parameters), and `spread` is the covariance. The error is infinite if a
+    `slopes` are the derivatives (functions, parameters), and `covariance` is the covariance. The error is infinite if a
     function depends on a parameter of infinite variance.
     """
-    unidentifiable = np.isinf(np.diag(spread))
+    unidentifiable = np.isinf(np.diag(covariance))
     columns = slopes[:, ~unidentifiable]
-    variance = np.einsum("ij,jk,ik->i", columns, spread[np.ix_(~unidentifiable, ~unidentifiable)], columns)
+    variance = np.einsum("ij,jk,ik->i", columns, covariance[np.ix_(~unidentifiable, ~unidentifiable)], columns)
     return np.where((slopes[:, unidentifiable] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))

@@ -134,9 +134,9 @@ def search_orders(
         "top": top,
         "pruning": pruning,
     }
-    several, structure = as_runs(runs), as_structure("equation", equation)
+    run_list, structure = as_runs(runs), as_structure("equation", equation)
     result = rank_orders(
-        several,
+        run_list,
         structure,
         order_grid,
         m=m,
@@ -146,7 +146,7 @@ def search_orders(
         executor=executor,
         **settings,
     )
-    return with_verdict(result, several, structure, SearchSettings(**settings), order_grid, m=m)
+    return with_verdict(result, run_list, structure, SearchSettings(**settings), order_grid, m=m)
 
 
 def with_verdict(
@@ -160,18 +160,18 @@ def with_verdict(
 ) -> SearchResult:
     """Return an order search with the verdict and the findings of an identification at its best orders."""
     name = "stage" if structure.has_order_law else structure.outputs[0]
-    first = replace(search, table=search.table[:1])
+    best_search = replace(search, table=search.table[:1])
     try:
-        result = identification_of_searches({name: first}, runs, structure, settings, order_grid, m=m)
+        result = search_identification({name: best_search}, runs, structure, settings, order_grid, m=m)
     except FtlmError as error:
         failed = make_finding("rank_not_validated", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
-    alike = [] if result.residuals is None else _tied_rank_findings(search, result.residuals)
-    findings = unique([*alike, *result.findings])
+    equivalent_rows = [] if result.residuals is None else _tied_rank_findings(search, result.residuals)
+    findings = unique([*equivalent_rows, *result.findings])
     return replace(search, verdict=result.verdict, model_findings=findings, best=result)
 
 
-def identification_of_searches(
+def search_identification(
     searches: Mapping[str, SearchResult],
     runs: Sequence[Run],
     structure: Structure,
@@ -191,22 +191,24 @@ def _tied_rank_findings(search: SearchResult, residuals: Residuals) -> list[Find
     orders by the relative amount chi-squared(k) / N. Colored residuals count as fewer samples.
     """
     samples = min(sum(map(_independent_samples, o.residuals)) for o in residuals.outputs.values())
-    best, distinct = search.table[0], search.distinct_rows
+    best, distinct_rows = search.table[0], search.distinct_rows
     limit = best.score * math.sqrt(1.0 + chi_squared_99(len(search.orders)) / max(samples, 1.0))
-    alike = [row for row, _ in distinct if row.score <= limit]
-    if len(alike) < 2:
+    tied = [row for row, _ in distinct_rows if row.score <= limit]
+    if len(tied) < 2:
         return []
-    values = {n: [row.orders[n] for row in alike] for n in best.orders}
-    spans = {n: (min(own), max(own)) for n, own in values.items()}
+    values = {n: [row.orders[n] for row in tied] for n in best.orders}
+    spans = {n: (min(order_range), max(order_range)) for n, order_range in values.items()}
     spans_of_change = {n: ends for n, ends in spans.items() if ends[1] > ends[0]}
-    decided = all(
+    is_determined = all(
         max(high - best.orders[n], best.orders[n] - low) <= MAX_ORDER_ERROR for n, (low, high) in spans.items()
     )
     spans_text = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in spans_of_change.items())
-    last = max(row.rank for row in alike)
-    every = ", all that are kept," if alike[-1] is distinct[-1][0] and len(distinct) > 1 else ""
-    code = "tied_orders_close" if decided else "tied_orders_far_apart"
-    return [make_finding(code, parameter=", ".join(spans_of_change), last=last, every=every, shown=spans_text)]
+    last_rank = max(row.rank for row in tied)
+    scope_text = ", all that are kept," if tied[-1] is distinct_rows[-1][0] and len(distinct_rows) > 1 else ""
+    code = "tied_orders_close" if is_determined else "tied_orders_far_apart"
+    return [
+        make_finding(code, parameter=", ".join(spans_of_change), last=last_rank, every=scope_text, shown=spans_text)
+    ]
 
 
 def _independent_samples(residuals: Floats) -> float:

@@ -208,26 +208,28 @@ class JointFit:
         if not self.starts:
             return f"from {self.origin}"
         level, origin = self.starts[0]
-        same = [v for v, _ in self.starts if v <= (1.0 + SAME_COST) * level]
-        words = f"{len(same)} of {len(self.starts)} starts ended in the lowest optimum, first that of: {origin}"
-        rest = self.starts[len(same) :]
-        return words + (f"; the next costs {rest[0][0] / level:.3g} times as much" if rest and level > 0 else "")
+        same_optimum = [v for v, _ in self.starts if v <= (1.0 + SAME_COST) * level]
+        text = f"{len(same_optimum)} of {len(self.starts)} starts ended in the lowest optimum, first that of: {origin}"
+        other_starts = self.starts[len(same_optimum) :]
+        return text + (
+            f"; the next costs {other_starts[0][0] / level:.3g} times as much" if other_starts and level > 0 else ""
+        )
 
     @property
     def derived_errors(self) -> dict[str, float]:
         """Standard errors, to first order, of the coefficients that follow from a coefficient law, by name."""
         block = slice(len(self.orders), len(self.orders) + len(self.coefficients))
-        out, spread = {}, self.covariance[block, block]
+        out, covariance = {}, self.covariance[block, block]
         for name, (sign, factors) in self.products.items():
             value = sign * math.prod(self.coefficients[f] for f in factors)
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
-            out[name] = float(propagated_errors(slope[None], spread)[0])
+            out[name] = float(propagated_errors(slope[None], covariance)[0])
         return out
 
     def exact_outputs(self, runs: Sequence[Run]) -> set[str]:
         """Return the outputs whose residuals are no larger than rounding and discretization errors."""
-        sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
-        return {o for o, noise in self.noise.items() if noise <= ROUNDING_RESIDUAL_RATIO * sizes[o]}
+        deviations = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
+        return {o for o, noise in self.noise.items() if noise <= ROUNDING_RESIDUAL_RATIO * deviations[o]}
 
     @property
     def names(self) -> list[str]:
@@ -257,8 +259,8 @@ class JointFit:
     def correlation(self) -> Floats:
         """Correlation matrix of the parameters; NaN in rows of parameters whose variance is 0 or not finite."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            spread = np.sqrt(np.diag(self.covariance))
-            scaled: Floats = self.covariance / np.outer(spread, spread)
+            deviations = np.sqrt(np.diag(self.covariance))
+            scaled: Floats = self.covariance / np.outer(deviations, deviations)
         return scaled
 
 
@@ -299,17 +301,17 @@ def fit_output_error(
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
     guesses: Sequence[Mapping[str, float]] = (),
-    near: JointFit | None = None,
+    initial_fit: JointFit | None = None,
     multistart: _core.JointMultistart | None = None,
 ) -> JointFit:
     """Return the joint output-error fit of all equations of a structure to all runs.
 
     A coefficient law of the structure is imposed. The structure must not have ``initial="auto"``. `start` gives values
-    of all free parameters by name and replaces the automatic initial guesses, whereas `guesses` adds to them. `near` is
-    a fit of the same structure to nearly the same runs, whose optimum, time step and weights are reused. `multistart`
-    is the result of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval.
-    `progress` is called with (work done, total work). Optima are compared by the loss on all samples, and initial
-    guesses by the sum of squared residuals.
+    of all free parameters by name and replaces the automatic initial guesses, whereas `guesses` adds to them.
+    `initial_fit` is a fit of the same structure to nearly the same runs, whose optimum, time step and weights are
+    reused. `multistart` is the result of an earlier multistart. Without `refine`, the time step is not refined below
+    the sampling interval. `progress` is called with (work done, total work). Optima are compared by the loss on all
+    samples, and initial guesses by the sum of squared residuals.
 
     Raises
     ------
@@ -319,21 +321,21 @@ def fit_output_error(
         If no initial guess has a finite simulation or a finite sum of squares.
     """
     problem, outputs = _check_sample_count(runs, structure), structure.outputs
-    given_near = None
-    if near is not None:
-        given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
-    automatic = start is None and near is None and not guesses
+    initial_optimum = None
+    if initial_fit is not None:
+        initial_optimum = initial_fit.values.tolist(), [initial_fit.noise[o] for o in outputs], initial_fit.refinement
+    automatic = start is None and initial_fit is None and not guesses
     if automatic and problem.orders and structure.is_linear:
         # The coefficients of collinear inputs are not identifiable. This check avoids a search of all orders.
-        why = describe_collinear_inputs(runs, structure)
-        if why is not None:
-            raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
-    answer = _core.joint_fit(
+        reason = describe_collinear_inputs(runs, structure)
+        if reason is not None:
+            raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {reason}")
+    result = _core.joint_fit(
         problem.core,
         [recording(run, structure) for run in runs],
         [[v[n] for n in problem.names] for v in guesses],
         None if start is None else [start[n] for n in problem.names],
-        given_near,
+        initial_optimum,
         multistart,
         loss == "huber",
         refine,
@@ -341,32 +343,32 @@ def fit_output_error(
         progress,
         stop_flag(),
     )
-    if answer is None:
-        why = describe_collinear_inputs(runs, structure) or "check the signs of the data and the bounds"
-        raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
-    orders, coefficients, inputs = problem.split(answer["estimate"])
-    residuals = [dict(zip(outputs, part, strict=True)) for part in answer["left"]]
+    if result is None:
+        reason = describe_collinear_inputs(runs, structure) or "check the signs of the data and the bounds"
+        raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {reason}")
+    orders, coefficients, inputs = problem.split(result["estimate"])
+    residuals = [dict(zip(outputs, run_residuals, strict=True)) for run_residuals in result["left"]]
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)),
         products=dict(problem.products),
-        covariance=answer["covariance"],
+        covariance=result["covariance"],
         residuals=residuals,
-        noise=dict(zip(outputs, answer["noise"], strict=True)),
-        robust=None if answer["robust"] is None else RobustLossSummary(*answer["robust"]),
-        robust_weights=answer["shares"],
-        finest_grid_values=answer["on_grid"],
-        cost=answer["cost"],
-        samples=sum(drop_missing(e).size for part in residuals for e in part.values()),
-        refinement=answer["every"],
-        step_converged=answer["settled"],
-        converged=answer["status"] == "converged",
-        starts=answer["starts"],
-        survivors=answer["survivors"],
+        noise=dict(zip(outputs, result["noise"], strict=True)),
+        robust=None if result["robust"] is None else RobustLossSummary(*result["robust"]),
+        robust_weights=result["shares"],
+        finest_grid_values=result["on_grid"],
+        cost=result["cost"],
+        samples=sum(drop_missing(e).size for run_residuals in residuals for e in run_residuals.values()),
+        refinement=result["every"],
+        step_converged=result["settled"],
+        converged=result["status"] == "converged",
+        starts=result["starts"],
+        survivors=result["survivors"],
         initial=structure.initial,
-        initial_terms=answer["initial_terms"] + level_count(runs, structure),
-        unstable_optimum=None if answer["growth"] is None else UnstableOptimum(*answer["growth"]),
+        initial_terms=result["initial_terms"] + level_count(runs, structure),
+        unstable_optimum=None if result["growth"] is None else UnstableOptimum(*result["growth"]),
     )
 
 
@@ -404,13 +406,13 @@ ORDER_BOUND_MARGIN = 0.5
 def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
     """Return the free parameters of a joint fit with their covariance and noise, as a model file stores them."""
     orders = [order for e in structure.equations for order in (e.order, *(t.order for t in e.terms))]
-    spread = joint.covariance
+    covariance = joint.covariance
     return FitParameters(
         names=tuple(joint.names),
         orders=tuple(map(str, orders)),
         noise={o: float(v) for o, v in joint.noise.items()},
         products={n: (float(sign), tuple(factors)) for n, (sign, factors) in joint.products.items()},
-        covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
+        covariance=tuple(tuple(row) for row in covariance.tolist()) if np.all(np.isfinite(covariance)) else None,
         refinement=joint.refinement,
     )
 
@@ -425,9 +427,10 @@ def parameter_set_of(model: Model) -> FitParameters:
     """
     free = None if model.estimate is None else model.estimate.free
     if free is None:
-        how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
+        reason = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
-            f"this model {how}, or its file does not list the free parameters, whose covariance an input design needs; "
+            f"this model {reason}, or its file does not list the free parameters, whose covariance an input design "
+            "needs; "
             f"identify it with {parameter('method', 'output-error')}"
         )
     return free
@@ -443,28 +446,28 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     """
     parameter_set, estimate = parameter_set_of(model), model.estimate
     values = {} if estimate is None else estimate.values
-    lacking = [n for n in parameter_set.names if n not in values]
+    missing_names = [n for n in parameter_set.names if n not in values]
     count = sum(1 + len(e.terms) for e in model.equations)
-    if lacking or len(parameter_set.orders) != count:
-        what = (
-            f"no value of {lacking[0]}"
-            if lacking
+    if missing_names or len(parameter_set.orders) != count:
+        message = (
+            f"no value of {missing_names[0]}"
+            if missing_names
             else f"{len(parameter_set.orders)} orders where its equations have {count}"
         )
-        raise ModelError(f"the fit results that the model stores have {what}; identify the model again")
+        raise ModelError(f"the fit results that the model stores have {message}; identify the model again")
     laws = iter(parameter_set.orders)
     equations = []
-    for item in model.equations:
+    for equation in model.equations:
         order = Order.parse(next(laws))
         terms = []
-        for term in item.terms:
+        for term in equation.terms:
             free = term.name in parameter_set.names or term.name in parameter_set.products
             coefficient = str(term.name) if free else term.coefficient
             terms.append(replace(term, order=Order.parse(next(laws)), coefficient=coefficient, name=None))
-        equations.append(replace(item, order=order, terms=tuple(terms)))
+        equations.append(replace(equation, order=order, terms=tuple(terms)))
     names = {n for e in equations for n in e.order_names}
-    late = {s: input_name("delay", s) for s in model.structure.signals if s not in model.outputs}
-    delays = {s: values[n] for s, n in late.items() if n in parameter_set.names}
+    delay_names = {s: input_name("delay", s) for s in model.structure.signals if s not in model.outputs}
+    delays = {s: values[n] for s, n in delay_names.items() if n in parameter_set.names}
     structure = replace(
         model.structure,
         equations=tuple(equations),
@@ -476,8 +479,9 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     )
     problem = FreeProblem.of(structure)
     if set(problem.names) != set(parameter_set.names):
-        differing = sorted(set(problem.names) ^ set(parameter_set.names))
+        different_names = sorted(set(problem.names) ^ set(parameter_set.names))
         raise ModelError(
-            f"the fit results that the model stores contradict its equations: {differing[0]}; identify the model again"
+            f"the fit results that the model stores contradict its equations: {different_names[0]}; identify the "
+            "model again"
         )
     return problem, [values[n] for n in problem.names]

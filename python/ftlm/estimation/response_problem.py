@@ -79,14 +79,14 @@ class ResponseProblem:
             for n in self.orders
             if bound_exponents and n not in structure.order_values and all(map(is_impedance, records))
         )
-        every = np.concatenate([r.frequency for r in records])
-        self.unit = float(np.exp(np.mean(np.log(every))))
+        frequencies = np.concatenate([r.frequency for r in records])
+        self.unit = float(np.exp(np.mean(np.log(frequencies))))
         self.records = [
             ResponseRecord(structure.outputs.index(r.output), r.input, r.frequency / self.unit, r.response, w)
             for r, w in zip(records, weights, strict=True)
         ]
         self.known_delays = {name: value * self.unit for name, value in structure.delay.items()}
-        self._place = {name: k for k, name in enumerate(self.orders)}
+        self._order_index = {name: k for k, name in enumerate(self.orders)}
         at = len(self.orders)
         self._coefficient = {name: at + k for k, name in enumerate(self.coefficients)}
         self._delay = {name: at + len(self.coefficients) + k for k, name in enumerate(self.delays)}
@@ -97,17 +97,17 @@ class ResponseProblem:
         """Return the same problem for other measured responses and weights."""
         return ResponseProblem(self.structure, records, weights)
 
-    def on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
+    def names_on_user_bound(self, active_constraints: Sequence[int]) -> list[str]:
         """Return an empty list: bounds of coefficients are imposed by :func:`fit_within_bounds`."""
         return []
 
     def default_start(self) -> dict[str, float]:
         """Return default values of orders and coefficients by name, which complete a user's initial guess."""
-        usual = dict.fromkeys(self.coefficients, 1.0)
+        values = dict.fromkeys(self.coefficients, 1.0)
         for name in self.orders:
             grid = self.structure.order_values.get(name, (1.0,))
-            usual[name] = min(max(1.0, grid[0]), grid[-1])
-        return usual
+            values[name] = min(max(1.0, grid[0]), grid[-1])
+        return values
 
     def sort_groups(self, values: Floats) -> Floats:
         """Return the parameters unchanged: equations, unlike circuits, have no exchangeable groups to sort."""
@@ -119,7 +119,7 @@ class ResponseProblem:
 
     def order_at(self, order: Order, values: Floats) -> float:
         """Return the value of an order of the equations at given parameters."""
-        return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
+        return order.constant + math.fsum(w * float(values[self._order_index[n]]) for n, w in order.weights)
 
     def in_problem_units(self, values: Floats) -> Floats:
         """Convert parameters from seconds to the time unit of this problem."""
@@ -133,14 +133,14 @@ class ResponseProblem:
         """Return (low, high) by name from half-widths by name; parameters are in SI units (seconds)."""
         return {n: (v - widths[n], v + widths[n]) for n, v in zip(self.names, values.tolist(), strict=True)}
 
-    def _convert_time_unit(self, values: Floats, way: float) -> Floats:
+    def _convert_time_unit(self, values: Floats, power_sign: float) -> Floats:
         out = values.astype(np.float64).copy()
         for name, at in self._coefficient.items():
-            item, term = self.term_of[name]
-            power = self.order_at(item.order, values) - self.order_at(term.order, values)
-            out[at] *= self.unit ** (way * power)
+            equation, term = self.term_of[name]
+            power = self.order_at(equation.order, values) - self.order_at(term.order, values)
+            out[at] *= self.unit ** (power_sign * power)
         for at in self._delay.values():
-            out[at] *= self.unit**-way
+            out[at] *= self.unit**-power_sign
         return out
 
     def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
@@ -148,22 +148,22 @@ class ResponseProblem:
         out = jacobian.copy()
         log = np.log(self.unit)
         for name, at in self._coefficient.items():
-            item, term = self.term_of[name]
-            power = self.order_at(item.order, values) - self.order_at(term.order, values)
+            equation, term = self.term_of[name]
+            power = self.order_at(equation.order, values) - self.order_at(term.order, values)
             # The scaled coefficient c unit^-(alpha - order) depends on the coefficient c and on the orders.
-            for order, sign in ((item.order, -1.0), (term.order, 1.0)):
+            for order, sign in ((equation.order, -1.0), (term.order, 1.0)):
                 for n, w in order.weights:
-                    out[:, self._place[n]] += sign * w * log * float(values[at]) * jacobian[:, at]
+                    out[:, self._order_index[n]] += sign * w * log * float(values[at]) * jacobian[:, at]
             out[:, at] *= self.unit**-power
         for at in self._delay.values():
             out[:, at] *= self.unit
         return out
 
-    def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
+    def coefficient(self, term: Term, equation: Equation, values: Floats) -> float:
         """Return the coefficient of an equation's term, in the time unit of this problem."""
         if isinstance(term.coefficient, str):
             return term.factor * float(values[self._coefficient[term.coefficient]])
-        power = self.order_at(item.order, values) - self.order_at(term.order, values)
+        power = self.order_at(equation.order, values) - self.order_at(term.order, values)
         return float(term.fixed or 0.0) * math.pow(self.unit, -power)
 
     def shift(self, signal: str, values: Floats) -> float:
@@ -183,49 +183,49 @@ class ResponseProblem:
         log = np.log(s)
         items, names = self.structure.equations, self.structure.outputs
         matrix = np.zeros((s.size, len(items), len(items)), dtype=np.complex128)
-        right = np.zeros((s.size, len(items)), dtype=np.complex128)
+        inputs_matrix = np.zeros((s.size, len(items)), dtype=np.complex128)
         powers: dict[tuple[int, int], Complex] = {}
-        for i, item in enumerate(items):
-            powers[i, -1] = np.exp(self.order_at(item.order, values) * log)
+        for i, equation in enumerate(items):
+            powers[i, -1] = np.exp(self.order_at(equation.order, values) * log)
             matrix[:, i, i] += powers[i, -1]
-            for k, term in enumerate(item.terms):
+            for k, term in enumerate(equation.terms):
                 if term.signal not in names and term.signal != record.input:
                     continue
                 powers[i, k] = np.exp(self.order_at(term.order, values) * log)
-                part = self.coefficient(term, item, values) * powers[i, k]
+                part = self.coefficient(term, equation, values) * powers[i, k]
                 if term.signal in names:
                     matrix[:, i, names.index(term.signal)] -= part
                 else:
-                    right[:, i] += part
-        late = np.exp(-s * self.shift(record.input, values))
+                    inputs_matrix[:, i] += part
+        delay_factor = np.exp(-s * self.shift(record.input, values))
         try:
-            whole = np.linalg.solve(matrix, (right * late[:, None])[..., None])[..., 0]
+            outputs_matrix = np.linalg.solve(matrix, (inputs_matrix * delay_factor[:, None])[..., None])[..., 0]
             unit = np.zeros((s.size, len(items), 1), dtype=np.complex128)
             unit[:, record.output] = 1.0
             solutions = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if jacobian else None
         except np.linalg.LinAlgError:
-            nothing = np.full(s.size, np.nan, dtype=np.complex128)
-            return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if jacobian else None
-        response = np.asarray(whole[:, record.output], dtype=np.complex128)
+            undefined = np.full(s.size, np.nan, dtype=np.complex128)
+            return undefined, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if jacobian else None
+        response = np.asarray(outputs_matrix[:, record.output], dtype=np.complex128)
         if solutions is None:
             return response, None
         out = np.zeros((s.size, len(self.names)), dtype=np.complex128)
-        for i, item in enumerate(items):
-            for n, w in item.order.weights:
-                out[:, self._place[n]] -= w * log * solutions[:, i] * powers[i, -1] * whole[:, i]
-            for k, term in enumerate(item.terms):
+        for i, equation in enumerate(items):
+            for n, w in equation.order.weights:
+                out[:, self._order_index[n]] -= w * log * solutions[:, i] * powers[i, -1] * outputs_matrix[:, i]
+            for k, term in enumerate(equation.terms):
                 if (i, k) not in powers:
                     continue
-                signal = whole[:, names.index(term.signal)] if term.signal in names else late
-                size = self.coefficient(term, item, values)
+                signal = outputs_matrix[:, names.index(term.signal)] if term.signal in names else delay_factor
+                coefficient = self.coefficient(term, equation, values)
                 derivative = solutions[:, i] * powers[i, k] * signal
                 for n, w in term.order.weights:
-                    out[:, self._place[n]] += w * size * log * derivative
+                    out[:, self._order_index[n]] += w * coefficient * log * derivative
                 if not isinstance(term.coefficient, str):
                     # A fixed coefficient is given in seconds. Its value in scaled time depends on the orders.
-                    for its, sign in ((item.order, -1.0), (term.order, 1.0)):
-                        for n, w in its.weights:
-                            out[:, self._place[n]] += sign * w * np.log(self.unit) * size * derivative
+                    for order, sign in ((equation.order, -1.0), (term.order, 1.0)):
+                        for n, w in order.weights:
+                            out[:, self._order_index[n]] += sign * w * np.log(self.unit) * coefficient * derivative
                 else:
                     out[:, self._coefficient[term.coefficient]] += term.factor * derivative
         if record.input in self._delay:
@@ -253,47 +253,55 @@ class ResponseProblem:
         """Return (rows, limits, descriptions) of the constraints ``rows @ values <= limits`` on orders and delays."""
         rows: list[Floats] = []
         limits: list[float] = []
-        words: list[ConstraintText] = []
+        descriptions: list[ConstraintText] = []
 
-        def keep(order: Order, most: float, text: str, sign: float = 1.0, *, name: str | None = None) -> None:
+        def add(order: Order, maximum: float, text: str, sign: float = 1.0, *, name: str | None = None) -> None:
             row = np.zeros(len(self.names))
             for n, w in order.weights:
-                row[self._place[n]] += sign * w
+                row[self._order_index[n]] += sign * w
             if np.any(row):
                 rows.append(row)
-                limits.append(most - sign * order.constant)
-                words.append(ConstraintText(text, name))
+                limits.append(maximum - sign * order.constant)
+                descriptions.append(ConstraintText(text, name))
 
-        for item in self.structure.equations:
-            keep(item.order, MAX_ORDER, f"the highest order of {item.output} is at most 10")
-            keep(item.order, -MIN_HIGHEST_ORDER, f"the highest order of {item.output} is above 0", -1.0)
-            for term in item.terms:
-                own = term.signal == item.output
+        for equation in self.structure.equations:
+            add(equation.order, MAX_ORDER, f"the highest order of {equation.output} is at most 10")
+            add(equation.order, -MIN_HIGHEST_ORDER, f"the highest order of {equation.output} is above 0", -1.0)
+            for term in equation.terms:
+                is_output_term = term.signal == equation.output
                 name = str(term.order)
-                low, above = (0.0, -MIN_ORDER_GAP) if own else (MIN_INPUT_ORDER, MAX_IMPROPER_ORDER - MIN_ORDER_GAP)
-                keep(term.order, -low, f"order {name} is from {low:g} on", -1.0)
+                low, upper = (
+                    (0.0, -MIN_ORDER_GAP) if is_output_term else (MIN_INPUT_ORDER, MAX_IMPROPER_ORDER - MIN_ORDER_GAP)
+                )
+                add(term.order, -low, f"order {name} is from {low:g} on", -1.0)
                 both = dict(term.order.weights)
-                for n, w in item.order.weights:
+                for n, w in equation.order.weights:
                     both[n] = both.get(n, 0.0) - w
-                over = tuple(sorted((n, w) for n, w in both.items() if w))
-                gap = Order(term.order.constant - item.order.constant, over)
-                keep(gap, above, f"order {name} stays below {item.order} of {item.output}{'' if own else ' + 1'}")
+                variables = tuple(sorted((n, w) for n, w in both.items() if w))
+                gap = Order(term.order.constant - equation.order.constant, variables)
+                add(
+                    gap,
+                    upper,
+                    f"order {name} stays below {equation.order} of {equation.output}{'' if is_output_term else ' + 1'}",
+                )
         for name, values in self.structure.order_values.items():
-            if name in self._place:
-                keep(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
-                keep(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
+            if name in self._order_index:
+                add(Order(0.0, ((name, 1.0),)), values[-1], f"{name} is at most {values[-1]:g}")
+                add(Order(0.0, ((name, 1.0),)), -values[0], f"{name} is from {values[0]:g} on", -1.0)
         for name in self.exponents:
             text = f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
-            keep(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, text, name=name)
+            add(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, text, name=name)
         for free in self.structure.free_inputs:
             for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
                 row = np.zeros(len(self.names))
                 row[self._delay[free.signal]] = sign
                 rows.append(row)
                 limits.append(sign * end * self.unit)
-                words.append(ConstraintText(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s"))
+                descriptions.append(
+                    ConstraintText(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s")
+                )
         table = np.array(rows) if rows else np.zeros((0, len(self.names)))
-        return table, np.array(limits), words
+        return table, np.array(limits), descriptions
 
     def search_ranges(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
         """Return for each free order its grid values if it has any, else the interval (low, high) to search."""
@@ -302,9 +310,9 @@ class ResponseProblem:
             if name in self.structure.order_values:
                 out[name] = tuple(self.structure.order_values[name])
                 continue
-            own = [e.order for e in self.structure.equations if name in e.order.names]
+            output_orders = [e.order for e in self.structure.equations if name in e.order.names]
             highest = MAX_EXPONENT if name in self.exponents else self._highest()
-            out[name] = (0.1, highest) if own else (0.0, highest)
+            out[name] = (0.1, highest) if output_orders else (0.0, highest)
         return out
 
     def _highest(self) -> float:
@@ -352,48 +360,55 @@ def _order_delay_grid(problem: ResponseProblem) -> Floats:
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
     # The fit still converges from a delay error of a third of a period at the highest frequency.
     fastest = max(float(r.frequency.max()) for r in problem.records)
-    fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
-    room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
+    delay_counts = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
+    point_budget = max(MAX_GRID_POINTS // int(np.prod(delay_counts, initial=1)), 60)
     count = len(axes)
     grid_size = int(np.prod([len(a) if g else 1 for a, g in zip(axes, has_values, strict=True)], initial=1))
     free = count - sum(has_values)
-    each = int(np.floor((room / max(grid_size, 1)) ** (1.0 / free))) if free and grid_size <= room else 0
-    if (free and each < 4) or (not free and grid_size > room):
+    values_per_order = (
+        int(np.floor((point_budget / max(grid_size, 1)) ** (1.0 / free))) if free and grid_size <= point_budget else 0
+    )
+    if (free and values_per_order < 4) or (not free and grid_size > point_budget):
         # For too many axes, a deterministic low-discrepancy sequence replaces the grid.
-        spread = halton(room, count)
+        halton_points = halton(point_budget, count)
         columns = [
-            np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
+            np.asarray(a)[(halton_points[:, k] * len(a)).astype(int)]
+            if g
+            else a[0] + halton_points[:, k] * (a[1] - a[0])
             for k, (a, g) in enumerate(zip(axes, has_values, strict=True))
         ]
         orders = np.stack(columns, axis=1)
     else:
-        sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, has_values, strict=True)]
-        orders = _cartesian_product(sides)
-    late = _cartesian_product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
-    table = np.zeros((len(orders) * len(late), len(problem.names)))
-    table[:, :count] = np.repeat(orders, len(late), axis=0)
-    table[:, len(problem.names) - len(delays) :] = np.tile(late, (len(orders), 1))
+        axis_values = [
+            a if g else np.linspace(a[0], a[1], min(values_per_order, 31))
+            for a, g in zip(axes, has_values, strict=True)
+        ]
+        orders = _cartesian_product(axis_values)
+    delay_values = _cartesian_product([np.linspace(a, b, n) for (a, b), n in zip(delays, delay_counts, strict=True)])
+    table = np.zeros((len(orders) * len(delay_values), len(problem.names)))
+    table[:, :count] = np.repeat(orders, len(delay_values), axis=0)
+    table[:, len(problem.names) - len(delays) :] = np.tile(delay_values, (len(orders), 1))
     rows, limits, _ = problem.constraints()
-    inside = np.all(table @ rows.T <= limits + 1e-12, axis=1)
-    points: Floats = table[inside]
+    is_feasible = np.all(table @ rows.T <= limits + 1e-12, axis=1)
+    points: Floats = table[is_feasible]
     return points
 
 
-def _cartesian_product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
+def _cartesian_product(axis_values: Sequence[Sequence[float] | Floats]) -> Floats:
     """Return the Cartesian product of grid axes, of shape (points, axes)."""
-    rows = list(itertools.product(*sides))
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
+    rows = list(itertools.product(*axis_values))
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(axis_values))
 
 
-def halton(count: int, width: int) -> Floats:
-    """Return the first `count` points of the Halton sequence in the unit cube of dimension `width`."""
-    primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:width]
-    out = np.zeros((count, width))
+def halton(count: int, dimension: int) -> Floats:
+    """Return the first `count` points of the Halton sequence in the unit cube of dimension `dimension`."""
+    primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:dimension]
+    out = np.zeros((count, dimension))
     for k, base in enumerate(primes):
-        index, share = np.arange(1, count + 1), 1.0
+        index, fraction = np.arange(1, count + 1), 1.0
         while np.any(index):
-            share /= base
-            out[:, k] += share * (index % base)
+            fraction /= base
+            out[:, k] += fraction * (index % base)
             index = index // base
     return out
 
@@ -403,41 +418,43 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
 
     The coefficients of each equation are computed separately. Points are sorted by the total cost of all equations.
     """
-    slow = points[np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))]
+    repeated_points = points[
+        np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))
+    ]
     points, corners = (
-        np.concatenate([points, np.repeat(slow, CORNERS_PER_POINT, axis=0)]),
-        _corner_frequencies(problem, len(points), slow),
+        np.concatenate([points, np.repeat(repeated_points, CORNERS_PER_POINT, axis=0)]),
+        _corner_frequencies(problem, len(points), repeated_points),
     )
     table = points.copy()
-    total = np.zeros(len(points))
-    for i, item in enumerate(problem.structure.equations):
-        names = [n for n in item.coefficient_names if n in problem.coefficients]
+    costs = np.zeros(len(points))
+    for i, equation in enumerate(problem.structure.equations):
+        names = [n for n in equation.coefficient_names if n in problem.coefficients]
         records = [r for r in problem.records if r.output == i]
         if not records:
             continue
-        answers, cost = _equation_coefficients(
+        coefficients, cost = _equation_coefficients(
             problem, i, names, [_subsample_record(r) for r in records], points, corners
         )
         for k, name in enumerate(names):
-            table[:, problem.names.index(name)] = answers[:, k]
-        total += np.where(np.isfinite(cost), cost, np.inf)
-    best = np.argsort(total, kind="stable")[:MAX_EVALUATED_POINTS]
-    return [table[k] for k in best if np.isfinite(total[k])]
+            table[:, problem.names.index(name)] = coefficients[:, k]
+        costs += np.where(np.isfinite(cost), cost, np.inf)
+    best = np.argsort(costs, kind="stable")[:MAX_EVALUATED_POINTS]
+    return [table[k] for k in best if np.isfinite(costs[k])]
 
 
-def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
+def _corner_frequencies(problem: ResponseProblem, estimated_count: int, repeated_points: Floats) -> Floats:
     """Return, for each grid point, the corner frequency that fixes the coefficient of the slowest output term.
 
     The slowest output term is the one that dominates at low frequencies. The corner frequency is NaN for the first
-    points (`first` is their number), where this coefficient is estimated. The other points are repetitions of the
-    points in `slow`, each with corner frequencies distributed over the measured band.
+    points (`estimated_count` is their number), where this coefficient is estimated. The other points are repetitions of
+    the points in `repeated_points`, each with corner frequencies distributed over the measured band.
 
     If noise hides a small arc of an impedance, iteratively reweighted least squares are biased. The coefficients of
     output terms are then far too small or too large. If the slowest output term is fixed, the remaining bias is small.
     """
-    every = np.concatenate([r.frequency for r in problem.records])
-    frequencies = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
-    return np.concatenate([np.full(first, np.nan), np.tile(frequencies, len(slow))])
+    measured = np.concatenate([r.frequency for r in problem.records])
+    frequencies = np.geomspace(measured.min(), measured.max(), CORNERS_PER_POINT)
+    return np.concatenate([np.full(estimated_count, np.nan), np.tile(frequencies, len(repeated_points))])
 
 
 def _subsample_record(record: ResponseRecord) -> ResponseRecord:
@@ -452,7 +469,7 @@ def _subsample_record(record: ResponseRecord) -> ResponseRecord:
 
 def _equation_coefficients(
     problem: ResponseProblem,
-    place: int,
+    output_index: int,
     names: Sequence[str],
     records: Sequence[ResponseRecord],
     points: Floats,
@@ -460,95 +477,99 @@ def _equation_coefficients(
 ) -> tuple[Floats, Floats]:
     """Return the coefficients of one equation at every grid point by reweighted least squares, and their cost.
 
-    The coefficients have shape (points, names), and the cost has shape (points,). `place` is the index of the equation,
-    and `corners` are the corner frequencies from :func:`_corner_frequencies`.
+    The coefficients have shape (points, names), and the cost has shape (points,). `output_index` is the index of the
+    equation, and `corners` are the corner frequencies from :func:`_corner_frequencies`.
     """
-    item = problem.structure.equations[place]
-    alpha = _orders(problem, item.order.constant, item.order.weights, points)
+    equation = problem.structure.equations[output_index]
+    alpha = _orders(problem, equation.order.constant, equation.order.weights, points)
     columns: dict[str, list[Complex]] = {n: [] for n in names}
-    own: dict[str, list[Complex]] = {}
+    output_columns: dict[str, list[Complex]] = {}
     targets, below = [], []
     for record in records:
         log = np.log(1j * record.frequency)
-        late = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
+        delay_factor = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
         powers = np.exp(alpha[:, None] * log)
         below.append(powers)
-        goal = powers * record.response
-        for term in item.terms:
-            signal = _signal(problem, record, term.signal, late)
+        target = powers * record.response
+        for term in equation.terms:
+            signal = _signal(problem, record, term.signal, delay_factor)
             power = np.exp(_orders(problem, term.order.constant, term.order.weights, points)[:, None] * log)
             if isinstance(term.coefficient, str):
                 columns[term.coefficient].append(term.factor * power * signal)
-                if term.signal == item.output:
-                    own.setdefault(term.coefficient, []).append(term.factor * power)
+                if term.signal == equation.output:
+                    output_columns.setdefault(term.coefficient, []).append(term.factor * power)
             else:
                 gap = alpha - _orders(problem, term.order.constant, term.order.weights, points)
-                size = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
-                goal = goal - size * power * signal
-                if term.signal == item.output:
-                    below[-1] = below[-1] - size * power
-        targets.append(goal)
+                fixed_coefficient = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
+                target = target - fixed_coefficient * power * signal
+                if term.signal == equation.output:
+                    below[-1] = below[-1] - fixed_coefficient * power
+        targets.append(target)
     weight = np.concatenate([r.weight for r in records])
-    goal, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
+    target, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
     matrix = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
-    denominator_parts = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
-    slowest = _slowest_output_term(problem, item, points)
+    denominator_parts = {n: np.concatenate(parts, axis=1) for n, parts in output_columns.items()}
+    slowest = _slowest_output_term(problem, equation, points)
     bottom = 1.0 + np.abs(powers) + 0j
-    answers = np.zeros((len(points), len(names)))
+    coefficients = np.zeros((len(points), len(names)))
     cost = np.full(len(points), np.inf)
     with np.errstate(all="ignore"):
         for _ in range(REWEIGHTING_ITERATIONS):
             scaled = weight / np.abs(bottom)
             if matrix is not None:
-                answers = _least_squares(matrix * scaled[..., None], goal * scaled)
+                coefficients = _least_squares(matrix * scaled[..., None], target * scaled)
                 if slowest is not None:
                     k, power = names.index(slowest[0]), slowest[1]
                     is_finite = np.isfinite(corners)
                     high_terms = -(corners[is_finite] ** power[is_finite])
-                    rest = goal[is_finite] - matrix[is_finite][:, :, k] * high_terms[:, None]
-                    others = np.delete(matrix[is_finite], k, axis=2)
-                    solved = _least_squares(others * scaled[is_finite][..., None], rest * scaled[is_finite])
-                    answers[is_finite] = np.insert(solved, k, high_terms, axis=1)
+                    remainder = target[is_finite] - matrix[is_finite][:, :, k] * high_terms[:, None]
+                    other_columns = np.delete(matrix[is_finite], k, axis=2)
+                    other_coefficients = _least_squares(
+                        other_columns * scaled[is_finite][..., None], remainder * scaled[is_finite]
+                    )
+                    coefficients[is_finite] = np.insert(other_coefficients, k, high_terms, axis=1)
             bottom = powers - sum(
-                (answers[:, [names.index(n)]] * part for n, part in denominator_parts.items()), 0.0 * powers
+                (coefficients[:, [names.index(n)]] * part for n, part in denominator_parts.items()), 0.0 * powers
             )
-            missed = goal if matrix is None else goal - np.einsum("bnp,bp->bn", matrix, answers)
-            cost = np.sum(np.abs(missed / bottom * weight) ** 2, axis=1)
-    return answers, cost
+            misfit = target if matrix is None else target - np.einsum("bnp,bp->bn", matrix, coefficients)
+            cost = np.sum(np.abs(misfit / bottom * weight) ** 2, axis=1)
+    return coefficients, cost
 
 
-def _slowest_output_term(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
+def _slowest_output_term(problem: ResponseProblem, equation: Equation, points: Floats) -> tuple[str, Floats] | None:
     """Return the coefficient of the output term that dominates at low frequencies, and its order difference.
 
     The difference is alpha minus the order of the term at each point. Only terms with a free coefficient are
     considered; None if there are none.
     """
-    own = [t for t in item.terms if t.signal == item.output and isinstance(t.coefficient, str) and t.factor == 1]
-    if not own:
+    output_terms = [
+        t for t in equation.terms if t.signal == equation.output and isinstance(t.coefficient, str) and t.factor == 1
+    ]
+    if not output_terms:
         return None
-    alpha = _orders(problem, item.order.constant, item.order.weights, points)
-    gaps = [alpha - _orders(problem, t.order.constant, t.order.weights, points) for t in own]
+    alpha = _orders(problem, equation.order.constant, equation.order.weights, points)
+    gaps = [alpha - _orders(problem, t.order.constant, t.order.weights, points) for t in output_terms]
     at = int(np.argmax([float(np.mean(g)) for g in gaps]))
-    return str(own[at].coefficient), gaps[at]
+    return str(output_terms[at].coefficient), gaps[at]
 
 
-def _least_squares(matrix: Complex, right: Complex) -> Floats:
+def _least_squares(matrix: Complex, target: Complex) -> Floats:
     """Return the real minimum-norm least-squares solution of each complex linear system of a batch."""
     lengths = np.sqrt(np.sum(np.abs(matrix) ** 2, axis=1))
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
     scaled = np.nan_to_num(matrix / unit[:, None, :])
     normal = np.einsum("bnp,bnq->bpq", scaled.conj(), scaled).real
-    moment = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(right)).real
+    gradient = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(target)).real
     inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
-    answers: Floats = np.einsum("bpq,bq->bp", inverse, moment) / unit
-    return answers
+    solution: Floats = np.einsum("bpq,bq->bp", inverse, gradient) / unit
+    return solution
 
 
 def _orders(problem: ResponseProblem, constant: float, weights: Sequence[tuple[str, float]], points: Floats) -> Floats:
-    total = np.full(len(points), constant)
+    order_sum = np.full(len(points), constant)
     for name, weight in weights:
-        total = total + weight * points[:, problem.orders.index(name)]
-    return total
+        order_sum = order_sum + weight * points[:, problem.orders.index(name)]
+    return order_sum
 
 
 def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
@@ -557,22 +578,24 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
     return np.full(len(points), problem.known_delays.get(signal, 0.0))
 
 
-def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
+def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, delay_factor: Complex) -> Complex | float:
     """Return the frequency response from the input of a record to a signal.
 
     For an output it is the measured response to the same input, interpolated from another record if necessary. For the
-    input itself it is the delay factor `late`, and for other signals 0.
+    input itself it is the delay factor `delay_factor`, and for other signals 0.
     """
     outputs = problem.structure.outputs
     if name not in outputs:
-        return late if name == record.input else 0.0
+        return delay_factor if name == record.input else 0.0
     if outputs.index(name) == record.output:
         return record.response
-    other = next((r for r in problem.records if r.output == outputs.index(name) and r.input == record.input), None)
-    if other is None:
+    input_record = next(
+        (r for r in problem.records if r.output == outputs.index(name) and r.input == record.input), None
+    )
+    if input_record is None:
         return 0.0
     # Linear interpolation between the frequencies of the other record suffices for an initial guess.
-    order = np.argsort(other.frequency, kind="stable")
-    at, x = np.log(record.frequency), np.log(other.frequency[order])
-    values = other.response[order]
+    order = np.argsort(input_record.frequency, kind="stable")
+    at, x = np.log(record.frequency), np.log(input_record.frequency[order])
+    values = input_record.response[order]
     return np.interp(at, x, values.real) + 1j * np.interp(at, x, values.imag)

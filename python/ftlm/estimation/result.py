@@ -111,31 +111,31 @@ def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> d
         if stage in stages:
             raise ModelError(f"two parameters of stage {stage} are given, but only one may be known; leave {name} out")
         stages.append(stage)
-        amount = real_number(name, value)
-        if not 0 < amount < math.inf:
+        physical_value = real_number(name, value)
+        if not 0 < physical_value < math.inf:
             raise ModelError(f"{name} = {value!r} is not positive; give a positive value")
         h = 2 * stage - 1
         ratio = f"j{stage}" if f"j{stage}" in joint.coefficients else f"r{stage}"
-        needed = [f"a{h}", f"b{h}", f"d{h}", f"g{h}", ratio]
-        missing = [n for n in needed if n not in joint.coefficients]
-        if missing:
+        coefficient_names = [f"a{h}", f"b{h}", f"d{h}", f"g{h}", ratio]
+        missing_names = [n for n in coefficient_names if n not in joint.coefficients]
+        if missing_names:
             raise ModelError(
-                f"coefficient {missing[0]} is not in the fit; identify flexible_link(stage={stage}) with "
+                f"coefficient {missing_names[0]} is not in the fit; identify flexible_link(stage={stage}) with "
                 "laws=('orders', 'coefficients') and all terms free"
             )
-        place = [joint.names.index(n) for n in needed]
+        indices = [joint.names.index(n) for n in coefficient_names]
         # The last coefficient is r = 1 + J_1/J_2, or j = J_1/J_2, to which 1 is added.
-        centre = joint.values[place] + np.array([0.0, 0.0, 0.0, 0.0, float(ratio.startswith("j"))])
-        spread = joint.covariance[np.ix_(place, place)]
-        values = _physical(centre, name, amount, stage)
+        estimate = joint.values[indices] + np.array([0.0, 0.0, 0.0, 0.0, float(ratio.startswith("j"))])
+        covariance = joint.covariance[np.ix_(indices, indices)]
+        values = _physical(estimate, name, physical_value, stage)
         slopes = []
-        for i, c in enumerate(centre):
+        for i, c in enumerate(estimate):
             step = GRADIENT_STEP * (abs(c) if c else 1.0)
-            shift = step * np.eye(centre.size)[i]
-            above, below = (_physical(centre + side, name, amount, stage) for side in (shift, -shift))
-            slopes.append((above - below) / (2 * step))
+            shift = step * np.eye(estimate.size)[i]
+            upper, lower = (_physical(estimate + change, name, physical_value, stage) for change in (shift, -shift))
+            slopes.append((upper - lower) / (2 * step))
         gradient = np.array(slopes).T
-        errors = propagated_errors(gradient, spread)
+        errors = propagated_errors(gradient, covariance)
         units = list(PHYSICAL_UNITS.items())
         for (pattern, unit), v, e in zip(units, values.tolist(), errors.tolist(), strict=True):
             out[pattern.format(j=stage)] = PhysicalParameter(v, e, unit)
@@ -146,9 +146,9 @@ def _physical(coefficients: NDArray[np.float64], name: str, value: float, stage:
     """Return K_s, J_1, J_2, B_1, B_2 and K_tau of a stage from a, b, d, g, r and one known parameter."""
     a, b, d, g, r = coefficients
     # All parameters are relative to J_1.
-    shares = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])
+    robust_weights = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])
     index = [pattern.format(j=stage) for pattern in PHYSICAL_UNITS].index(name)
-    out: NDArray[np.float64] = value / shares[index] * shares
+    out: NDArray[np.float64] = value / robust_weights[index] * robust_weights
     return out
 
 
@@ -170,9 +170,9 @@ class Task:
     structure: Structure
     order_grid: OrderGrid | None = None
 
-    def part_order_grid(self, part: Structure) -> OrderGrid:
-        """Return the order grid restricted to the free orders of `part`, a structure with some of the equations."""
-        return restrict_order_grid(self.order_grid, part) or OrderGrid()
+    def part_order_grid(self, group: Structure) -> OrderGrid:
+        """Return the order grid restricted to the free orders of `group`, a structure with some of the equations."""
+        return restrict_order_grid(self.order_grid, group) or OrderGrid()
 
 
 @dataclass(frozen=True)
@@ -277,8 +277,8 @@ class Identification:
         free = {*model.orders, *coefficients, *self.standard_errors}
         values_by_name = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
         values = self.values | {n: v for n, v in values_by_name.items() if n not in self.values}
-        own = parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
-        return {**own, **self.offsets}
+        estimates = parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
+        return {**estimates, **self.offsets}
 
     @property
     def offsets(self) -> dict[str, Parameter]:
@@ -566,23 +566,23 @@ class Identification:
         reference = self.model.structure.reference
         errors = self.standard_errors
         for name, value in self.values.items():
-            spread = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
+            error_text = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
-                spread += f"   {self.profiles[name]}"
+                error_text += f"   {self.profiles[name]}"
             reference_text = f"   (stated {reference[name]:.6g})" if name in reference else ""
-            lines.append(f"  {name:<12}{value:>14.6g}{spread}{reference_text}")
+            lines.append(f"  {name:<12}{value:>14.6g}{error_text}{reference_text}")
         if self.joint is not None:
             lines.append(f"  {self.joint.origin_text}")
         if errors:
-            others = ", but those written out: by profile likelihood" if self.profiles else ""
-            lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{others})")
+            interval_text = ", but those written out: by profile likelihood" if self.profiles else ""
+            lines.append(f"  (value ± standard error; 95 % intervals are ± 1.96 of these{interval_text})")
         lines.append(str(replace(self.comparison, findings=())))
         if self.residuals is not None:
-            white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
+            white_text = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
             free = ", ".join(f"{o} {w}" for o, w in self.residuals.independence.items())
-            around = [f"{u} around {o}" for o, r in self.residuals.outputs.items() for u in r.feedback]
-            loop = f"; closed loop of {', '.join(around)}" if around else ""
-            lines.append(f"residuals white: {white}; independent of the inputs: {free}{loop} (99 %)")
+            feedback_loops = [f"{u} around {o}" for o, r in self.residuals.outputs.items() for u in r.feedback]
+            loop = f"; closed loop of {', '.join(feedback_loops)}" if feedback_loops else ""
+            lines.append(f"residuals white: {white_text}; independent of the inputs: {free}{loop} (99 %)")
         if self.information is not None:
             lines.append(str(self.information))
         for name, search in self.searches.items():
@@ -609,8 +609,8 @@ def _initial_in_words(comparison: Comparison) -> list[str]:
     for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
         for output, terms in initial.items():
             if terms:
-                listed = ", ".join(
+                values_text = ", ".join(
                     f"{v:.4g} t^{e:g}" if e > -1 else f"{filter_state(e)} {v:.4g}" for e, v in terms.items()
                 )
-                lines.append(f"initial terms of {output} in {run} (of that run alone): {listed}")
+                lines.append(f"initial terms of {output} in {run} (of that run alone): {values_text}")
     return lines

@@ -88,14 +88,16 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
     if len(pieces) < MIN_PIECES or any(run.sample_times is not None for run in runs):
         return None
     sample_pieces = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MAX_PIECES).astype(int))]
-    started = replace(model, structure=replace(model.structure, initial="caputo"))
+    model_in_motion = replace(model, structure=replace(model.structure, initial="caputo"))
     try:
-        free = simulate_runs(started, sample_pieces)
+        free = simulate_runs(model_in_motion, sample_pieces)
     except FtlmError:
         return None
     ratios = []
     for k in range(len(model.outputs)):
-        outputs = [measured_samples(started, run, f.refinement)[k] for run, f in zip(sample_pieces, free, strict=True)]
+        outputs = [
+            measured_samples(model_in_motion, run, f.refinement)[k] for run, f in zip(sample_pieces, free, strict=True)
+        ]
         residuals = [y - simulated.outputs[k] for y, simulated in zip(outputs, free, strict=True)]
         power = sum(float(np.nansum((y - np.nanmean(y)) ** 2)) for y in outputs)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -111,14 +113,14 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
     """
     if not model.structure.is_linear:
         return []
-    explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
+    is_explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
     is_unstable = any(f.code == "simulation_unbounded" for f in stability_findings(model))
     if is_unstable:
         test = piece_test(model, runs)
         if test is not None and test.passed:
-            code = "plant_unstable" if explained and fit.joint is not None else "plant_unstable_in_pieces"
+            code = "plant_unstable" if is_explained and fit.joint is not None else "plant_unstable_in_pieces"
             return [make_finding(code, fit=test.fit, seconds=test.seconds)]
-    if (explained and not is_unstable) or fit.joint is None:
+    if (is_explained and not is_unstable) or fit.joint is None:
         return []
     test = least_squares_piece_test(runs, fit.task.structure.with_orders(model.orders), model.units)
     return [] if test is None else [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]

@@ -121,15 +121,15 @@ class Validation(Comparison):
         return str(verdict_html(self.verdict)) + super()._repr_html_()
 
 
-def verdict_html(judgement: Verdict) -> Markup:
+def verdict_html(verdict_shown: Verdict) -> Markup:
     """Return a verdict as an HTML paragraph."""
-    return Markup("<p><strong>{}</strong>: {}.</p>").format(judgement.level.capitalize(), judgement.sentence)
+    return Markup("<p><strong>{}</strong>: {}.</p>").format(verdict_shown.level.capitalize(), verdict_shown.sentence)
 
 
 def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:
     """Return a comparison with other runs as a validation, with the verdict from estimation and validation."""
-    own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
-    return Validation(**own, verdict=verdict(result, comparison))
+    comparison_fields = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
+    return Validation(**comparison_fields, verdict=verdict(result, comparison))
 
 
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
@@ -137,14 +137,14 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
     Serious findings that no rule covers follow in the sequence of the topics in ``findings.toml``.
     """
-    whole = not any(f.code == "runs_split" for f in result.findings)
-    unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
+    is_complete = not any(f.code == "runs_split" for f in result.findings)
+    unstable = is_complete and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
     runs = () if validation is None or unstable else (validation,)
     repeated = validation is not None and any(f.code in REPEATED_RUN_CODES for f in validation.findings)
     has_validation = bool(runs) and not repeated
-    against = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation, result.method)
-    if against is not None:
-        return against
+    overall_verdict = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation, result.method)
+    if overall_verdict is not None:
+        return overall_verdict
     fits = ", ".join(f"{o} {f.fit:.4g} %" for o, f in (validation or result.comparison).output_error.items())
     residual_text = _describe_residuals(result)
     return Verdict(
@@ -162,35 +162,37 @@ def _describe_residuals(result: Identification) -> str:
 
 
 def _combined_verdict(
-    own: Sequence[Finding],
+    model_findings: Sequence[Finding],
     estimation_fits: Mapping[str, float],
     runs: Sequence[Comparison],
     has_validation: bool,
     method: str = "",
 ) -> Verdict | None:
-    """Return the verdict from the findings `own` of a fit and from comparisons with validation `runs`.
+    """Return the verdict from the findings `model_findings` of a fit and from comparisons with validation `runs`.
 
     None if no finding is a warning. `method` is the name of the estimation method.
     """
-    reported = [f.output for f in own if f.code in POOR_FIT_CODES]
-    findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, reported)]
+    reported_outputs = [f.output for f in model_findings if f.code in POOR_FIT_CODES]
+    findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, reported_outputs)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
     # A remedy must not suggest the method that was used.
     findings = [replace(f, method=method) for f in findings]
-    own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
+    severe = [f for f in model_findings if f.level == LEVEL_DO_NOT_USE]
     # Findings of the fit name what is missing more precisely.
-    last = [f for comparison in runs for f in comparison.findings if f.code == "validation_follows_input"]
-    last += [] if has_validation else [make_finding("not_validated")]
-    return verdict_from([*own_first, *findings, *own, *last])
+    input_following = [f for comparison in runs for f in comparison.findings if f.code == "validation_follows_input"]
+    input_following += [] if has_validation else [make_finding("not_validated")]
+    return verdict_from([*severe, *findings, *model_findings, *input_following])
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
     """Return the verdict whose reason is the most serious of some findings; None if no finding is a warning."""
-    listed = list(findings)
-    bad = [f for level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) for f in listed if f.level == level]
-    if not bad:
+    all_findings = list(findings)
+    relevant = [f for level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) for f in all_findings if f.level == level]
+    if not relevant:
         return None
-    return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(f.reason for f in bad)))
+    return Verdict(
+        relevant[0].level, relevant[0].reason, relevant[0].remedy, tuple(dict.fromkeys(f.reason for f in relevant))
+    )
 
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
@@ -198,19 +200,19 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     estimate = model.estimate
     plant = estimate is not None and any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings)
     unstable = plant and estimate is not None and estimate.piece_duration is None
-    own = [] if unstable else [*_unstable_poles(model)]
+    model_findings = [] if unstable else [*_unstable_poles(model)]
     validation = () if unstable else validation
     if estimate is None:
-        own.append(make_finding("origin_unknown"))
-        judgement = _combined_verdict(own, {}, validation, True)
+        model_findings.append(make_finding("origin_unknown"))
+        overall_verdict = _combined_verdict(model_findings, {}, validation, True)
     else:
-        own += saved_findings(estimate)
+        model_findings += saved_findings(estimate)
         estimation_fits = {n: f for n, f in estimate.fit.items() if f is not None}
         is_repeated = any(name in estimate.runs for c in validation for name, _, _ in c.per_run)
         is_validated = bool(validation) and not is_repeated
-        judgement = _combined_verdict(own, estimation_fits, validation, is_validated, estimate.method)
-    if judgement is not None:
-        return judgement
+        overall_verdict = _combined_verdict(model_findings, estimation_fits, validation, is_validated, estimate.method)
+    if overall_verdict is not None:
+        return overall_verdict
     fits = ", ".join(f"{o} {f.fit:.4g} %" for c in validation for o, f in c.output_error.items())
     return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), with no finding against its fit")
 
@@ -232,8 +234,8 @@ def saved_findings(estimate: Estimate) -> list[Finding]:
 
 def result_findings(result: Identification) -> Iterator[Finding]:
     """Yield the findings that lower the verdict on a result that is not validated, most important first."""
-    for item in _against_result(result):
-        yield replace(item, method=result.method)
+    for finding in _against_result(result):
+        yield replace(finding, method=result.method)
 
 
 def _against_result(result: Identification) -> Iterator[Finding]:
@@ -307,9 +309,9 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
     """Yield a finding about the slowest oscillatory mode whose damping is not significantly positive, if any."""
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.oscillatory and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
-            spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
+            error_text = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
             yield make_finding(
-                "oscillation_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread
+                "oscillation_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=error_text
             )
             return
 
@@ -321,24 +323,26 @@ def is_degenerate(result: Identification) -> bool:
 
 def have_common_value(intervals: Any) -> bool:
     """Whether all intervals (low, high) have a value in common."""
-    each = list(intervals)
-    return not each or max(low for low, _ in each) <= min(high for _, high in each)
+    all_intervals = list(intervals)
+    return not all_intervals or max(low for low, _ in all_intervals) <= min(high for _, high in all_intervals)
 
 
 def improves_prediction(
-    gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
+    gains: Sequence[float],
+    intervals: Mapping[str, Mapping[str, tuple[float, float]]],
+    integer_orders: Mapping[str, float],
 ) -> bool | None:
     """Whether fractional orders improve the prediction of other runs; None if the test is inconclusive.
 
     `gains` are the increases of the fit on validation runs [percentage points], `intervals` the confidence intervals of
-    orders by name and run, and `whole` the integer orders by name.
+    orders by name and run, and `integer_orders` the integer orders by name.
 
     True if every estimation run excludes an integer order, the intervals of the runs overlap, no gain is significantly
     negative, and the median gain is significant. False if no gain is significant, or if no run excludes an integer
     order and the median gain is not significant. Otherwise None.
     """
     runs = list(next(iter(intervals.values()), {}))
-    is_outside = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
+    is_outside = [any(not e[r][0] <= integer_orders[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
     counts = median(gains) >= MIN_FIT_GAIN
     if (
         all(is_outside)
@@ -357,22 +361,29 @@ def is_buried(residuals: OutputResiduals) -> bool:
 
     The model must also explain a part of the output, because a zero model of pure noise passes both tests.
     """
-    moving = [t for t in residuals.informative_tests.values() if t.conclusive]
-    explained = residuals.nr < MAX_BURIED_RESIDUAL
-    return explained and residuals.whiteness.passed and bool(moving) and all(t.passed for t in moving)
+    conclusive_tests = [t for t in residuals.informative_tests.values() if t.conclusive]
+    is_explained = residuals.nr < MAX_BURIED_RESIDUAL
+    return (
+        is_explained
+        and residuals.whiteness.passed
+        and bool(conclusive_tests)
+        and all(t.passed for t in conclusive_tests)
+    )
 
 
-def _poor_fits(where: str, comparison: Comparison, reported: Sequence[str] = ()) -> Iterator[Finding]:
+def _poor_fits(location: str, comparison: Comparison, reported_outputs: Sequence[str] = ()) -> Iterator[Finding]:
     """Yield a finding on the outputs whose NR exceeds `MAX_NORMALIZED_RESIDUAL` over all runs, or else in one run.
 
     If no output exceeds the limit over all runs, each run is tested by itself, because runs with large signals dominate
-    the total. NR is the normalized residual. `reported` are outputs that are not tested.
+    the total. NR is the normalized residual. `reported_outputs` are outputs that are not tested.
     """
     for run, errors in _errors_by_run(comparison):
-        poor_outputs = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in reported]
+        poor_outputs = [
+            o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in reported_outputs
+        ]
         if poor_outputs:
             text = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in poor_outputs)
-            yield make_finding("poor_fit", run=run, output=", ".join(poor_outputs), where=where, shown=text)
+            yield make_finding("poor_fit", run=run, output=", ".join(poor_outputs), where=location, shown=text)
             return
 
 
@@ -390,19 +401,22 @@ def _on(run: str) -> str:
 
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
     """Yield one finding for each output whose fit on validation runs is far below its fit on estimation runs."""
-    found: set[str] = set()
+    found_outputs: set[str] = set()
     for run, errors in _errors_by_run(validation):
         for output, figures in errors.items():
-            if output not in estimation_fits or output in found:
+            if output not in estimation_fits or output in found_outputs:
                 continue
-            misfit, own = 100.0 - figures.fit, 100.0 - estimation_fits[output]
+            misfit, estimation_misfit = 100.0 - figures.fit, 100.0 - estimation_fits[output]
             if not (
-                misfit <= own + MAX_FIT_DROP_POINTS
-                and all(misfit <= times * own or misfit <= little for times, little in VALIDATION_LOSS_LIMITS)
+                misfit <= estimation_misfit + MAX_FIT_DROP_POINTS
+                and all(
+                    misfit <= times * estimation_misfit or misfit <= small_misfit
+                    for times, small_misfit in VALIDATION_LOSS_LIMITS
+                )
             ):
-                numbers = {"before": estimation_fits[output], "after": figures.fit, "where": _on(run)}
-                yield make_finding("fit_falls", run=run, output=output, **numbers)
-                found.add(output)
+                details = {"before": estimation_fits[output], "after": figures.fit, "where": _on(run)}
+                yield make_finding("fit_falls", run=run, output=output, **details)
+                found_outputs.add(output)
 
 
 def _residual_findings(result: Identification) -> Iterator[Finding]:
@@ -416,15 +430,15 @@ def _residual_findings(result: Identification) -> Iterator[Finding]:
     # Residuals of an incomplete model under a periodic input resemble feedback, so missing terms come first.
     coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in outputs]
     missing_couplings = {(f.output, f.input) for f in coupled}
-    following = {
+    signals_by_output = {
         o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in missing_couplings]
         for o, r in outputs.items()
     }
-    following = {o: signals for o, signals in following.items() if signals}
-    if following:
-        text = ", ".join(f"{o} with {enumerate_names(signals)}" for o, signals in following.items())
-        signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
-        yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=text)
+    signals_by_output = {o: signals for o, signals in signals_by_output.items() if signals}
+    if signals_by_output:
+        text = ", ".join(f"{o} with {enumerate_names(signals)}" for o, signals in signals_by_output.items())
+        signals = ", ".join(dict.fromkeys(s for output_signals in signals_by_output.values() for s in output_signals))
+        yield make_finding("residuals_follow_input", output=", ".join(signals_by_output), input=signals, shown=text)
     yield from coupled
     yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in outputs)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in outputs)
@@ -445,16 +459,16 @@ def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:
 def _is_uncertain(result: Identification, name: str) -> bool:
     """Whether an order or a coefficient is poorly determined, by its profile-likelihood interval if available."""
     error = result.standard_errors[name]
-    numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
+    coefficients = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
     if name in result.orders:
         return error > MAX_ORDER_ERROR or (name in result.profiles and math.isinf(result.profiles[name].high))
-    if name not in numbers:
+    if name not in coefficients:
         # A delay, saturation or dead zone may be 0.
         return False
     if name in result.profiles:
         interval = result.profiles[name]
         return interval.is_open or 0.0 in interval
-    return error > MAX_COEFFICIENT_ERROR_RATIO * abs(numbers[name])
+    return error > MAX_COEFFICIENT_ERROR_RATIO * abs(coefficients[name])
 
 
 def _is_of_input(result: Identification, name: str) -> bool:

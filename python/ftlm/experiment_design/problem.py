@@ -311,8 +311,8 @@ class ModelFit:
 
 def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
     orders, coefficients, inputs = problem.split(values)
-    grid = Objective(problem, [run], weights, every=every)
-    point = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, plain=True)
+    grid = Objective(problem, [run], weights, pulses_per_sample=every)
+    point = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, linear_scale=True)
     return np.asarray(point.outcome["jacobian"])
 
 

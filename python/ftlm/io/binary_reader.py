@@ -44,8 +44,8 @@ NUMERIC_MATLAB_CLASSES = frozenset(
 class UnreadableError(Exception):
     """Error for a file that cannot be read: reason `why`, and remedy `way_out`, which is "" for a damaged file."""
 
-    def __init__(self, why: str, way_out: str = "") -> None:
-        super().__init__(why)
+    def __init__(self, reason: str, way_out: str = "") -> None:
+        super().__init__(reason)
         self.way_out = way_out
 
 
@@ -58,11 +58,11 @@ def limit_resources(memory: int, seconds: int | None = None) -> None:
     limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_CORE: 0}
     if seconds is not None:
         limits[resource.RLIMIT_CPU] = seconds
-    for kind, most in limits.items():
-        _, hard = resource.getrlimit(kind)
-        allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    for kind, maximum in limits.items():
+        _, hard_limit = resource.getrlimit(kind)
+        limit = maximum if hard_limit == resource.RLIM_INFINITY else min(maximum, hard_limit)
         try:
-            resource.setrlimit(kind, (allowed, hard))
+            resource.setrlimit(kind, (limit, hard_limit))
         except (OSError, ValueError):
             continue
 
@@ -121,19 +121,19 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     if len(names) > MAX_ARRAYS:
         raise UnreadableError(f"it contains {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
     # With mat_dtype=True, SciPy drops imaginary parts; the stored types keep them.
-    wanted = [*kinds, *structs]
-    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=wanted) if wanted else {}
+    names_to_read = [*kinds, *structs]
+    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=names_to_read) if names_to_read else {}
     for name in structs:
         for field, values in struct_fields(loaded.pop(name)):
             # Fields of the only struct keep their own names, as `t` of `data.t`.
-            whole = field if len(structs) == 1 and field not in names else f"{name}.{field}"
+            full_name = field if len(structs) == 1 and field not in names else f"{name}.{field}"
             is_table = isinstance(values, numpy.ndarray) and values.ndim == 2 and values.dtype.kind in "biuf"
-            if not is_table or values.size == 0 or whole in loaded:
-                skipped[whole] = "no column of numbers"
+            if not is_table or values.size == 0 or full_name in loaded:
+                skipped[full_name] = "no column of numbers"
                 continue
             size += 8 * values.size
-            kinds[whole] = "single" if values.dtype == numpy.float32 else "double"
-            loaded[whole] = values
+            kinds[full_name] = "single" if values.dtype == numpy.float32 else "double"
+            loaded[full_name] = values
     if size > budget or len(kinds) > MAX_ARRAYS:
         raise UnreadableError(
             f"with its structs the arrays take more than {SIZE_LIMIT} bytes or {MAX_ARRAYS} columns",
@@ -240,8 +240,8 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
         if types.is_timestamp(kind) or types.is_date(kind):
             arrays.add(name, compute.cast(column, "timestamp[ns]").to_numpy())
         elif types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind):
-            form = "float32" if types.is_float32(kind) else "float64"
-            values = compute.cast(column, form).combine_chunks().to_numpy(zero_copy_only=False)
+            float_type = "float32" if types.is_float32(kind) else "float64"
+            values = compute.cast(column, float_type).combine_chunks().to_numpy(zero_copy_only=False)
             arrays.add(name, values, units.get(name, ""))
             digest.update(f"\0{name}\0{len(values)}\0".encode())
             digest.update(numpy.ascontiguousarray(values, dtype="<f8").tobytes())
@@ -260,13 +260,13 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
 def _arrow_units(schema: Any) -> dict[str, str]:
     """Return the units by column from the metadata of Arrow fields, or from the attributes of a pandas frame."""
     try:
-        whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
-        units = {str(name): str(unit) for name, unit in whole.items()}
+        all_units = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
+        units = {str(name): str(unit) for name, unit in all_units.items()}
     except (ValueError, AttributeError, RecursionError):
         units = {}
     for item in schema:
-        own = item.metadata or {}
-        unit = own.get(b"units", own.get(b"unit"))
+        field_metadata = item.metadata or {}
+        unit = field_metadata.get(b"units", field_metadata.get(b"unit"))
         if unit is not None:
             units[item.name] = unit.decode("utf-8", errors="replace")
     return units
@@ -278,31 +278,31 @@ class Arrays:
     def __init__(self, budget: int = SIZE_LIMIT) -> None:
         self.header: dict[str, Any] = {"arrays": [], "skipped": {}}
         self.values: list[Any] = []
-        self.left = budget
+        self.remaining_budget = budget
 
     def fits(self, name: str, shape: tuple[int, ...], kind: Any) -> bool:
         """Return whether an array of this shape and dtype is supported; if not, record the reason in the header.
 
         Raise UnreadableError if the array would exceed the size limit or the maximum number of arrays.
         """
-        why = None
+        reason = None
         if kind.hasobject:
-            why = "pickled objects, which are not read"
+            reason = "pickled objects, which are not read"
         elif kind.names is None and kind.kind not in "biufM":
-            why = "complex" if kind.kind == "c" else "no numbers"
+            reason = "complex" if kind.kind == "c" else "no numbers"
         elif not 1 <= len(shape) <= 2:
-            why = "a single value" if not shape else f"{len(shape)} dimensions"
+            reason = "a single value" if not shape else f"{len(shape)} dimensions"
         elif 0 in shape:
-            why = "empty"
-        if why is not None:
-            self.header["skipped"][name] = why
+            reason = "empty"
+        if reason is not None:
+            self.header["skipped"][name] = reason
             return False
         size = 8 * math.prod(shape) * len(kind.names or " ")
-        if size > self.left:
+        if size > self.remaining_budget:
             raise UnreadableError(f"with {name!r} the arrays take more than {SIZE_LIMIT} bytes", "save a part of it")
         if len(self.values) + len(kind.names or " ") > MAX_ARRAYS:
             raise UnreadableError(f"it contains more than {MAX_ARRAYS} arrays", "save a part of it")
-        self.left -= size
+        self.remaining_budget -= size
         return True
 
     def add(self, name: str, values: Any, unit: str = "") -> None:
@@ -311,11 +311,11 @@ class Arrays:
         if values.dtype.names:
             for field in values.dtype.names:
                 column = values[field]
-                whole = f"{name}.{field}" if name else field
+                full_name = f"{name}.{field}" if name else field
                 if column.ndim == 1 and column.dtype.kind in "biufM":
-                    self.add(whole, column)
+                    self.add(full_name, column)
                 else:
-                    self.header["skipped"][whole] = "no column of numbers"
+                    self.header["skipped"][full_name] = "no column of numbers"
             return
         matrix = values.reshape(-1, 1) if values.ndim == 1 else values
         fields: dict[str, Any] = {"type": "single" if values.dtype == numpy.float32 else "double"}
@@ -367,9 +367,9 @@ def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
 
     `name` is the name of the array. Raise UnreadableError if its size is wrong, or exceeds the limit of `arrays`.
     """
-    form: Any = importlib.import_module("numpy.lib.format")
-    version = form.read_magic(stream)
-    read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
+    npy_format: Any = importlib.import_module("numpy.lib.format")
+    version = npy_format.read_magic(stream)
+    read_header = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}.get(version)
     if read_header is None:
         raise UnreadableError(f"{name!r} has an unknown NumPy format ({version})", "save it again")
     shape, order, kind = read_header(stream)
@@ -497,8 +497,8 @@ def cell_text(cell: Any) -> str:
         return repr(cell)
     if isinstance(cell, datetime.timedelta):
         # A duration is written with its unit; a plain number would get the unit in the header of its column.
-        seconds, rest = divmod(abs(cell) // datetime.timedelta(microseconds=1), 1_000_000)
-        return f"{'-' if cell < datetime.timedelta() else ''}PT{seconds}.{rest:06}S"
+        seconds, microseconds = divmod(abs(cell) // datetime.timedelta(microseconds=1), 1_000_000)
+        return f"{'-' if cell < datetime.timedelta() else ''}PT{seconds}.{microseconds:06}S"
     if isinstance(cell, datetime.datetime):
         return cell.isoformat(sep=" ")
     if isinstance(cell, datetime.date | datetime.time):

@@ -33,14 +33,14 @@ _MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", 
 
 
 @functools.cache
-def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
+def _grouped_number_pattern(separator: str, comma: bool) -> re.Pattern[str]:
     """Return a regular expression for numbers with grouped thousands; its group 1 is the decimal mark and decimals.
 
-    `mark` is the name of the thousands separator. `comma` states whether the decimal mark is a comma.
+    `separator` is the name of the thousands separator. `comma` states whether the decimal mark is a comma.
     """
     point = "," if comma else "[.]"
     return re.compile(
-        rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS_SEPARATORS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*",
+        rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS_SEPARATORS[separator]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*",
         re.ASCII,
     )
 
@@ -52,27 +52,31 @@ def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
     """
     if len(cell) < len("1.234,"):
         return None
-    for mark in THOUSANDS_SEPARATORS:
-        pair = _grouped_number_pattern(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
+    for separator in THOUSANDS_SEPARATORS:
+        pair = (
+            _grouped_number_pattern(separator, comma).fullmatch(cell)
+            if separator != ("comma" if comma else "point")
+            else None
+        )
         if pair and pair[1]:
-            return mark
+            return separator
     return None
 
 
-def may_group(cell: str, mark: str, *, comma: bool) -> bool:
-    """Whether a cell may be a number with the thousands separator named `mark`; `comma` means decimal commas."""
-    return _grouped_number_pattern(mark, comma).fullmatch(cell) is not None
+def may_group(cell: str, separator: str, *, comma: bool) -> bool:
+    """Whether a cell may be a number with the thousands separator named `separator`; `comma` means decimal commas."""
+    return _grouped_number_pattern(separator, comma).fullmatch(cell) is not None
 
 
-def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
+def parse_number(cell: str, *, comma: bool = False, thousands_separator: str | None = None) -> float:
     """Return the number in a cell, 1 for true and 0 for false; raise ValueError if there is none.
 
-    `comma` states whether the decimal mark is a comma, and `mark` is the name of the thousands separator. Underscores
-    between digits, which Python accepts, are rejected. With decimal commas, points are accepted as thousands separators
-    only.
+    `comma` states whether the decimal mark is a comma, and `thousands_separator` is the name of the thousands
+    separator. Underscores between digits, which Python accepts, are rejected. With decimal commas, points are accepted
+    as thousands separators only.
     """
-    if mark is not None and may_group(cell, mark, comma=comma):
-        cell = re.sub(THOUSANDS_SEPARATORS[mark], "", cell)
+    if thousands_separator is not None and may_group(cell, thousands_separator, comma=comma):
+        cell = re.sub(THOUSANDS_SEPARATORS[thousands_separator], "", cell)
     if "_" in cell or (comma and "." in cell):
         raise ValueError(cell)
     text = cell.replace(",", ".") if comma else cell
@@ -87,10 +91,10 @@ def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> 
         return float(text.replace("D", "e").replace("d", "e"))
 
 
-def is_number(cell: str, *, comma: bool = False, mark: str | None = None) -> bool:
+def is_number(cell: str, *, comma: bool = False, thousands_separator: str | None = None) -> bool:
     """Whether a cell is a number; arguments are those of :func:`parse_number`."""
     try:
-        parse_number(cell, comma=comma, mark=mark)
+        parse_number(cell, comma=comma, thousands_separator=thousands_separator)
     except ValueError:
         return False
     return True
@@ -129,13 +133,13 @@ def split_unit(name: str) -> tuple[str, str]:
     opening = {"]": "[", ")": "("}.get(text[-1:])
     if opening is None:
         for word in _BEFORE_UNITS:
-            bare, mark, unit = text.rpartition(word)
-            if mark and bare.strip() and parse_unit(unit.strip()) is not None:
+            bare, preposition, unit = text.rpartition(word)
+            if preposition and bare.strip() and parse_unit(unit.strip()) is not None:
                 return bare.rstrip(), unit.strip()
         return name, ""
-    bare, mark, unit = text[:-1].rpartition(opening)
+    bare, preposition, unit = text[:-1].rpartition(opening)
     bare, unit = bare.rstrip().removesuffix(" /").rstrip(), unit.strip()
-    return (bare, unit) if mark and bare and unit and text[-1] not in unit else (name, "")
+    return (bare, unit) if preposition and bare and unit and text[-1] not in unit else (name, "")
 
 
 def split_slash_unit(name: str) -> tuple[str, str]:
@@ -148,8 +152,8 @@ def split_slash_unit(name: str) -> tuple[str, str]:
 def _bracket_content(cell: str) -> str | None:
     """Return the content of the brackets if a cell consists of one pair of brackets, otherwise None."""
     text = cell.strip()
-    whole = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
-    return text[1:-1].strip() if whole else None
+    is_bracketed = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
+    return text[1:-1].strip() if is_bracketed else None
 
 
 def is_unit(cell: str) -> bool:
@@ -210,7 +214,7 @@ class Timestamps:
     ----------
     parts
         Three numbers of each date in the sequence of the text, shape (N, 3); zeros without a date.
-    mark
+    separator
         Separator of the date; "" without a date.
     clock
         Time of day (in UTC if the text has a time zone), duration, or time since a reference [ns], shape (N,).
@@ -222,7 +226,7 @@ class Timestamps:
     """
 
     parts: npt.NDArray[np.int64]
-    mark: str
+    separator: str
     clock: npt.NDArray[np.int64]
     first: str
     notation: tuple[object, ...] = ()
@@ -238,15 +242,15 @@ class Timestamps:
         if not matches or any(match is None for match in matches):
             return None
         groups = [match.groups("") for match in matches if match is not None]
-        mark = groups[0][1]
+        separator = groups[0][1]
         zoned = bool(groups[0][9] or groups[0][15])
         rows = [(*g[:4], *(g[4:10] if g[1] else g[10:16])) for g in groups]
         halved = bool(rows[0][8])
-        if any(row[1] != mark or bool(row[9]) != zoned or bool(row[8]) != halved for row in rows):
+        if any(row[1] != separator or bool(row[9]) != zoned or bool(row[8]) != halved for row in rows):
             return None
         parts = np.array([(int(r[0] or 0), int(r[2] or 0), int(r[3] or 0)) for r in rows], np.int64)
         clock = np.array([_time_of_day_ns(*row[4:]) for row in rows], np.int64)
-        return cls(parts, mark, clock, cells[0].strip(), (mark, zoned, halved))
+        return cls(parts, separator, clock, cells[0].strip(), (separator, zoned, halved))
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Timestamps]) -> Timestamps | None:
@@ -272,16 +276,16 @@ class Timestamps:
             If a date is invalid, or the sequence of day and month is ambiguous.
         """
         since = self.clock
-        if not self.mark:
+        if not self.separator:
             return np.asarray((since - since[0]) / _NANOSECONDS_PER_SECOND)
-        year, month, day = (self.parts[:, place] for place in self._order(thing, dates))
+        year, month, day = (self.parts[:, index] for index in self._order(thing, dates))
         year = np.where(year < 100, year + 2000, year)
         months = (12 * (year - 1970) + np.clip(month, 1, 12) - 1).astype("datetime64[M]")
         starts, ends = (m.astype("datetime64[D]").astype(np.int64) for m in (months, months + 1))
-        bad = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
-        if bad.any():
+        is_invalid = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
+        if is_invalid.any():
             remedy = f"correct these rows, or give the order of day and month with {layout_parameter(dates='dmy')}"
-            raise masked_rows_error(thing, "an invalid date", bad, remedy)
+            raise masked_rows_error(thing, "an invalid date", is_invalid, remedy)
         days = starts + day - 1
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
@@ -290,7 +294,7 @@ class Timestamps:
 
         The result is also "" if the user gave the sequence (`dates`).
         """
-        if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
+        if not self.separator or dates is not None or (self.parts == self.parts[0]).all():
             return ""
         order = self._detect_date_order()
         return "" if order == "ymd" else order
@@ -303,16 +307,16 @@ class Timestamps:
         if second > 12 >= first:
             return "mdy"
         # Dates with points begin with the day; other dates may have conclusive numbers. Equal dates need no order.
-        is_day_first = self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
+        is_day_first = self.separator == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
         return "dmy" if is_day_first else ""
 
     def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
         """Return the positions of year, month and day in a date; raise DataError if they are ambiguous."""
-        first, likely = self.parts[:, 0].max(), self._detect_date_order()
+        largest_first, likely = self.parts[:, 0].max(), self._detect_date_order()
         order = likely if likely == "ymd" or dates is None else dates
         if order:
             return {"ymd": (0, 1, 2), "dmy": (2, 1, 0), "mdy": (2, 0, 1)}[order]
-        if first > 12:
+        if largest_first > 12:
             raise DataError(
                 f"{thing}: {self.first!r} may begin with the year or with the day; give "
                 f"{layout_parameter(dates='ymd')} or {layout_parameter(dates='dmy')}"
@@ -335,7 +339,7 @@ def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: st
     return (minutes * 60 + int(second or 0)) * _NANOSECONDS_PER_SECOND + int((fraction or "0").ljust(9, "0"))
 
 
-def _duration_ns(sign: str, whole: str, fraction: str) -> int:
+def _duration_ns(sign: str, whole_seconds: str, fraction: str) -> int:
     """Return a duration [ns] from the texts of its sign, seconds and decimals."""
-    nanoseconds = int(whole) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
+    nanoseconds = int(whole_seconds) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
     return -nanoseconds if sign else nanoseconds

@@ -77,9 +77,9 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         if not words_of(c) & _WORDS_BY_ROLE["reference"]
         and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in quantities)
     ]
-    roles, every = _roles_by_words(plant), _roles_by_words(columns)
+    roles, roles_of_all = _roles_by_words(plant), _roles_by_words(columns)
     # If the only other columns are outputs, a reference is the input of a closed loop.
-    return every if not roles[1] or (every[0] and not roles[0]) else roles
+    return roles_of_all if not roles[1] or (roles_of_all[0] and not roles[0]) else roles
 
 
 def _tokens(column: str) -> frozenset[str]:
@@ -98,16 +98,16 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         for role in ("input", "output", "input or output")
     )
     input_columns, output_columns = [c for c in inputs if c not in outputs], [c for c in outputs if c not in inputs]
-    either = [c for c in both if c not in input_columns and c not in output_columns]
-    if either and not input_columns:
-        input_columns, either = either, []
-    rest = [c for c in columns if c not in input_columns and c not in output_columns]
-    if len(rest) == 1 and rest != either:
+    ambiguous = [c for c in both if c not in input_columns and c not in output_columns]
+    if ambiguous and not input_columns:
+        input_columns, ambiguous = ambiguous, []
+    without_role = [c for c in columns if c not in input_columns and c not in output_columns]
+    if len(without_role) == 1 and without_role != ambiguous:
         if input_columns and not output_columns:
-            output_columns, rest = rest, []
+            output_columns, without_role = without_role, []
         elif output_columns and not input_columns:
-            input_columns, rest = rest, []
-    if output_columns and not input_columns and not rest:
+            input_columns, without_role = without_role, []
+    if output_columns and not input_columns and not without_role:
         # Outputs without any input are a free response.
         return [], output_columns
     return (input_columns, output_columns) if input_columns and output_columns else ([], [])
@@ -165,35 +165,35 @@ def assume_roles(
     if selection.inputs or selection.outputs:
         return ()
     free = [c for c in columns if has_numbers(c) and c.name and c.name.isprintable()]
-    own = {c.name_with_unit: c.name for c in free}
+    names_by_label = {c.name_with_unit: c.name for c in free}
     if signals is not None:
-        columns_by_name = {name: own[c] for c, name in signal_names(dict.fromkeys(own, "c")).items()} | {
-            c.name: c.name for c in free
-        }
-        if all(name in columns_by_name for side in signals for name in side):
+        columns_by_name = {
+            name: names_by_label[c] for c, name in signal_names(dict.fromkeys(names_by_label, "c")).items()
+        } | {c.name: c.name for c in free}
+        if all(name in columns_by_name for names_pair in signals for name in names_pair):
             selection.inputs = {name: columns_by_name[name] for name in signals[0]}
             selection.outputs = {name: columns_by_name[name] for name in signals[1]}
             return ()
-    unread = [c.name for c in columns if c.name and not has_numbers(c)]
-    if len(own) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in unread):
+    ignored = [c.name for c in columns if c.name and not has_numbers(c)]
+    if len(names_by_label) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in ignored):
         # If the input has no numbers, the file is faulty, and the output must not be taken for a free response.
         return ()
-    input_columns, output_columns = guess_roles(list(own))
+    input_columns, output_columns = guess_roles(list(names_by_label))
     names = signal_names({**dict.fromkeys(input_columns, "u"), **dict.fromkeys(output_columns, "y")})
     selection.inputs, selection.outputs = (
-        {names[c]: own[c] for c in input_columns},
-        {names[c]: own[c] for c in output_columns},
+        {names[c]: names_by_label[c] for c in input_columns},
+        {names[c]: names_by_label[c] for c in output_columns},
     )
     if not output_columns:
         return ()
     inputs, outputs = join_names(selection.inputs.values(), 10), join_names(selection.outputs.values(), 10)
-    words = f"{inputs} {'is an input' if len(selection.inputs) == 1 else 'are inputs'} of {outputs}, by their names"
+    text = f"{inputs} {'is an input' if len(selection.inputs) == 1 else 'are inputs'} of {outputs}, by their names"
     if not input_columns:
-        words = (
+        text = (
             f"there is no input of {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
         )
     remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
-    return (Assumption("inputs", inputs, words, remedy),)
+    return (Assumption("inputs", inputs, text, remedy),)
 
 
 def add_file_units(selection: ColumnSelection, pool: ColumnTable) -> None:

@@ -65,9 +65,9 @@ class _BadCells:
         Whether all of them are empty or mean a missing value.
     comma, sheet
         Whether the decimal mark is a comma, and whether the file is a workbook.
-    moments
+    has_timestamps
         Whether some of them are dates or times of day.
-    other
+    example
         First cell of the column if it is a date or time in a notation that differs from `cell`; otherwise "".
     """
 
@@ -77,9 +77,9 @@ class _BadCells:
     count: int
     blank: bool
     comma: bool
-    moments: bool = False
+    has_timestamps: bool = False
     sheet: bool = False
-    other: str = ""
+    example: str = ""
 
     def error(self, column: str, source: str) -> DataError:
         thing = f"{source}: column {column!r}, line {self.line}"
@@ -87,36 +87,36 @@ class _BadCells:
         cell_text = repr(text if len(text) <= 40 else text[:40] + "…")
         way_out = "correct or remove these rows"
         if not text:
-            what = "empty cell" + (", or one with an error or an uncomputed formula" if self.sheet else "")
+            description = "empty cell" + (", or one with an error or an uncomputed formula" if self.sheet else "")
             way_out = _fill_hint()
         elif is_gap(text):
-            what = f"{cell_text} stands for no number"
+            description = f"{cell_text} stands for no number"
             way_out = _fill_hint()
-        elif (mark := detect_thousands_separator(text, comma=self.comma)) is not None:
-            what = f"{cell_text} has marks between thousands"
-            way_out = f"give {layout_parameter(thousands=mark)}, or write all numbers without"
+        elif (separator := detect_thousands_separator(text, comma=self.comma)) is not None:
+            description = f"{cell_text} has marks between thousands"
+            way_out = f"give {layout_parameter(thousands=separator)}, or write all numbers without"
         elif self.comma and "." in text and is_number(text):
-            what = f"{cell_text} has a point where decimals follow a comma"
+            description = f"{cell_text} has a point where decimals follow a comma"
             way_out = "write all numbers alike"
             if may_group(text, "point", comma=True):
                 way_out += f", or give {layout_parameter(thousands='point')} where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
-            what = f"{cell_text} has a decimal comma"
+            description = f"{cell_text} has a decimal comma"
             way_out = (
                 f"write all numbers alike, or give {layout_parameter(decimal='comma')} where all of them have commas"
             )
-        elif self.other:
-            what = f"{cell_text} and {self.other!r} are dates or times of day written in two ways"
+        elif self.example:
+            description = f"{cell_text} and {self.example!r} are dates or times of day written in two ways"
             way_out = "write all alike"
-        elif self.moments:
-            what = (
+        elif self.has_timestamps:
+            description = (
                 f"{cell_text} stands among numbers"
                 if is_timestamp(text)
                 else f"{cell_text} stands among dates or times of day"
             )
         else:
-            what = f"{cell_text} is not a number"
-        return bad_rows(thing, what, self.row, self.count, way_out)
+            description = f"{cell_text} is not a number"
+        return bad_rows(thing, description, self.row, self.count, way_out)
 
 
 @dataclass
@@ -138,7 +138,7 @@ class _Rows:
     footer: list[int] = field(default_factory=list)
     blocks: list[npt.NDArray[np.float64]] = field(default_factory=list)
     bad_cells: dict[int, _BadCells] = field(default_factory=dict)
-    moments: dict[int, list[Timestamps]] = field(default_factory=dict)
+    timestamps: dict[int, list[Timestamps]] = field(default_factory=dict)
 
 
 def read_text(path: Path, layout: Layout) -> FileTable:
@@ -182,8 +182,8 @@ class _SizeLimitedStream:
     def readline(self, size: int) -> bytes:
         return self._stream.readline(size)
 
-    def seek(self, place: int) -> int:
-        return self._stream.seek(place)
+    def seek(self, position: int) -> int:
+        return self._stream.seek(position)
 
 
 def parse_text(
@@ -200,17 +200,17 @@ def parse_text(
     stream.seek(0)
     blocks = _line_blocks(path, stream, encoding)
     # Sheets have no comment lines.
-    mark = "#" if sheet is None else "\0"
-    head, sample, remark = _first_lines(blocks, layout, mark)
+    comment_mark = "#" if sheet is None else "\0"
+    head, sample, remark = _first_lines(blocks, layout, comment_mark)
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that contains a record")
-    dialect = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
+    dialect = find_table(sample, layout, source, has_own_header=header is not None, sheet=sheet is not None)
     dialect = _dialect_with_empty_rows(dialect, head, sample, layout, sheet=sheet is not None)
     rows = _Rows(dialect, sheet is not None)
     for first, lines in itertools.chain(head, blocks):
-        _read_block(rows, first, lines, mark, source)
+        _read_block(rows, first, lines, comment_mark, source)
     columns = _columns(rows, path, source)
-    what = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
+    used_layout = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
     if sheet is not None:
         dialect = replace(dialect, layout=replace(dialect.layout, separator=None, decimal=None))
     kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[dialect.separator]} between cells)"
@@ -218,11 +218,11 @@ def parse_text(
     if rows.footer:
         first, last = rows.footer[0], rows.footer[-1]
         which = f"lines {first} to {last} are" if last > first else f"line {first} is"
-        words = f"{which} below the table and left out"
-        assumed = (*assumed, Assumption("", rows.count, words, "remove the empty line above them"))
+        text = f"{which} below the table and left out"
+        assumed = (*assumed, Assumption("", rows.count, text, "remove the empty line above them"))
     if dialect.names is None:
         assumed = tuple(_with_remark(a, remark, dialect.width) for a in assumed)
-    return FileTable(path, columns, True, header, layout=what.under(dialect.layout), assumed=assumed, kind=kind)
+    return FileTable(path, columns, True, header, layout=used_layout.under(dialect.layout), assumed=assumed, kind=kind)
 
 
 def _dialect_with_empty_rows(
@@ -239,21 +239,25 @@ def _dialect_with_empty_rows(
     """
     if dialect.separator != "\t" or dialect.names is None:
         return dialect
-    above = max((at for at, _ in sample if at < dialect.begin), default=0)
+    last_line_before = max((at for at, _ in sample if at < dialect.first_line), default=0)
     lines = ((at, line) for first, part in head for at, line in enumerate(part, first))
-    between = itertools.takewhile(lambda pair: pair[0] < dialect.begin, lines)
-    gaps = [at for at, line in between if at > above and not line.strip() and line.count("\t") == dialect.width - 1]
+    lines_between = itertools.takewhile(lambda pair: pair[0] < dialect.first_line, lines)
+    gaps = [
+        at
+        for at, line in lines_between
+        if at > last_line_before and not line.strip() and line.count("\t") == dialect.width - 1
+    ]
     if not gaps or dialect.width == 1:
         return dialect
     if not sheet:
-        return replace(dialect, begin=gaps[0])
+        return replace(dialect, first_line=gaps[0])
     if layout.header is not None:
         return dialect
-    words = f"line {gaps[0]}, right below the header, is empty and left out"
+    text = f"line {gaps[0]}, right below the header, is empty and left out"
     if len(gaps) > 1:
-        words = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
+        text = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
     header = 1 if dialect.units is None else 2
-    return replace(dialect, assumed=(*dialect.assumed, Assumption("header", header, words, layout_parameter(header=1))))
+    return replace(dialect, assumed=(*dialect.assumed, Assumption("header", header, text, layout_parameter(header=1))))
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
@@ -268,12 +272,12 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
 
 
 def _first_lines(
-    blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
+    blocks: Iterator[tuple[int, list[str]]], layout: Layout, comment_mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
     """Return the first blocks, the lines from which the layout is detected, and the last comment above these lines.
 
-    Blocks are (number of the first line, lines), and lines are (number, text) without blank lines and comments. `mark`
-    begins a comment.
+    Blocks are (number of the first line, lines), and lines are (number, text) without blank lines and comments.
+    `comment_mark` begins a comment.
     """
     head: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
@@ -283,9 +287,9 @@ def _first_lines(
         for at, line in enumerate(lines, first):
             if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
                 break
-            if not sample and line.lstrip()[:1] == mark:
+            if not sample and line.lstrip()[:1] == comment_mark:
                 remark = line[:400]
-            if _has_content(line, mark):
+            if _has_content(line, comment_mark):
                 sample.append((at, line))
                 size += len(line) if at > (layout.skip or 0) else 0
         if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
@@ -293,41 +297,41 @@ def _first_lines(
     return head, sample, remark
 
 
-def _has_content(line: str, mark: str) -> bool:
+def _has_content(line: str, comment_mark: str) -> bool:
     text = line.lstrip()
-    return bool(text) and text[0] != mark
+    return bool(text) and text[0] != comment_mark
 
 
-def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
+def _read_block(rows: _Rows, first: int, lines: list[str], comment_mark: str, source: str) -> None:
     """Parse the lines of one block, and append their rows to `rows`.
 
-    `first` is the number of the first line, and `mark` begins a comment. Raise DataError for a second table, a repeated
-    header or an ambiguous comment.
+    `first` is the number of the first line, and `comment_mark` begins a comment. Raise DataError for a second table, a
+    repeated header or an ambiguous comment.
     """
     dialect = rows.dialect
     content = []
     for at, line in enumerate(lines, first):
         # With tabs, a line of empty cells is a row of missing values, not a blank line.
         gap = dialect.separator == "\t" and "\t" in line and not line.strip()
-        if at >= dialect.begin and (gap or _has_content(line, mark)):
+        if at >= dialect.first_line and (gap or _has_content(line, comment_mark)):
             if rows.footer or (rows.after_blank and _is_footer(line, dialect, source, at)):
                 _check_footer(rows, line, at, source)
                 rows.footer.append(at)
                 continue
             content.append((at, line))
             rows.after_blank = False
-        elif at >= dialect.begin and not line.strip():
+        elif at >= dialect.first_line and not line.strip():
             rows.after_blank = bool(content) or rows.count > 0
-        elif at >= dialect.begin and line.lstrip()[:1] == mark:
+        elif at >= dialect.first_line and line.lstrip()[:1] == comment_mark:
             _check_remark(line, at, dialect, source)
     if not content:
         return
     cells = split_cells([line for _, line in content], dialect.separator, source, content[0][0])
-    wrong = [index for index, row in enumerate(cells) if len(row) != dialect.width]
-    if wrong:
+    ragged_indices = [index for index, row in enumerate(cells) if len(row) != dialect.width]
+    if ragged_indices:
         if not rows.ragged:
-            rows.ragged_line, rows.ragged_cells = content[wrong[0]][0], cells[wrong[0]]
-        rows.ragged += len(wrong)
+            rows.ragged_line, rows.ragged_cells = content[ragged_indices[0]][0], cells[ragged_indices[0]]
+        rows.ragged += len(ragged_indices)
     repeated = next((at for (at, _), row in zip(content, cells, strict=True) if row == dialect.names), None)
     if repeated is not None:
         raise DataError(
@@ -336,23 +340,30 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
         )
     if not rows.ragged:
         # float() accepts underscores between digits, which numbers in files must not have.
-        plain = not dialect.comma and dialect.mark is None and not any("_" in line for _, line in content)
-        rows.blocks.append(_numbers(rows, cells, [at for at, _ in content], plain=plain))
+        is_plain_decimal = (
+            not dialect.comma and dialect.thousands_separator is None and not any("_" in line for _, line in content)
+        )
+        rows.blocks.append(_numbers(rows, cells, [at for at, _ in content], is_plain_decimal=is_plain_decimal))
     rows.count += len(cells)
 
 
 def _is_footer(line: str, dialect: TableDialect, source: str, at: int) -> bool:
     """Whether a line after an empty line is a footer: its first cell is a word, and it is not a row of the table."""
     cells = split_cells([line], dialect.separator, source, at)[0]
-    numbers = [is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells]
-    return bool(cells[0].strip()) and not numbers[0] and (len(cells) != dialect.width or not any(numbers))
+    are_numbers = [
+        is_number(cell, comma=dialect.comma, thousands_separator=dialect.thousands_separator) or is_timestamp(cell)
+        for cell in cells
+    ]
+    return bool(cells[0].strip()) and not are_numbers[0] and (len(cells) != dialect.width or not any(are_numbers))
 
 
 def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
     """Raise DataError if a line below a footer is a row of numbers, that is, part of a second table."""
     dialect = rows.dialect
     cells = split_cells([line], dialect.separator, source, at)[0]
-    if len(cells) == dialect.width and all(is_number(c, comma=dialect.comma, mark=dialect.mark) for c in cells):
+    if len(cells) == dialect.width and all(
+        is_number(c, comma=dialect.comma, thousands_separator=dialect.thousands_separator) for c in cells
+    ):
         raise DataError(
             f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; save the "
             f"lines from {rows.footer[0]} on as a second file, and give both files as two runs"
@@ -362,12 +373,15 @@ def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
 def _check_remark(line: str, at: int, dialect: TableDialect, source: str) -> None:
     """Raise DataError if a line that begins with # may also be a row, for example one that begins with #N/A."""
     cells = line.split(dialect.separator)
-    numbers = any(is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells)
+    has_numbers = any(
+        is_number(cell, comma=dialect.comma, thousands_separator=dialect.thousands_separator) or is_timestamp(cell)
+        for cell in cells
+    )
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
     if (
         len(cells) == dialect.width
         and (dialect.width > 1 or error)
-        and (numbers or error or dialect.separator is not None)
+        and (has_numbers or error or dialect.separator is not None)
     ):
         raise DataError(
             f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be "
@@ -385,39 +399,42 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
     names = dialect.names if dialect.names is not None else [f"c{index + 1}" for index in range(dialect.width)]
     columns = []
     for k, (name, column) in enumerate(zip(names, values, strict=True)):
-        column_errors, pieces = rows.bad_cells.get(k), rows.moments.get(k)
-        moments = None if pieces is None else Timestamps.concatenate(pieces)
+        column_errors, blocks = rows.bad_cells.get(k), rows.timestamps.get(k)
+        timestamps = None if blocks is None else Timestamps.concatenate(blocks)
         problem = None if column_errors is None else column_errors.error(name, source)
-        if pieces is not None and (moments is None or moments.clock.size != rows.count):
+        if blocks is not None and (timestamps is None or timestamps.clock.size != rows.count):
             problem = problem or DataError(
                 f"{source}: column {name!r}: dates or times have several notations; write all in the same notation"
             )
-            moments = None
-        elif moments is not None:
-            words = f"dates or times of day, not numbers ({moments.first!r})"
-            problem = dates_problem(f"{source}: column {name!r}", words, rows.count)
+            timestamps = None
+        elif timestamps is not None:
+            description = f"dates or times of day, not numbers ({timestamps.first!r})"
+            problem = dates_problem(f"{source}: column {name!r}", description, rows.count)
         unit = (
             (dialect.units[k] if dialect.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         )
         blank = column_errors is not None and column_errors.blank
-        columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, file_unit=unit))
+        columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=timestamps, file_unit=unit))
     return columns
 
 
 def _ragged_rows_error(rows: _Rows, source: str) -> DataError:
     dialect = rows.dialect
-    first = "line of names" if dialect.names is not None else "first row"
-    others = [
-        words
-        for mark, words in SEPARATOR_WORDS.items()
-        if mark is not None
-        and mark != dialect.separator
-        and not (dialect.comma and mark == ",")
-        and sum(cell.count(mark) for cell in rows.ragged_cells) >= max(1, dialect.width - 1)
+    reference = "line of names" if dialect.names is not None else "first row"
+    other_separators = [
+        separator_name
+        for separator, separator_name in SEPARATOR_WORDS.items()
+        if separator is not None
+        and separator != dialect.separator
+        and not (dialect.comma and separator == ",")
+        and sum(cell.count(separator) for cell in rows.ragged_cells) >= max(1, dialect.width - 1)
     ]
-    mixed = f"; that line has {others[0]}s" if others and len(rows.ragged_cells) < dialect.width else ""
+    mixed = (
+        f"; that line has {other_separators[0]}s" if other_separators and len(rows.ragged_cells) < dialect.width else ""
+    )
     return DataError(
-        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {first} has {dialect.width}, "
+        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {reference} has "
+        f"{dialect.width}, "
         f"{rows.ragged} lines in all; give every line the same number of cells "
         f"(separator: {SEPARATOR_WORDS[dialect.separator]}{mixed})"
     )
@@ -437,10 +454,12 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
     if head.startswith(_UTF16):
         return "utf-16", ()
     for offset, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        zeros, others = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
-        if zeros > 4 and others == 0 and zeros > 0.8 * len(head[offset:4000:2]):
-            words = f"every other byte is 0, so the text is {name}"
-            return name, (Assumption("encoding", name, words, layout_parameter(encoding=Placeholder("NAME")), False),)
+        zeros, other_zeros = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
+        if zeros > 4 and other_zeros == 0 and zeros > 0.8 * len(head[offset:4000:2]):
+            description = f"every other byte is 0, so the text is {name}"
+            return name, (
+                Assumption("encoding", name, description, layout_parameter(encoding=Placeholder("NAME")), False),
+            )
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError as error:
@@ -452,28 +471,30 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
                 f"text in any encoding{zipped}; give {layout_parameter(encoding=Placeholder('NAME'))}, or pass a csv, "
                 "text or .mat file"
             ) from None
-        words = f"no UTF-8 (byte {head[error.start]:#04x}), read as cp1252 of Windows, which does not affect numbers"
+        description = (
+            f"no UTF-8 (byte {head[error.start]:#04x}), read as cp1252 of Windows, which does not affect numbers"
+        )
         otherwise = layout_parameter(encoding=Placeholder("NAME"))
         try:
             head.decode("cp1252")
         except UnicodeDecodeError:
             return "latin-1", (
-                Assumption("encoding", "latin-1", words.replace("cp1252 of Windows", "latin-1"), otherwise),
+                Assumption("encoding", "latin-1", description.replace("cp1252 of Windows", "latin-1"), otherwise),
             )
-        return "cp1252", (Assumption("encoding", "cp1252", words, otherwise),)
+        return "cp1252", (Assumption("encoding", "cp1252", description, otherwise),)
     return "utf-8", ()
 
 
 def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: str) -> Iterator[tuple[int, list[str]]]:
     """Yield (number of the first line, lines) for blocks of about 8 MB; raise DataError if the text is invalid."""
     decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
-    incomplete_line, number_, newline = "", 1, ""
+    incomplete_line, line_number, newline = "", 1, ""
     while True:
         block = stream.read(_BLOCK_BYTES)
         try:
             data = incomplete_line + decoder.decode(block, final=not block)
         except UnicodeError as error:
-            raise _undecodable(path, error, number_ + incomplete_line.count("\n"), encoding) from None
+            raise _undecodable(path, error, line_number + incomplete_line.count("\n"), encoding) from None
         if not block:
             # Old programs write Ctrl-Z at the end of a text.
             data = data.removesuffix("\x1a")
@@ -482,16 +503,19 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
         zero = data.find("\0")
         if zero >= 0:
             raise DataError(
-                f"{path.name}: a zero byte near line {number_ + data[:zero].count(newline)}, so it is not a text file "
+                f"{path.name}: a zero byte near line {line_number + data[:zero].count(newline)}, so it is not a "
+                "text file "
                 "or is damaged; pass a csv, text or .mat file"
             )
         cut = data.rfind(newline) + 1 if block and newline else len(data) if not block else 0
         if cut == 0 and len(data) > _BLOCK_BYTES:
-            raise DataError(f"{path.name}: line {number_} is longer than {_BLOCK_BYTES} bytes; pass a csv or text file")
+            raise DataError(
+                f"{path.name}: line {line_number} is longer than {_BLOCK_BYTES} bytes; pass a csv or text file"
+            )
         if cut:
             lines = data[:cut].split(newline)
-            yield number_, lines
-            number_ += len(lines) - 1
+            yield line_number, lines
+            line_number += len(lines) - 1
         incomplete_line = data[cut:]
         if not block:
             return
@@ -509,10 +533,14 @@ def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> D
     )
 
 
-def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
+def _numbers(
+    rows: _Rows, cells: list[list[str]], lines: list[int], *, is_plain_decimal: bool
+) -> npt.NDArray[np.float64]:
     width = len(cells[0])
-    parse_cell = functools.partial(parse_number, comma=rows.dialect.comma, mark=rows.dialect.mark)
-    value: Callable[[str], float] = float if plain else parse_cell
+    parse_cell = functools.partial(
+        parse_number, comma=rows.dialect.comma, thousands_separator=rows.dialect.thousands_separator
+    )
+    value: Callable[[str], float] = float if is_plain_decimal else parse_cell
     try:
         flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
     except ValueError:
@@ -536,35 +564,44 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     of the cells. If all invalid cells mean missing values, the column of `values` is filled with the numbers, and with
     NaN for missing values.
     """
-    comma, mark = rows.dialect.comma, rows.dialect.mark
-    if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
-        moments = Timestamps.read(column)
-        if moments is not None:
-            rows.moments.setdefault(index, []).append(moments)
+    comma, thousands_separator = rows.dialect.comma, rows.dialect.thousands_separator
+    if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.timestamps.get(index, [])):
+        timestamps = Timestamps.read(column)
+        if timestamps is not None:
+            rows.timestamps.setdefault(index, []).append(timestamps)
             return
-    bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma, mark=mark)]
-    dated = [row for row in bad if is_timestamp(column[row])]
+    invalid_rows = [
+        row
+        for row, cell in enumerate(column)
+        if not is_number(cell, comma=comma, thousands_separator=thousands_separator)
+    ]
+    dated = [row for row in invalid_rows if is_timestamp(column[row])]
     if dated and 2 * len(dated) > len(column):
         # In a column that consists mostly of dates, the other cells are invalid.
-        bad = [row for row in range(len(column)) if not is_timestamp(column[row])] or bad
+        invalid_rows = [row for row in range(len(column)) if not is_timestamp(column[row])] or invalid_rows
     # If all cells are timestamps, those with another notation are invalid.
     ways = (
-        [row for row in bad if Timestamps.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
+        [row for row in invalid_rows if Timestamps.read([column[0], column[row]]) is None]
+        if len(dated) == len(column)
+        else []
     )
-    bad = ways or bad
+    invalid_rows = ways or invalid_rows
     # Report invalid texts rather than empty cells.
-    bad = [row for row in bad if not is_gap(column[row])] or bad
-    blank = all(is_gap(column[row]) for row in bad)
+    invalid_rows = [row for row in invalid_rows if not is_gap(column[row])] or invalid_rows
+    blank = all(is_gap(column[row]) for row in invalid_rows)
     if blank and not dated:
-        values[:, index] = [np.nan if is_gap(cell) else parse_number(cell, comma=comma, mark=mark) for cell in column]
-    first, blank = bad[0], blank and not dated
-    place = lines[first], rows.count + first, column[first]
+        values[:, index] = [
+            np.nan if is_gap(cell) else parse_number(cell, comma=comma, thousands_separator=thousands_separator)
+            for cell in column
+        ]
+    first_row, blank = invalid_rows[0], blank and not dated
+    location = lines[first_row], rows.count + first_row, column[first_row]
     bad_cell = rows.bad_cells.get(index)
     if bad_cell is None:
-        other = column[0].strip()[:40] if ways else ""
-        rows.bad_cells[index] = _BadCells(*place, len(bad), blank, comma, bool(dated), rows.sheet, other)
+        example = column[0].strip()[:40] if ways else ""
+        rows.bad_cells[index] = _BadCells(*location, len(invalid_rows), blank, comma, bool(dated), rows.sheet, example)
         return
     if bad_cell.blank and not blank:
-        bad_cell.line, bad_cell.row, bad_cell.cell = place
-    bad_cell.count += len(bad)
+        bad_cell.line, bad_cell.row, bad_cell.cell = location
+    bad_cell.count += len(invalid_rows)
     bad_cell.blank &= blank

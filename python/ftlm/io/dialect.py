@@ -74,14 +74,14 @@ class Layout:
     sheet: str | None = None
 
     def __post_init__(self) -> None:
-        for option, words in (
+        for option, names in (
             ("separator", SEPARATOR_CHARACTERS),
             ("decimal", DECIMAL_CHARACTERS),
             ("thousands", THOUSANDS_CHARACTERS),
         ):
             value = getattr(self, option)
             if value is not None:
-                object.__setattr__(self, option, _word(option, value, words))
+                object.__setattr__(self, option, _word(option, value, names))
         if self.separator == self.decimal == "comma":
             raise DataError(
                 f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be distinguished"
@@ -96,12 +96,12 @@ class Layout:
             raise DataError(
                 f"{layout_fields('dates')} is {self.dates!r}; the known orders are {join_names(DATE_ORDERS)}"
             )
-        for option, most in (("skip", _MAX_SKIPPED_LINES), ("header", 2)):
+        for option, maximum in (("skip", _MAX_SKIPPED_LINES), ("header", 2)):
             value = getattr(self, option)
             count = None if value is None else whole_number(value)
-            if value is not None and (count is None or not 0 <= count <= most):
-                what = "0, 1 (names) or 2 (names and units)" if option == "header" else "a number of lines from 0"
-                raise DataError(f"{layout_fields(option)} is {value!r}; give {what}")
+            if value is not None and (count is None or not 0 <= count <= maximum):
+                expected = "0, 1 (names) or 2 (names and units)" if option == "header" else "a number of lines from 0"
+                raise DataError(f"{layout_fields(option)} is {value!r}; give {expected}")
             object.__setattr__(self, option, count)
         if self.encoding is not None:
             object.__setattr__(self, "encoding", _encoding(self.encoding))
@@ -177,18 +177,18 @@ class Assumption:
         return Note(self.words, self.otherwise)
 
 
-def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
+def _word(option: str, value: object, characters_by_name: Mapping[str, str | None]) -> str:
     """Return the name of a layout option's value, which the user gives by name (``comma``) or by character (``,``).
 
-    `words` maps names to characters. Raise DataError for an unknown value.
+    `characters_by_name` maps names to characters. Raise DataError for an unknown value.
     """
     if isinstance(value, str):
-        if value in words:
+        if value in characters_by_name:
             return value
-        for word, character in words.items():
+        for word, character in characters_by_name.items():
             if value == (" " if character is None else character) or (character == "\t" and value == "\\t"):
                 return word
-    raise DataError(f"{layout_fields(option)} is {value!r}; the known ones are {join_names(words)}")
+    raise DataError(f"{layout_fields(option)} is {value!r}; the known ones are {join_names(characters_by_name)}")
 
 
 def _encoding(value: object) -> str:
@@ -225,12 +225,12 @@ class TableDialect:
 
     Parameters
     ----------
-    separator, comma, mark
+    separator, comma, thousands_separator
         Cell separator (None for white space), whether the decimal mark is a comma, and name of the thousands separator
         (None if there is none).
     names, units
         Names and units of the columns; None if the header does not have them.
-    begin
+    first_line
         Line number of the first row, counted from 1.
     width
         Number of cells per row.
@@ -244,11 +244,11 @@ class TableDialect:
     comma: bool
     names: list[str] | None
     units: list[str] | None
-    begin: int
+    first_line: int
     width: int
     layout: Layout
     assumed: tuple[Assumption, ...]
-    mark: str | None = None
+    thousands_separator: str | None = None
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ class _Line:
 
 
 def find_table(
-    lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, own: bool, sheet: bool
+    lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, has_own_header: bool, sheet: bool
 ) -> TableDialect:
     """Return the layout and position of the table in the first lines of a text.
 
@@ -308,7 +308,7 @@ def find_table(
         Options given by the user; the others are detected.
     source
         Name of the file in error messages.
-    own
+    has_own_header
         Whether ftlm wrote the file, so that it has commas, decimal points and one line of names.
     sheet
         Whether the lines are rows of a sheet, with tabs between cells.
@@ -318,7 +318,7 @@ def find_table(
     DataError
         If there is no row of numbers, or the layout is ambiguous.
     """
-    if own:
+    if has_own_header:
         layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(
             layout_options
         )
@@ -331,26 +331,26 @@ def find_table(
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
     _check_width(rows[-2:], source)
-    separator, comma, mark, table_lines = _choose_separator(rows, layout_options, source)
+    separator, comma, thousands_separator, table_lines = _choose_separator(rows, layout_options, source)
     width = _width(table_lines)
     if layout_options.skip is None or layout_options.header is None:
         top = _first_row(table_lines, width)
     else:
         top = min(layout_options.header, len(table_lines))
-    names, units, top = _header(table_lines, top, width, layout_options, source, own=own)
+    names, units, top = _header(table_lines, top, width, layout_options, source, has_own_header=has_own_header)
     header = 0 if names is None else 1 if units is None else 2
     layout = Layout(
         separator=_WORDS_BY_SEPARATOR[separator],
         decimal="comma" if comma else "point",
-        thousands=mark,
+        thousands=thousands_separator,
         skip=table_lines[top - header].at - 1 if 0 < top - header < len(table_lines) else 0,
         header=header,
     ).under(layout_options)
     assumed = _layout_assumptions(table_lines, layout_options, layout, top, units)
     if layout_options.skip is None:
-        _check_above(table_lines[: top - header], width, source, (comma, mark))
+        _check_above(table_lines[: top - header], width, source, (comma, thousands_separator))
     if (
-        not own
+        not has_own_header
         and names is None
         and top < len(table_lines)
         and table_lines[top].words
@@ -358,18 +358,21 @@ def find_table(
     ):
         # A first row with words and numbers may be a header.
         raise _mixed_line(table_lines[top], source)
-    if names is not None and not own and layout_options.separator is None:
+    if names is not None and not has_own_header and layout_options.separator is None:
         _check_mixed(table_lines, top, separator, comma, source)
-    begin = table_lines[top].at if top < len(table_lines) else table_lines[-1].at + 1
+    first_line = table_lines[top].at if top < len(table_lines) else table_lines[-1].at + 1
     if names is not None:
         width = len(names)
-    return TableDialect(separator, comma, names, units, begin, width, layout, assumed, mark)
+    return TableDialect(separator, comma, names, units, first_line, width, layout, assumed, thousands_separator)
 
 
 def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
     """Raise DataError if a line has more than `MAX_COLUMNS` cells with one of the possible separators."""
     for at, line in rows:
-        count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
+        count = max(
+            len(line.split()),
+            *(line.count(separator) + 1 for separator in _SEPARATOR_CANDIDATES if separator is not None),
+        )
         if count > MAX_COLUMNS:
             raise DataError(
                 f"{source}: line {at} has {count} cells, more than {MAX_COLUMNS}; save a part of the columns, or "
@@ -391,18 +394,19 @@ def _split_lines(
         except DataError:
             cells = line.split(separator)
         cells_by_line.append((at, cells))
-    mark = None if layout.thousands == "none" else layout.thousands
+    thousands_separator = None if layout.thousands == "none" else layout.thousands
     if layout.thousands is None:
-        marks = (detect_thousands_separator(cell, comma=comma) for _, cells in cells_by_line for cell in cells)
-        mark = next((candidate for candidate in marks if candidate is not None), None)
+        separators = (detect_thousands_separator(cell, comma=comma) for _, cells in cells_by_line for cell in cells)
+        thousands_separator = next((candidate for candidate in separators if candidate is not None), None)
     for at, cells in cells_by_line:
         is_full = [bool(cell.strip()) for cell in cells]
         numbers = [
-            full and (is_number(cell, comma=comma, mark=mark) or is_timestamp(cell))
-            for cell, full in zip(cells, is_full, strict=True)
+            is_complete
+            and (is_number(cell, comma=comma, thousands_separator=thousands_separator) or is_timestamp(cell))
+            for cell, is_complete in zip(cells, is_full, strict=True)
         ]
         lines.append(_Line(at, cells, numbers, sum(is_full) - sum(numbers)))
-    return lines, mark
+    return lines, thousands_separator
 
 
 def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None, bool]]:
@@ -425,25 +429,25 @@ def _choose_separator(
     candidate, or if the role of the commas is ambiguous.
     """
     text = "".join(line for _, line in table_rows)
-    best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
+    best_choice: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
     for separator, comma in _dialect_candidates(text, layout):
-        lines, mark = _split_lines(table_rows, separator, source, layout, comma=comma)
+        lines, thousands_separator = _split_lines(table_rows, separator, source, layout, comma=comma)
         if comma and layout.decimal is None and _decimal_comma(lines) is None:
             continue
         width = _width(lines)
         rows = [line for line in lines[_first_row(lines, width) :] if line.width == width and line.is_row_candidate]
         half = 2 * sum(line.width > 1 for line in lines[:20]) >= len(lines[:20])
         rank = (len(rows), -sum(line.words for line in rows), half and not rows)
-        if best is None or rank > best[0]:
-            best = rank, separator, comma, mark, lines
-    if best is None:
+        if best_choice is None or rank > best_choice[0]:
+            best_choice = rank, separator, comma, thousands_separator, lines
+    if best_choice is None:
         raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not match the text; give others")
-    _, separator, comma, mark, lines = best
+    _, separator, comma, thousands_separator, lines = best_choice
     if layout.decimal is None and layout.separator is None and separator == ",":
         _check_commas(table_rows, lines, source)
     if layout.decimal is None and comma:
         _check_thousands(lines, source)
-    return separator, comma, mark, lines
+    return separator, comma, thousands_separator, lines
 
 
 def _decimal_comma(lines: list[_Line]) -> str | None:
@@ -459,8 +463,8 @@ def _width(lines: list[_Line]) -> int:
     for rows in ([line for line in lines if line.has_only_numbers], [line for line in lines if line.is_row_candidate]):
         counts = Counter(line.width for line in rows)
         if counts:
-            most = max(counts.values())
-            widths = [width for width, count in counts.items() if count == most]
+            largest_count = max(counts.values())
+            widths = [width for width, count in counts.items() if count == largest_count]
             return lines[0].width if lines[0].width in widths else max(widths)
     return lines[0].width
 
@@ -474,10 +478,10 @@ def _first_row(lines: list[_Line], width: int) -> int:
     rows = [line for line in lines if line.width == width and line.is_row_candidate]
     if not rows:
         return 1 if lines[0].has_only_words else 0
-    most = [2 * sum(line.numbers[k] for line in rows) > len(rows) for k in range(width)]
+    is_numeric_column = [2 * sum(line.numbers[k] for line in rows) > len(rows) for k in range(width)]
 
     def is_typical(line: _Line) -> bool:
-        return line.width == width and all(n or not m for n, m in zip(line.numbers, most, strict=True))
+        return line.width == width and all(n or not m for n, m in zip(line.numbers, is_numeric_column, strict=True))
 
     first = next((k for k, line in enumerate(lines) if is_typical(line) and line.count), None)
     if first is None:
@@ -488,10 +492,10 @@ def _first_row(lines: list[_Line], width: int) -> int:
             break
         first -= 1
     # Short lines right below a header count as rows; reading them raises a specific error later.
-    above = first
-    while above > 0 and lines[above - 1].has_only_numbers:
-        above -= 1
-    return above if above > 0 and lines[above - 1].has_only_words and lines[above - 1].width == width else first
+    row = first
+    while row > 0 and lines[row - 1].has_only_numbers:
+        row -= 1
+    return row if row > 0 and lines[row - 1].has_only_words and lines[row - 1].width == width else first
 
 
 def _is_settings_line(lines: list[_Line], at: int) -> bool:
@@ -499,16 +503,16 @@ def _is_settings_line(lines: list[_Line], at: int) -> bool:
     line = lines[at]
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
-    others = {word.casefold() for word in words if not is_unit(word)}
+    other_words = {word.casefold() for word in words if not is_unit(word)}
     # Settings have columns of their own. Numbers in columns where the next line also has numbers belong to a row.
-    below = lines[at + 1].numbers if at + 1 < len(lines) else []
-    row = any(one and other for one, other in zip(line.numbers, below, strict=False))
+    next_numbers = lines[at + 1].numbers if at + 1 < len(lines) else []
+    row = any(here and below_it for here, below_it in zip(line.numbers, next_numbers, strict=False))
     return (
         at > 0
         and lines[at - 1].has_only_words
         and line.count > 0
         and _has_unit(units)
-        and others <= {_ROW_INDEX_UNIT}
+        and other_words <= {_ROW_INDEX_UNIT}
         and not row
     )
 
@@ -524,7 +528,7 @@ def _has_unit(units: Sequence[str]) -> bool:
 
 
 def _header(
-    lines: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
+    lines: list[_Line], top: int, width: int, layout: Layout, source: str, *, has_own_header: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
     """Return names, units and the index of the first row; names or units are None if the header lacks them.
 
@@ -550,7 +554,7 @@ def _header(
     if count is None:
         count = 0
         units_above = top > 1 and (_is_unit_line(lines[top - 1]) or _is_settings_line(lines, top - 1))
-        if top > 0 and (lines[top - 1].has_only_words or own or units_above):
+        if top > 0 and (lines[top - 1].has_only_words or has_own_header or units_above):
             count = 1
             if units_above and len(fit_names(lines[top - 2])) == width and lines[top - 2].words:
                 count = 2
@@ -570,10 +574,10 @@ def _header(
         return None, None, top
     line = lines[top - count]
     names = fit_names(line)
-    if not own and count == 1 and line.count and layout.header is None:
+    if not has_own_header and count == 1 and line.count and layout.header is None:
         raise _mixed_line(line, source)
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
-    if commas and not own and count == 1:
+    if commas and not has_own_header and count == 1:
         raise DataError(
             f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; give "
             f"{layout_parameter(decimal='comma')}"
@@ -581,8 +585,8 @@ def _header(
     check_distinct(names, line.at, source)
     if count == 1:
         return names, None, top
-    below = lines[top - 1].cells
-    units = [unit_of(cell) for cell in below] if len(below) > 1 or width == 1 else []
+    previous_cells = lines[top - 1].cells
+    units = [unit_of(cell) for cell in previous_cells] if len(previous_cells) > 1 or width == 1 else []
     units += [""] * (len(names) - len(units))
     return names, units[: len(names)], top
 
@@ -597,17 +601,18 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
             )
 
 
-def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
+def _check_above(preceding: list[_Line], width: int, source: str, number_marks: tuple[bool, str | None]) -> None:
     """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped.
 
-    `marks` are whether the decimal mark is a comma, and the name of the thousands separator. `width` is the number of
-    cells per row of the table, for the message.
+    `number_marks` are whether the decimal mark is a comma, and the name of the thousands separator. `width` is the
+    number of cells per row of the table, for the message.
     """
-    comma, mark = marks
+    comma, thousands_separator = number_marks
     rows = [
         line
-        for line in above
-        if line.has_only_numbers and sum(is_number(c, comma=comma, mark=mark) for c in line.cells) > 1
+        for line in preceding
+        if line.has_only_numbers
+        and sum(is_number(c, comma=comma, thousands_separator=thousands_separator) for c in line.cells) > 1
     ]
     if rows:
         raise DataError(
@@ -637,10 +642,10 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], lines: list[_Line], s
     if not rows:
         return
     pairs = all(_COMMA_PAIRS_PATTERN.fullmatch(text) for _, text in rows)
-    single = not any(line.has_only_words and line.width == 2 for line in lines) and all(
+    is_single_column = not any(line.has_only_words and line.width == 2 for line in lines) and all(
         line.width == 2 and all(cell.strip().lstrip("+-").isdecimal() for cell in line.cells) for line, _ in rows
     )
-    if pairs or single:
+    if pairs or is_single_column:
         at, example = rows[0][0].at, rows[0][1].strip()[:40]
         raise DataError(
             f"{source}: line {at}: the commas of {example!r} may be cell separators or decimal marks; give "
@@ -679,32 +684,32 @@ def _check_mixed(lines: list[_Line], top: int, separator: str | None, comma: boo
 
 
 def _layout_assumptions(
-    lines: list[_Line], given: Layout, layout: Layout, top: int, units: list[str] | None
+    lines: list[_Line], requested: Layout, layout: Layout, top: int, units: list[str] | None
 ) -> tuple[Assumption, ...]:
-    """Return the assumptions about the options in a detected layout that `given` does not set.
+    """Return the assumptions about the options in a detected layout that `requested` does not set.
 
     The first row of data is ``lines[top]``.
     """
     assumed = []
-    if given.separator is None:
-        words = f"{SEPARATOR_WORDS[SEPARATOR_CHARACTERS[str(layout.separator)]]} between cells"
+    if requested.separator is None:
+        text = f"{SEPARATOR_WORDS[SEPARATOR_CHARACTERS[str(layout.separator)]]} between cells"
         otherwise = layout_parameter(separator=Placeholder("NAME"))
-        assumed.append(Assumption("separator", str(layout.separator), words, otherwise, False))
-    if given.decimal is None and layout.decimal == "comma":
-        words, otherwise = f"decimal commas, as in {_decimal_comma(lines)!r}", layout_parameter(decimal="point")
-        assumed.append(Assumption("decimal", "comma", words, otherwise))
-    if given.thousands is None and (mark := layout.thousands) is not None:
+        assumed.append(Assumption("separator", str(layout.separator), text, otherwise, False))
+    if requested.decimal is None and layout.decimal == "comma":
+        text, otherwise = f"decimal commas, as in {_decimal_comma(lines)!r}", layout_parameter(decimal="point")
+        assumed.append(Assumption("decimal", "comma", text, otherwise))
+    if requested.thousands is None and (thousands_separator := layout.thousands) is not None:
         cells, comma = (c for line in lines for c in line.cells), layout.decimal == "comma"
-        example = next(c.strip() for c in cells if detect_thousands_separator(c, comma=comma) == mark)
-        words = f"{mark}s group thousands, as in {example!r}"
-        assumed.append(Assumption("thousands", mark, words, layout_parameter(thousands="none")))
-    if given.skip is None and (skip := layout.skip):
-        words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
-        assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
-    if given.header is None and units is not None:
-        words = f"line {lines[top - 1].at} contains units" if any(units) else f"line {lines[top - 1].at} is a remark"
-        assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
-    elif given.header is None and layout.header == 0:
-        words = "no line of names: columns are c1, c2, …"
-        assumed.append(Assumption("header", 0, words, layout_parameter(header=1), False))
+        example = next(c.strip() for c in cells if detect_thousands_separator(c, comma=comma) == thousands_separator)
+        text = f"{thousands_separator}s group thousands, as in {example!r}"
+        assumed.append(Assumption("thousands", thousands_separator, text, layout_parameter(thousands="none")))
+    if requested.skip is None and (skip := layout.skip):
+        text = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
+        assumed.append(Assumption("skip", skip, text, layout_parameter(skip=Placeholder("LINES"))))
+    if requested.header is None and units is not None:
+        text = f"line {lines[top - 1].at} contains units" if any(units) else f"line {lines[top - 1].at} is a remark"
+        assumed.append(Assumption("header", 2, text, layout_parameter(header=1)))
+    elif requested.header is None and layout.header == 0:
+        text = "no line of names: columns are c1, c2, …"
+        assumed.append(Assumption("header", 0, text, layout_parameter(header=1), False))
     return tuple(assumed)

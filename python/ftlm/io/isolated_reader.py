@@ -79,9 +79,11 @@ def binary_format_of(path: Path) -> BinaryFormat | None:
     """Return the binary format of a path by its extension, None for text; raise DataError for a gzipped binary file."""
     suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
     if suffixes and suffixes[-1] == ".gz":
-        inner = next((kind for kind in BINARY_FORMATS if suffixes[0] in kind.suffixes), None)
-        if inner is not None:
-            raise DataError(f"{str(path)!r}: {inner.label} files cannot be read compressed; unpack it with gunzip")
+        inner_format = next((kind for kind in BINARY_FORMATS if suffixes[0] in kind.suffixes), None)
+        if inner_format is not None:
+            raise DataError(
+                f"{str(path)!r}: {inner_format.label} files cannot be read compressed; unpack it with gunzip"
+            )
         return None
     match = next((kind for kind in BINARY_FORMATS if suffixes and suffixes[-1] in kind.suffixes), None)
     return MATLAB_73_FORMAT if match is MATLAB_FORMAT and _is_hdf5(path) else match
@@ -119,17 +121,17 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
             check=False,
         )
     except subprocess.TimeoutExpired as stopped:
-        answers = _ReaderOutput(stopped.stdout or b"")
-        path = paths[min(answers.count_complete(len(paths)), len(paths) - 1)]
+        output = _ReaderOutput(stopped.stdout or b"")
+        path = paths[min(output.count_complete(len(paths)), len(paths) - 1)]
         raise _damaged_file_error(path, f"did not finish in {_READER_TIMEOUT_S:g} s", kind) from None
     except OSError as error:
         raise DataError(
             f"{str(paths[0])!r}: Python could not be started to read it ({error.strerror}); check the installation"
         ) from None
-    answers = _ReaderOutput(process.stdout)
+    output = _ReaderOutput(process.stdout)
     tables = []
     for path in paths:
-        table = answers.table(path, layout)
+        table = output.table(path, layout)
         if table is None:
             raise _damaged_file_error(path, _describe_exit(process.returncode), kind)
         tables.append(table if table.kind else replace(table, kind=kind.label))
@@ -151,8 +153,8 @@ def _describe_exit(code: int) -> str:
     return f"crashed ({describe_crash(code)})"
 
 
-def _damaged_file_error(path: Path, how: str, kind: BinaryFormat) -> DataError:
-    return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.repair_hint}")
+def _damaged_file_error(path: Path, reason: str, kind: BinaryFormat) -> DataError:
+    return DataError(f"{str(path)!r}: damaged file: the reader {reason}; get an intact copy or {kind.repair_hint}")
 
 
 Size = Annotated[int, msgspec.Meta(ge=0)]
@@ -178,7 +180,7 @@ class _ResultHeader(msgspec.Struct):
     arrays: list[_Array] = []
     skipped: dict[str, str] = {}
     text: bool = False
-    own: str | None = msgspec.field(default=None, name="ftlm-run")
+    run_header: str | None = msgspec.field(default=None, name="ftlm-run")
     sheet: str | None = None
     others: list[str] = []
     bytes: Size = 0
@@ -196,19 +198,19 @@ class _ReaderOutput:
         self._content = content
         self._at = 0
 
-    def count_complete(self, most: int) -> int:
-        """Return the number of further files with a complete answer, at most `most`."""
+    def count_complete(self, maximum: int) -> int:
+        """Return the number of further files with a complete answer, at most `maximum`."""
         count = 0
-        while count < most and self._next() is not None:
+        while count < maximum and self._next() is not None:
             count += 1
         return count
 
     def _next(self) -> tuple[_ResultHeader, list[Floats], bytes] | None:
-        end = self._content.find(b"\n", self._at)
+        stop = self._content.find(b"\n", self._at)
         matrices = []
         try:
-            header = HEADER_DECODER.decode(self._content[self._at : max(end, self._at)])
-            at = end + 1
+            header = HEADER_DECODER.decode(self._content[self._at : max(stop, self._at)])
+            at = stop + 1
             for array in header.arrays:
                 count = array.rows * array.columns
                 flat = np.frombuffer(self._content, dtype="<f8", count=count, offset=at)
@@ -239,21 +241,23 @@ class _ReaderOutput:
         columns = [column for array, matrix in arrays for column in _columns(path, array, matrix)]
         if not columns:
             skipped = list(header.skipped.items())[:10]
-            why = ", ".join(f"{name!r} ({reason})" for name, reason in skipped) or "it is empty"
-            raise DataError(f"{str(path)!r} contains no real numeric matrix: {why}; save the samples as matrices")
-        own = None if header.own is None else Header.read(path, "its metadata", header.own)
-        return FileTable(path, columns, text=header.text, header=own, skipped=header.skipped)
+            skipped_text = ", ".join(f"{name!r} ({reason})" for name, reason in skipped) or "it is empty"
+            raise DataError(
+                f"{str(path)!r} contains no real numeric matrix: {skipped_text}; save the samples as matrices"
+            )
+        run_header = None if header.run_header is None else Header.read(path, "its metadata", header.run_header)
+        return FileTable(path, columns, text=header.text, header=run_header, skipped=header.skipped)
 
 
-def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layout) -> FileTable:
+def _sheet(path: Path, sheet: str, other_sheets: list[str], cells: bytes, layout: Layout) -> FileTable:
     """Return the table in the cells of a sheet, which the reader sends as tab-separated text.
 
     An assumption names the sheet if the user did not, and the workbook has other sheets, all of them empty.
     """
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
-    if layout.sheet is None and others:
-        words = f"sheet {sheet!r}, the only one that is not empty"
-        assumed = Assumption("sheet", sheet, words, layout_parameter(sheet=Placeholder("NAME")))
+    if layout.sheet is None and other_sheets:
+        text = f"sheet {sheet!r}, the only one that is not empty"
+        assumed = Assumption("sheet", sheet, text, layout_parameter(sheet=Placeholder("NAME")))
         table = replace(table, assumed=(assumed, *table.assumed))
     return table
 
@@ -285,7 +289,9 @@ def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Colu
     if is_missing.any():
         problem = masked_rows_error(thing, "no date", is_missing, "remove or fill these rows yourself")
         return Column(name, name, path, None, problem)
-    first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
-    moments = Timestamps(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
-    problem = dates_problem(thing, f"dates, not numbers ({first})", values.size)
-    return Column(name, name, path, values, problem, timestamps=moments)
+    first_text = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
+    timestamps = Timestamps(
+        np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first_text
+    )
+    problem = dates_problem(thing, f"dates, not numbers ({first_text})", values.size)
+    return Column(name, name, path, values, problem, timestamps=timestamps)

@@ -194,13 +194,13 @@ def run_from_tables(
     _check_disjoint_roles(selection, pool)
     if not selection.outputs:
         # A column that contains text does not become a signal by its name.
-        words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
+        problem_text = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
         in_a_file = f", or in a file for {parameter('columns')}"
         in_a_file = choose_text(in_a_file, in_a_file, "")
         raise DataError(
             "no output is named, and the roles of the columns are not clear from their names; name the signals with "
             f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}{in_a_file}; "
-            f"{pool.describe()}{words}"
+            f"{pool.describe()}{problem_text}"
         )
     if header is None:
         add_file_units(selection, pool)
@@ -223,9 +223,9 @@ def run_from_tables(
     if name is None:
         stem = base_name(tables[0].path)
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
-    several = len(tables) > 1
+    is_batch = len(tables) > 1
     facts: tuple[str, ...] = tuple(
-        Note(f"{table.path.name}: {a.words}", a.otherwise) if several else a.note
+        Note(f"{table.path.name}: {a.words}", a.otherwise) if is_batch else a.note
         for table in tables
         for a in table.assumed
         if a.counts
@@ -337,16 +337,17 @@ def base_name(path: Path) -> str:
 
 def _check_disjoint_roles(selection: ColumnSelection, pool: ColumnTable) -> None:
     """Raise DataError if a column is an input and an output, because the model of this output would be trivial."""
-    driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
+    inputs_by_id = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
     twice = [
-        (driven[id(column)], name)
+        (inputs_by_id[id(column)], name)
         for name, spec in selection.outputs.items()
-        if id(column := pool.find(spec, f"signal {name!r}")) in driven
+        if id(column := pool.find(spec, f"signal {name!r}")) in inputs_by_id
     ]
     if twice and twice[0][0][0] != twice[0][1]:
-        (name, spec), other = twice[0]
+        (name, spec), other_name = twice[0]
         raise DataError(
-            f"column {spec!r} is the input {name!r} and the output {other!r} ({len(twice)} such columns in all); name "
+            f"column {spec!r} is the input {name!r} and the output {other_name!r} ({len(twice)} such columns in "
+            "all); name "
             "another column for one of them"
         )
 
@@ -355,8 +356,8 @@ def time_header(clock: Column) -> str:
     """Return the header of a time column with its unit, or ``time`` for the first column of a matrix."""
     if clock.matrix is not None:
         return "time"
-    below = clock.file_unit and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
-    return f"{clock.variable} [{clock.file_unit}]" if below else clock.variable
+    is_unit_row = clock.file_unit and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
+    return f"{clock.variable} [{clock.file_unit}]" if is_unit_row else clock.variable
 
 
 def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
@@ -369,18 +370,22 @@ def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
         raise DataError(f"path is {type_name(argument)}; pass the path of a file, or a list of paths")
     if not entries:
         raise DataError("path: the list is empty; pass the path of at least one file")
-    places = [_split_group(Path(entry)) for entry in entries]
-    total = 0
-    for index, (path, group) in enumerate(places):
-        total += _size(path)
-        if any(path.resolve() == other.resolve() and group == inner for other, inner in places[:index]):
+    paths_and_groups = [_split_group(Path(entry)) for entry in entries]
+    total_size = 0
+    for index, (path, group) in enumerate(paths_and_groups):
+        total_size += _size(path)
+        if any(
+            path.resolve() == other_path.resolve() and group == other_group
+            for other_path, other_group in paths_and_groups[:index]
+        ):
             raise DataError(f"{str(path / group)!r} is given twice; give every file once")
-    if total > _MAX_FILE_BYTES:
+    if total_size > _MAX_FILE_BYTES:
         raise DataError(
-            f"{join_names(str(path) for path, _ in places)}: {total} bytes, more than the limit of {_MAX_FILE_BYTES}; "
+            f"{join_names(str(path) for path, _ in paths_and_groups)}: {total_size} bytes, more than the limit of "
+            f"{_MAX_FILE_BYTES}; "
             "split the record or lower its rate"
         )
-    return places
+    return paths_and_groups
 
 
 def _split_group(path: Path) -> tuple[Path, str]:
@@ -404,32 +409,32 @@ def run_paths(path: str) -> list[str]:
 
 def _size(path: Path) -> int:
     try:
-        status = path.stat()
+        file_status = path.stat()
     except FileNotFoundError:
         raise DataError(f"{str(path)!r} does not exist{nearest_file_hint(path)}; check the path") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{str(path)!r} cannot be opened ({error}); check the path and its permissions") from None
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(file_status.st_mode):
         raise DataError(f"{str(path)!r} is not a file; pass the path of a file")
-    return status.st_size
+    return file_status.st_size
 
 
 def read_tables(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
     """Return one table per path, with all columns; raise DataError if a file cannot be read."""
-    places = _paths(path)
-    read: dict[Path, FileTable] = {}
-    kinds = {file: binary_format_of(file) for file, _ in places}
+    paths = _paths(path)
+    tables_by_path: dict[Path, FileTable] = {}
+    kinds = {file: binary_format_of(file) for file, _ in paths}
     for kind in dict.fromkeys(kinds.values()):
         if kind is not None:
-            own = [file for file in kinds if kinds[file] is kind]
-            for name in own:
+            files_of_kind = [file for file in kinds if kinds[file] is kind]
+            for name in files_of_kind:
                 layout.check_used(repr(name.name), kind.label, SHEET_OPTIONS if kind.has_sheets else ())
-            read |= dict(zip(own, read_isolated(own, kind, layout), strict=True))
-    for name, form in kinds.items():
-        if form is None:
+            tables_by_path |= dict(zip(files_of_kind, read_isolated(files_of_kind, kind, layout), strict=True))
+    for name, file_format in kinds.items():
+        if file_format is None:
             layout.check_used(repr(name.name), "text", TEXT_OPTIONS)
-    tables = [read[file] if file in read else read_text(file, layout) for file, _ in places]
-    return [table.in_group(group) if group else table for table, (_, group) in zip(tables, places, strict=True)]
+    tables = [tables_by_path[file] if file in tables_by_path else read_text(file, layout) for file, _ in paths]
+    return [table.in_group(group) if group else table for table, (_, group) in zip(tables, paths, strict=True)]
 
 
 def column_names(path: PathLike) -> tuple[str, ...] | None:
@@ -486,15 +491,16 @@ def _columns_file(columns: object) -> Mapping[str, object]:
         return {}
     if isinstance(columns, (str, os.PathLike)):
         remedy = "a file with a time and tables [inputs], [outputs] and [units] of name = column"
-        read = msgspec.structs.asdict(read_toml(columns, "names of columns", remedy, _ColumnsFile))
-        return {key: value for key, value in read.items() if value is not None}
+        contents = msgspec.structs.asdict(read_toml(columns, "names of columns", remedy, _ColumnsFile))
+        return {key: value for key, value in contents.items() if value is not None}
     if not isinstance(columns, Mapping):
         raise DataError(f"{parameter('columns')} is {type_name(columns)}; pass a dict or the path of a TOML file")
     keys = COLUMN_KEYS
-    unknown = [key for key in columns if key not in keys]
-    if unknown:
+    unknown_names = [key for key in columns if key not in keys]
+    if unknown_names:
         raise DataError(
-            f"{parameter('columns')}: the key {unknown[0]!r} is unknown{nearest(unknown[0], keys)}, {len(unknown)} in "
+            f"{parameter('columns')}: the key {unknown_names[0]!r} is unknown{nearest(unknown_names[0], keys)}, "
+            f"{len(unknown_names)} in "
             f"all; the known keys are {join_names(keys)}"
         )
     return columns

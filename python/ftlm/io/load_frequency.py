@@ -174,12 +174,12 @@ def load_frequency(
     if "deviation" in parts:
         deviation = factor * parts["deviation"].column.numbers().astype(np.float64)
     label = base_name(table.path) if name is None else name
-    rest = omega == 0.0
-    if np.any(rest) and not np.all(rest):
+    is_zero_frequency = omega == 0.0
+    if np.any(is_zero_frequency) and not np.all(is_zero_frequency):
         # Some instruments append a row at 0 Hz, which has no place on a logarithmic axis.
-        notes.append(f"{int(np.sum(rest))} of {omega.size} rows are at frequency 0 and left out")
-        omega, response = omega[~rest], response[~rest]
-        deviation = None if deviation is None else deviation[~rest]
+        notes.append(f"{int(np.sum(is_zero_frequency))} of {omega.size} rows are at frequency 0 and left out")
+        omega, response = omega[~is_zero_frequency], response[~is_zero_frequency]
+        deviation = None if deviation is None else deviation[~is_zero_frequency]
     notes += _describe_sweeps(omega, response)
     PACKAGE_LOGGER.info("read: %s: %d frequencies", label, omega.size)
     return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
@@ -191,17 +191,19 @@ def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
     A sweep is a contiguous block of rows with increasing or decreasing frequencies. In the common frequency range, each
     later sweep is compared with the first sweep, which is interpolated linearly over the logarithm of the frequency.
     """
-    steps = np.sign(np.diff(omega))
-    reversals = np.flatnonzero(steps == -np.sign(np.sum(steps))) + 1
+    directions = np.sign(np.diff(omega))
+    reversals = np.flatnonzero(directions == -np.sign(np.sum(directions))) + 1
     sweeps = [rows for rows in np.split(np.arange(omega.size), reversals) if rows.size >= MIN_SWEEP_ROWS]
     differences = []
     for rows in sweeps[1:]:
-        first = sweeps[0][np.argsort(omega[sweeps[0]], kind="stable")]
-        shared = rows[(omega[rows] >= omega[first[0]]) & (omega[rows] <= omega[first[-1]])]
-        if shared.size >= MIN_SWEEP_ROWS:
-            at, known = np.log(omega[shared]), np.log(omega[first])
-            curve = np.interp(at, known, response[first].real) + 1j * np.interp(at, known, response[first].imag)
-            differences.append(float(np.linalg.norm(response[shared] - curve) / np.linalg.norm(curve)))
+        first_sweep = sweeps[0][np.argsort(omega[sweeps[0]], kind="stable")]
+        shared_rows = rows[(omega[rows] >= omega[first_sweep[0]]) & (omega[rows] <= omega[first_sweep[-1]])]
+        if shared_rows.size >= MIN_SWEEP_ROWS:
+            at, known_points = np.log(omega[shared_rows]), np.log(omega[first_sweep])
+            curve = np.interp(at, known_points, response[first_sweep].real) + 1j * np.interp(
+                at, known_points, response[first_sweep].imag
+            )
+            differences.append(float(np.linalg.norm(response[shared_rows] - curve) / np.linalg.norm(curve)))
     if not differences:
         return []
     return [
@@ -255,13 +257,13 @@ def _select_parts(pool: ColumnTable, columns: Mapping[str, str | int]) -> dict[s
 
 
 def _check_parts(parts: Mapping[str, _ResponseColumn], pool: ColumnTable) -> None:
-    whole = {"real", "imag"} <= parts.keys() or {"magnitude", "phase"} <= parts.keys()
-    if "frequency" in parts and whole:
+    is_complete = {"real", "imag"} <= parts.keys() or {"magnitude", "phase"} <= parts.keys()
+    if "frequency" in parts and is_complete:
         return
     names = ", ".join(f"{i.part} {i.column.name!r}" for i in parts.values()) or "none"
-    missing = "the frequency" if "frequency" not in parts else "real and imaginary part, or magnitude and phase"
+    missing_text = "the frequency" if "frequency" not in parts else "real and imaginary part, or magnitude and phase"
     raise DataError(
-        f"{missing} cannot be recognized by column names (recognized: {names}); name the columns with "
+        f"{missing_text} cannot be recognized by column names (recognized: {names}); name the columns with "
         f"{parameter('columns', PART_COLUMNS)}, parts frequency, real and imag, or frequency, magnitude and phase; "
         f"{pool.describe()}"
     )
@@ -277,8 +279,8 @@ def _split_name_and_unit(column: Column) -> tuple[str, str]:
         return bare, unit
     if bare.casefold().endswith("_rad_s"):
         return bare[:-6], "rad/s"
-    for mark in ("/", "_", " ", ","):
-        head, separator, tail = bare.rpartition(mark)
+    for character in ("/", "_", " ", ","):
+        head, separator, tail = bare.rpartition(character)
         if separator and head and _unit_kind(tail.strip()) is not None:
             return head.strip(), tail.strip()
     return bare, ""
@@ -303,18 +305,18 @@ def _phase_unit(unit: str) -> str | None:
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
     """Return a column of a response with the part that its name denotes, such as ``Re(Z)`` or ``dB``; else None."""
-    whole, file_unit = column.name.strip(), column.file_unit
-    own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
-    for text, unit in ((whole, own), _split_name_and_unit(column)):
+    full_name, file_unit = column.name.strip(), column.file_unit
+    name_unit = full_name if _unit_kind(full_name) else file_unit if _unit_kind(file_unit) else ""
+    for text, unit in ((full_name, name_unit), _split_name_and_unit(column)):
         word = re.sub(
             r"[\s_]", "", text.replace(_OHM_SIGN, "Ω") if len(text) < _MAX_PART_NAME_CHARACTERS else ""
         ).casefold()
         word = word.replace('"', "''")
         bare = _MINUS_PREFIX_PATTERN.sub("", word)
-        for name, turned in ((word, False), (bare, True)):
+        for name, is_negated in ((word, False), (bare, True)):
             part = next((p for p, names in _PART_SYNONYMS.items() if name in names), None)
             if part is not None:
-                return _ResponseColumn(column, part, unit, turned, name)
+                return _ResponseColumn(column, part, unit, is_negated, name)
     return None
 
 
@@ -367,16 +369,16 @@ def _cartesian(
 ) -> tuple[Complex, float, str]:
     real, imag = parts["real"], parts["imag"]
     factor, unit = _magnitude_scale(real)
-    other, _ = _magnitude_scale(imag)
+    imag_scale, _ = _magnitude_scale(imag)
     if (factor, unit) != _magnitude_scale(imag) and imag.unit and real.unit:
         raise DataError(
             f"columns {real.column.name!r} and {imag.column.name!r} have the units {real.unit!r} and {imag.unit!r}; "
             "give both in one unit"
         )
-    factor = factor if real.unit else other
-    turned = imag.is_negated if negated is None else _truth("negated", negated)
+    factor = factor if real.unit else imag_scale
+    is_negated = imag.is_negated if negated is None else _truth("negated", negated)
     x, y = (i.column.numbers().astype(np.float64) for i in (real, imag))
-    if turned and negated is None:
+    if is_negated and negated is None:
         notes.append(
             f"column {imag.column.name!r} contains the negative imaginary part, by its name; otherwise "
             f"{parameter('negated')}"
@@ -386,7 +388,7 @@ def _cartesian(
             f"the imaginary part {imag.column.name!r} is positive in {int(np.sum(y > 0))} of {y.size} rows, as of an "
             f"inductance; if it contains -Z'', give {parameter('negated', True)}"
         )
-    response: Complex = np.asarray(factor * (x - 1j * y if turned else x + 1j * y), dtype=np.complex128)
+    response: Complex = np.asarray(factor * (x - 1j * y if is_negated else x + 1j * y), dtype=np.complex128)
     return response, factor, unit or _magnitude_scale(imag)[1]
 
 
@@ -397,10 +399,10 @@ def _polar(
     negated: bool | None,
     notes: list[str],
 ) -> tuple[Complex, float, str]:
-    size, angle = parts["magnitude"], parts["phase"]
-    values, phase = (i.column.numbers().astype(np.float64) for i in (size, angle))
-    file_unit = "dB" if size.unit.casefold() == "db" else "abs" if size.unit else None
-    decibels = _resolve_unit("magnitude", size, magnitude_unit, ("abs", "dB"), file_unit, notes)
+    magnitude, angle = parts["magnitude"], parts["phase"]
+    values, phase = (i.column.numbers().astype(np.float64) for i in (magnitude, angle))
+    file_unit = "dB" if magnitude.unit.casefold() == "db" else "abs" if magnitude.unit else None
+    decibels = _resolve_unit("magnitude", magnitude, magnitude_unit, ("abs", "dB"), file_unit, notes)
     if decibels == "dB" and "deviation" in parts:
         raise DataError(
             f"column {parts['deviation'].column.name!r} is read as the standard deviation of real and imaginary "
@@ -409,49 +411,50 @@ def _polar(
         )
     file_unit = _phase_unit(angle.unit)
     radians = SIGNAL_UNITS[_resolve_unit("phase", angle, phase_unit, _PHASE_UNITS, file_unit, notes)][1]
-    factor, unit = (1.0, "") if decibels == "dB" else _magnitude_scale(size)
+    factor, unit = (1.0, "") if decibels == "dB" else _magnitude_scale(magnitude)
     if decibels == "dB":
         values = 10.0 ** (values / 20.0)
     elif np.any(values < 0):
-        bad = values < 0
+        is_negative = values < 0
         raise DataError(
-            f"column {size.column.name!r}: a magnitude is negative, first at row {int(np.argmax(bad))}, "
-            f"{int(bad.sum())} in all; give {parameter('magnitude_unit', 'dB')} if these are decibels"
+            f"column {magnitude.column.name!r}: a magnitude is negative, first at row {int(np.argmax(is_negative))}, "
+            f"{int(is_negative.sum())} in all; give {parameter('magnitude_unit', 'dB')} if these are decibels"
         )
-    turned = angle.is_negated if negated is None else _truth("negated", negated)
-    if turned and negated is None:
+    is_negated = angle.is_negated if negated is None else _truth("negated", negated)
+    if is_negated and negated is None:
         notes.append(
             f"column {angle.column.name!r} contains the negative phase, by its name; otherwise {parameter('negated')}"
         )
-    response: Complex = factor * values * np.exp((-1j if turned else 1j) * radians * phase)
+    response: Complex = factor * values * np.exp((-1j if is_negated else 1j) * radians * phase)
     return response, factor, unit
 
 
 def _resolve_unit(
-    what: str, item: _ResponseColumn, option: str | None, choices: tuple[str, ...], unit: str | None, notes: list[str]
+    kind: str, item: _ResponseColumn, option: str | None, choices: tuple[str, ...], unit: str | None, notes: list[str]
 ) -> str:
     """Return the unit of a column: the option of the user, else the unit in the file, else the first of `choices`.
 
-    `what` is "magnitude" or "phase". In the last case, a note is added to `notes`. Raise DataError if the option is
+    `kind` is "magnitude" or "phase". In the last case, a note is added to `notes`. Raise DataError if the option is
     unknown or contradicts the file.
     """
     if option is not None:
         if option not in choices:
             hint = nearest(option, choices)
             raise DataError(
-                f"{parameter(f'{what}_unit', option)} is unknown{hint}; the known ones are {join_names(choices)}"
+                f"{parameter(f'{kind}_unit', option)} is unknown{hint}; the known ones are {join_names(choices)}"
             )
         if unit is not None and unit != option:
             raise DataError(
-                f"column {item.column.name!r} states {unit}, and {parameter(f'{what}_unit', option)} is given; "
-                f"leave {parameter(f'{what}_unit')} out, or rename the column"
+                f"column {item.column.name!r} states {unit}, and {parameter(f'{kind}_unit', option)} is given; "
+                f"leave {parameter(f'{kind}_unit')} out, or rename the column"
             )
         return option
     if unit is not None:
         return unit
-    words = "linear, not in decibels" if what == "magnitude" else "in degrees"
+    default_text = "linear, not in decibels" if kind == "magnitude" else "in degrees"
     notes.append(
-        f"the {what} {item.column.name!r} is assumed to be {words}; otherwise {parameter(f'{what}_unit', choices[1])}"
+        f"the {kind} {item.column.name!r} is assumed to be {default_text}; otherwise "
+        f"{parameter(f'{kind}_unit', choices[1])}"
     )
     return choices[0]
 
@@ -467,9 +470,9 @@ def _compare(parts: Mapping[str, _ResponseColumn], response: Complex, notes: lis
     item = parts["magnitude"]
     if item.unit.casefold() == "db" or item.column.problem is not None:
         return
-    own, units = item.column.numbers(), _ohms(item.unit) or 1.0
+    values, units = item.column.numbers(), _ohms(item.unit) or 1.0
     scale = (_ohms(parts["real"].unit) or 1.0) / units
-    off = np.abs(np.abs(response) * scale - own) > _MAGNITUDE_TOLERANCE * np.abs(own)
+    off = np.abs(np.abs(response) * scale - values) > _MAGNITUDE_TOLERANCE * np.abs(values)
     if np.any(off):
         notes.append(
             f"column {item.column.name!r} is not the magnitude of real and imaginary part, first at row "

@@ -167,9 +167,9 @@ class OpenedFile:
         return {**fields, "options": {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items()}}
 
     def __str__(self) -> str:
-        heads = ("column", "role", "unit", "first", "low", "high")
+        headings = ("column", "role", "unit", "first", "low", "high")
         columns = self.columns[:_MAX_LISTED_COLUMNS]
-        cells: list[tuple[str, ...]] = [heads]
+        cells: list[tuple[str, ...]] = [headings]
         for c in columns:
             texts = _truncate_text(c.name), f"{c.role} {c.signal}".rstrip(), _truncate_text(c.unit)
             cells.append((*texts, *_figures(c)))
@@ -196,22 +196,27 @@ class OpenedFile:
         """Return the command-line arguments that correspond to `options`, without those that equal a default."""
         options = self.options
         # Options that are detected reliably or equal the default are omitted.
-        plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
-        words = []
+        stated_options = {a.option for a in self.assumed if not a.counts and a.option != "time"}
+        arguments = []
         for key in ("time", "step", "time_unit", "resample", "missing"):
-            if key in options and key not in plain:
-                words += [flag_of(key), str(options[key])]
+            if key in options and key not in stated_options:
+                arguments += [flag_of(key), str(options[key])]
         if "window" in options:
-            words += [flag_of("window"), ":".join("" if end is None else repr(end) for end in options["window"])]
+            arguments += [
+                flag_of("window"),
+                ":".join("" if bound is None else repr(bound) for bound in options["window"]),
+            ]
         for key in ("inputs", "outputs", "units", "intersample"):
             bare = key in ("inputs", "outputs")
             pairs = (
                 name if bare and name == value else f"{name}={value}" for name, value in options.get(key, {}).items()
             )
-            words += [w for pair in pairs for w in (flag_of(key), pair)]
+            arguments += [w for pair in pairs for w in (flag_of(key), pair)]
         given_layout: Layout = options.get("layout", Layout())
-        words += [w for k, v in given_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
-        return words
+        arguments += [
+            w for k, v in given_layout.to_dict().items() if k not in stated_options for w in (flag_of(k), str(v))
+        ]
+        return arguments
 
 
 @check_arguments
@@ -278,10 +283,10 @@ class _FilePreview:
 
     def result(self, path: str) -> OpenedFile:
         table, selection = self.table, self.selection
-        every = self.pool.columns
-        clock, assumed, problem = self._time(every)
+        all_columns = self.pool.columns
+        clock, assumed, problem = self._time(all_columns)
         of_clock = () if clock is None or selection.step is not None else self._time_assumptions(clock)
-        roles, role_assumptions, open_roles = self._roles(every, clock)
+        roles, role_assumptions, open_roles = self._roles(all_columns, clock)
         assumed = (*table.assumed, *assumed, *of_clock, *role_assumptions)
         step, notes = None, tuple[str, ...]()
         if not problem:
@@ -293,8 +298,8 @@ class _FilePreview:
                 step, notes = run.step, tuple(n for n in run.warnings if n not in {str(a) for a in assumed})
             except DataError as error:
                 problem = str(error)
-        columns = tuple(_summarize_column(column, roles) for column in every)
-        rows = max((0 if c.values is None else c.values.size for c in every), default=0)
+        columns = tuple(_summarize_column(column, roles) for column in all_columns)
+        rows = max((0 if c.values is None else c.values.size for c in all_columns), default=0)
         return OpenedFile(path, table.kind, rows, columns, table.layout, assumed, options, step, problem, notes)
 
     def _named_signals(self) -> set[str]:
@@ -305,7 +310,7 @@ class _FilePreview:
                 names.add(self.pool.find(spec, "signal").name)
         return names
 
-    def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
+    def _time(self, all_columns: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
         """Return the time column, assumptions about it, and "" or a text on why there is no time column."""
         selection, header = self.selection, self.table.header
         if header is not None and selection.time is None and selection.step is None:
@@ -316,11 +321,11 @@ class _FilePreview:
         if header is None and selection.time is None and not signals and is_response(self.pool):
             path = shlex.quote(os.fspath(self.table.path))
             command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
-            how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
-            words = "the columns are those of a frequency response or an impedance spectrum"
+            hint = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
+            reason = "the columns are those of a frequency response or an impedance spectrum"
             fits = "fits a first model, for an impedance a resistor in series with a depressed semicircle"
-            return None, (), f"{words}; {how} {fits}"
-        matrices = list(dict.fromkeys(c.matrix for c in every if c.matrix is not None))
+            return None, (), f"{reason}; {hint} {fits}"
+        matrices = list(dict.fromkeys(c.matrix for c in all_columns if c.matrix is not None))
         try:
             clock, assumed = self.pool.time(selection.time, matrices if len(matrices) == 1 else [], signals)
         except DataError as error:
@@ -328,16 +333,16 @@ class _FilePreview:
         if assumed is not None:
             return clock, (assumed,), ""
         if selection.time is None and clock.matrix is not None:
-            words = f"the time is the first column of the matrix, {clock.name!r}"
+            reason = f"the time is the first column of the matrix, {clock.name!r}"
             return (
                 clock,
-                (Assumption("time", clock.name, words, f"{parameter('time', Placeholder('COLUMN'))}", False),),
+                (Assumption("time", clock.name, reason, f"{parameter('time', Placeholder('COLUMN'))}", False),),
                 "",
             )
         return clock, (), ""
 
     def _roles(
-        self, every: list[Column], clock: Column | None
+        self, all_columns: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
         """Return (role, signal) by column, assumptions, and "" or a text on why the roles are unknown."""
         selection, header = self.selection, self.table.header
@@ -345,7 +350,7 @@ class _FilePreview:
         if header is not None and not selection.inputs and not selection.outputs:
             selection.inputs, selection.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         else:
-            assumptions = assume_roles(selection, [c for c in every if c is not clock])
+            assumptions = assume_roles(selection, [c for c in all_columns if c is not clock])
         roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
         for role, specs in (("input", selection.inputs), ("output", selection.outputs)):
             for name, spec in specs.items():
@@ -354,17 +359,17 @@ class _FilePreview:
             add_file_units(selection, self.pool)
         open_roles = ""
         if not selection.outputs:
-            choice = join_names((c.name for c in every if c is not clock and has_numbers(c)), 20)
+            choice = join_names((c.name for c in all_columns if c is not clock and has_numbers(c)), 20)
             open_roles = (
                 "the column names do not say which are inputs and which are outputs; name them with "
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
             )
-            text_columns = (c for c in every if c is not clock and not has_numbers(c) and c.timestamps is None)
-            others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in text_columns]
-            if others:
-                more = f" and {len(others) - _MAX_LISTED_COLUMNS} more" * (len(others) > _MAX_LISTED_COLUMNS)
-                open_roles += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
+            text_columns = (c for c in all_columns if c is not clock and not has_numbers(c) and c.timestamps is None)
+            texts = [f"{c.name!r} ({_first_bad_cell(c)})" for c in text_columns]
+            if texts:
+                further_text = f" and {len(texts) - _MAX_LISTED_COLUMNS} more" * (len(texts) > _MAX_LISTED_COLUMNS)
+                open_roles += f"; no column of numbers is {', '.join(texts[:_MAX_LISTED_COLUMNS])}{further_text}"
         return roles, assumptions, open_roles
 
     def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
@@ -378,8 +383,8 @@ class _FilePreview:
         is_certain = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
         if self.options.time_unit is not None or is_certain or clock.problem is not None:
             return ()
-        words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
-        return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
+        text = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
+        return (Assumption("time_unit", "s", text, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments with which :func:`ftlm.load` returns the previewed run without assumptions."""
@@ -387,8 +392,8 @@ class _FilePreview:
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and selection.step is None and self.table.header is None:
             options["time"] = clock.name
-        more = {key: getattr(self.options, key) for key in ("window", "resample", "time_unit", "missing")}
-        options |= {key: value for key, value in more.items() if value is not None}
+        further_options = {key: getattr(self.options, key) for key in ("window", "resample", "time_unit", "missing")}
+        options |= {key: value for key, value in further_options.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
             if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):
                 options[key] = dict(getattr(selection, key))
@@ -414,8 +419,8 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
     if column.timestamps is not None:
         return replace(summary, words=f"from {column.timestamps.first}")
     if values is None or not values.size or not has_numbers(column):
-        why = _first_bad_cell(column)
-        return replace(summary, words=f"no numbers ({why})" if why else "no numbers")
+        problem = _first_bad_cell(column)
+        return replace(summary, words=f"no numbers ({problem})" if problem else "no numbers")
     finite = values[~np.isnan(values)]
     if not finite.size:
         return replace(summary, words="empty")

@@ -79,9 +79,9 @@ class Column:
         return self.values
 
 
-def dates_problem(thing: str, words: str, rows: int) -> DataError:
+def dates_problem(thing: str, description: str, rows: int) -> DataError:
     """Return the DataError for a column of dates or times of day that is used as numbers."""
-    return bad_rows(thing, words, 0, rows, f"name it with {parameter('time')}, or choose another column")
+    return bad_rows(thing, description, 0, rows, f"name it with {parameter('time')}, or choose another column")
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ class FileTable:
     @property
     def runs(self) -> tuple[str, ...]:
         """Names of the groups of an HDF5 file that each have a time column; empty if the file contains one run."""
-        places = [c.variable.rpartition("/") for c in self.columns if c.matrix is None]
-        groups = tuple(dict.fromkeys(group for group, _, name in places if group and is_time_name(name)))
+        name_parts = [c.variable.rpartition("/") for c in self.columns if c.matrix is None]
+        groups = tuple(dict.fromkeys(group for group, _, name in name_parts if group and is_time_name(name)))
         return groups if len(groups) > 1 else ()
 
     def in_group(self, group: str) -> FileTable:
@@ -179,10 +179,10 @@ class ColumnTable:
 
     def describe(self) -> str:
         """Return text on the available columns and on skipped parts of the files, for error messages."""
-        skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
+        skipped = {name: reason for table in self._tables for name, reason in table.skipped.items()}
         text = f"the columns are {join_names(self.names)}"
         if skipped:
-            text += "; not read: " + ", ".join(f"{name!r} ({why})" for name, why in list(skipped.items())[:10])
+            text += "; not read: " + ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10])
         return text
 
     def find(self, spec: object, thing: str) -> Column:
@@ -244,7 +244,7 @@ class ColumnTable:
             return self.find(spec, "time"), None
         clocks, assumed = [], None
         for table in self._tables:
-            columns, why = self._time_candidates(table, signals)
+            columns, problem = self._time_candidates(table, signals)
             if len(columns) > 1 and table.runs:
                 raise DataError(
                     f"{table.path.name} contains {len(table.runs)} runs, each in a group with its own time; give the "
@@ -255,20 +255,20 @@ class ColumnTable:
                     f"{table.path.name}: the columns {join_names(column.name for column in columns)} may all be the "
                     f"time; name one with {parameter('time')}"
                 )
-            if columns and why:
-                assumed = Assumption("time", columns[0].name, why, parameter("time", Placeholder("COLUMN")))
+            if columns and problem:
+                assumed = Assumption("time", columns[0].name, problem, parameter("time", Placeholder("COLUMN")))
             clocks += columns
         if not clocks:
-            first = [self._columns[f"{matrix}.1"] for matrix in dict.fromkeys(matrices)]
-            clocks = [column for column in first if column.name not in signals]
+            first_columns = [self._columns[f"{matrix}.1"] for matrix in dict.fromkeys(matrices)]
+            clocks = [column for column in first_columns if column.name not in signals]
         if not clocks:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
                 f"name it with {parameter('time')}, or give the time between rows with {parameter('step')}; "
                 f"{choose_text('identify_frequency', 'ftlm identify-frequency')} takes spectra; {self.describe()}"
             )
-        for other in clocks[1:]:
-            _check_agreement(clocks[0], other)
+        for other_clock in clocks[1:]:
+            _check_agreement(clocks[0], other_clock)
         return clocks[0], assumed
 
     def _time_candidates(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
@@ -277,23 +277,23 @@ class ColumnTable:
         The first criterion with a candidate is used: t, time or seconds; another name of a time; dates; first column
         with a unit of time.
         """
-        others = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
-        own = [c for c in others if c.matrix is None]
+        candidates = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
+        vectors = [c for c in candidates if c.matrix is None]
         groups = {name.rpartition("/")[0] for name in signals}
         # Each group of an HDF5 file is a separate run.
         if groups != {""}:
-            own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
-        time_columns = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
+            vectors = [c for c in vectors if {c.name.rpartition("/")[0]} == groups] or vectors
+        time_columns = [c for c in vectors if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
         if time_columns:
             return time_columns, ""
-        columns = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
+        columns = [c for c in vectors if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
         if columns:
             return columns, f"the time is column {columns[0].name!r}, by its name"
-        dated = [c for c in own if c.timestamps is not None]
+        dated = [c for c in vectors if c.timestamps is not None]
         if dated:
             return dated, f"the time is column {dated[0].name!r}, which contains dates or times of day"
-        if own and own[0].file_unit and is_time_unit(own[0].file_unit):
-            return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].file_unit}"
+        if vectors and vectors[0].file_unit and is_time_unit(vectors[0].file_unit):
+            return vectors[:1], f"the time is the first column, {vectors[0].name!r}, by its unit {vectors[0].file_unit}"
         return [], ""
 
 
@@ -302,32 +302,39 @@ def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None
     order = "" if clock.timestamps is None else clock.timestamps.inferred_date_order(dates)
     if clock.timestamps is None or not order:
         return None
-    first = "day" if order == "dmy" else "month"
-    words = f"dates begin with the {first}, as in {clock.timestamps.first!r}"
-    return Assumption("dates", order, words, layout_parameter(dates=Placeholder("ORDER")))
+    first_part = "day" if order == "dmy" else "month"
+    text = f"dates begin with the {first_part}, as in {clock.timestamps.first!r}"
+    return Assumption("dates", order, text, layout_parameter(dates=Placeholder("ORDER")))
 
 
-def _check_agreement(one: Column, other: Column) -> None:
-    names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
-    if one.timestamps is not None and other.timestamps is not None:
-        own, its = (np.column_stack([c.parts, c.clock]) for c in (one.timestamps, other.timestamps))
-        if one.timestamps.mark != other.timestamps.mark or not np.array_equal(own, its):
+def _check_agreement(reference: Column, compared: Column) -> None:
+    names = (
+        f"time: the columns {reference.name!r} of {reference.source.name} and {compared.name!r} of "
+        f"{compared.source.name}"
+    )
+    if reference.timestamps is not None and compared.timestamps is not None:
+        reference_parts, compared_parts = (
+            np.column_stack([c.parts, c.clock]) for c in (reference.timestamps, compared.timestamps)
+        )
+        if reference.timestamps.separator != compared.timestamps.separator or not np.array_equal(
+            reference_parts, compared_parts
+        ):
             raise DataError(
                 f"{names} differ; give files of one record, or name the time to use with {parameter('time')}"
             )
         return
-    a, b = one.numbers(), other.numbers()
+    a, b = reference.numbers(), compared.numbers()
     if a.size != b.size:
         raise DataError(
             f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with "
             f"{parameter('time')}"
         )
     with np.errstate(invalid="ignore", over="ignore"):
-        same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _RELATIVE_TIME_TOLERANCE * max(
+        is_same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _RELATIVE_TIME_TOLERANCE * max(
             1.0, float(np.abs(a[[0, -1]]).max())
         )
-    rows = np.flatnonzero(~same & ~(np.isnan(a) & np.isnan(b)))
+    rows = np.flatnonzero(~is_same & ~(np.isnan(a) & np.isnan(b)))
     if rows.size:
-        what = f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}"
+        difference_text = f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}"
         remedy = f"give files of one record, or name the time to use with {parameter('time')}"
-        raise bad_rows(names, what, int(rows[0]), rows.size, remedy)
+        raise bad_rows(names, difference_text, int(rows[0]), rows.size, remedy)

@@ -70,9 +70,9 @@ class SearchProblem(ABC):
     def core_arguments(self) -> tuple[Any, ...]:
         """Arguments of the search functions of the Rust core that follow the block-pulse records."""
 
-    def core(self, *more: Any) -> tuple[Any, ...]:
-        """Return the arguments of a search function of the Rust core: records, `core_arguments`, and then `more`."""
-        return list(self.runs), *self.core_arguments, *more
+    def core(self, *extra: Any) -> tuple[Any, ...]:
+        """Return the arguments of a search function of the Rust core: records, `core_arguments`, and then `extra`."""
+        return list(self.runs), *self.core_arguments, *extra
 
     @abstractmethod
     def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
@@ -226,9 +226,9 @@ def _run_cached(key: str, work: SearchProblem | None, do: Callable[[Any], Piece]
         _cached_searches.move_to_end(key)
         while len(_cached_searches) > MAX_CACHED_SEARCHES:
             _cached_searches.popitem(last=False)
-    began = time.monotonic()
-    piece = do(search)
-    return time.monotonic() - began, piece
+    start_time = time.monotonic()
+    result = do(search)
+    return time.monotonic() - start_time, result
 
 
 #: Target duration of a task: long compared with its transfer, and short enough that a lost task costs little.
@@ -291,8 +291,8 @@ class Throughput:
 
     def update(self, seconds: float, count: int) -> None:
         """Update the smoothed time per item from the time [s] that `count` items took."""
-        each = max(seconds, 1e-9) / count
-        self.seconds_each = each if self.seconds_each == 0 else 0.7 * self.seconds_each + 0.3 * each
+        seconds_each = max(seconds, 1e-9) / count
+        self.seconds_each = seconds_each if self.seconds_each == 0 else 0.7 * self.seconds_each + 0.3 * seconds_each
 
 
 def run_on_executor(
@@ -309,17 +309,17 @@ def run_on_executor(
     count = worker_count(executor)
     queue_size = TASKS_PER_WORKER * count + 2
     # A small batch is divided evenly among the workers.
-    share = max(throughput.min_count, -(-sum(s.last - s.first for s in blocks) // count))
+    task_size = max(throughput.min_count, -(-sum(s.last - s.first for s in blocks) // count))
     pending: dict[Future[Any], CandidateBlock] = {}
-    waiting = blocks[::-1]
+    queue = blocks[::-1]
     try:
-        while waiting or pending:
-            while waiting and len(pending) < queue_size:
-                block = waiting.pop()
-                size = min(throughput.count_for(TASK_DURATION_S), share)
-                if block.start is None and block.attempts == 0 and block.last - block.first > size:
-                    waiting.append(CandidateBlock(block.first + size, block.last))
-                    block = CandidateBlock(block.first, block.first + size)
+        while queue or pending:
+            while queue and len(pending) < queue_size:
+                block = queue.pop()
+                task_count = min(throughput.count_for(TASK_DURATION_S), task_size)
+                if block.start is None and block.attempts == 0 and block.last - block.first > task_count:
+                    queue.append(CandidateBlock(block.first + task_count, block.last))
+                    block = CandidateBlock(block.first, block.first + task_count)
                 try:
                     pending[executor.submit(run_in_worker, *send(block))] = block
                 except (BrokenExecutor, RuntimeError) as error:
@@ -329,11 +329,11 @@ def run_on_executor(
                 block = pending.pop(future)
                 timed = _result(future, block)
                 if timed is None:
-                    waiting.append(block)
+                    queue.append(block)
                     continue
-                seconds, piece = timed
+                seconds, result = timed
                 throughput.update(seconds, block.last - block.first)
-                yield block, piece
+                yield block, result
     finally:
         for future in pending:
             future.cancel()
@@ -455,10 +455,10 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         All rounds of a batch start from the same best rows. Later batches exclude more candidates, so the evaluation
         time per round is measured separately for each batch.
         """
-        first, keep = 0, self.work.settings.top
+        first, table_size = 0, self.work.settings.top
         for end in self._ends:
-            ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:keep]
-            if len(ranked) == keep:
+            ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:table_size]
+            if len(ranked) == table_size:
                 self._parts = [_drop_beaten_rows(ranked[-1], part) for part in self._parts]
             self._seed = [(index, score) for score, index in ranked]
             self.throughput = Throughput()
@@ -483,8 +483,8 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function that evaluates a block of this search in a worker process, followed by its arguments."""
-        ranged = block.first, block.last, self._seed, block.start, self.threads
-        return evaluate_rounds, self.work.key, self.payload(block), *ranged
+        arguments = block.first, block.last, self._seed, block.start, self.threads
+        return evaluate_rounds, self.work.key, self.payload(block), *arguments
 
     def frame(self, number: int, block: CandidateBlock, piece: Part) -> Rounds:
         """Return the checkpoint record with the partial result of a block of rounds (groups of candidates)."""
@@ -537,12 +537,12 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         for block in blocks:
             at = block.first
             while at < block.last:
-                piece = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
-                began = time.monotonic()
-                outcomes = self.search.evaluate_spans(self._candidate_spans(piece), self.threads, None)
-                self.throughput.update(time.monotonic() - began, piece.last - piece.first)
-                yield piece, outcomes
-                at = piece.last
+                sub_block = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
+                start_time = time.monotonic()
+                outcomes = self.search.evaluate_spans(self._candidate_spans(sub_block), self.threads, None)
+                self.throughput.update(time.monotonic() - start_time, sub_block.last - sub_block.first)
+                yield sub_block, outcomes
+                at = sub_block.last
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function that evaluates a block of candidates in a worker process, followed by its arguments."""
@@ -643,20 +643,20 @@ def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Tabl
 
     Raise ModelError if the file contains candidates of another search.
     """
-    store, number, section = execution.store, execution.number, execution.section
+    store, search_index, section = execution.store, execution.number, execution.section
     executor, progress = execution.executor, execution.progress
-    save = None if store is None else partial(store.save, number)
+    save = None if store is None else partial(store.save, search_index)
     pruned = 0
     for first, end in state.batches():
         for stored_frame in _stored_frames(section, first, end):
             state.add_block(stored_frame)
         blocks = list(_pending_blocks(section, first, end))
         if executor is None:
-            pieces = state.evaluate_locally(blocks, progress, save)
+            results = state.evaluate_locally(blocks, progress, save)
         else:
-            pieces = run_on_executor(state.task, blocks, executor, state.throughput)
-        for block, piece in pieces:
-            frame = state.frame(number, block, piece)
+            results = run_on_executor(state.task, blocks, executor, state.throughput)
+        for block, result in results:
+            frame = state.frame(search_index, block, result)
             if store is not None:
                 store.append_block(frame)
             pruned += state.add_block(frame)
@@ -674,10 +674,10 @@ def equation_state(work: EquationProblem, section: Section) -> tuple[int, float 
 
     The score is None if the file contains none.
     """
-    best = section.best
-    if best is not None and work.settings.norm == "l2":
-        best = math.sqrt(max(best, 0.0) / work.samples)
-    return work.plan()[0], best
+    best_score = section.best
+    if best_score is not None and work.settings.norm == "l2":
+        best_score = math.sqrt(max(best_score, 0.0) / work.samples)
+    return work.plan()[0], best_score
 
 
 def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | None]:
@@ -701,17 +701,17 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
 
     Raise ModelError if sizes or counts of the table do not match the search.
     """
-    widths = [len(terms) for _, _, terms in work.laws]
+    coefficient_counts = [len(terms) for _, _, terms in work.laws]
     accounted = sum(v for k, v in joined.counts.items() if k != "candidates")
-    sound = (
+    is_valid = (
         set(joined.counts) == {"candidates", "kept", "beaten", "bound", "stopped early", "singular", "diverged"}
         and accounted == joined.counts["candidates"]
         and 0 < len(joined.rows) == joined.counts["kept"] <= work.settings.top
         and all(len(free) == len(work.axes) for _, free, _ in joined.failures)
         and all(len(free) == len(work.axes) for _, _, free, _ in joined.rows)
-        and all([len(p[3]) for p in parts] == widths for _, _, _, parts in joined.rows)
+        and all([len(p[3]) for p in parts] == coefficient_counts for _, _, _, parts in joined.rows)
     )
-    if not sound:
+    if not is_valid:
         raise ModelError("its table belongs to another search")
     table = msgspec.to_builtins({"rows": joined.rows, "counts": joined.counts, "failures": joined.failures})
     return cast("_core._FoundStage", {**table, "distinct": []})

@@ -101,13 +101,13 @@ def certify_orders(
     KeyboardInterrupt
         On Ctrl-C, within half a second.
     """
-    share = real_number("tolerance", tolerance)
-    if not 0 < share < 1:
+    relative_tolerance = real_number("tolerance", tolerance)
+    if not 0 < relative_tolerance < 1:
         raise ModelError(
             f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 means that no orders may be better by more "
             "than 5 %"
         )
-    most = check_integer("max_cells", max_cells, 1)
+    box_limit = check_integer("max_cells", max_cells, 1)
     increment = order_grid.increment if isinstance(order_grid, OrderGrid) else DEFAULT_INCREMENT
     gap = real_number("min_separation", increment if min_separation is None else min_separation)
     if not 0 < gap <= 1:
@@ -115,8 +115,8 @@ def certify_orders(
             f"{setting('min_separation')} {min_separation!r} is outside (0, 1]; the increment of the order grid is "
             "usual"
         )
-    size = real_number("max_term_ratio", max_term_ratio)
-    if not 1 <= size <= 1e9:
+    term_ratio = real_number("max_term_ratio", max_term_ratio)
+    if not 1 <= term_ratio <= 1e9:
         raise ModelError(
             f"{setting('max_term_ratio')} {max_term_ratio!r} is outside [1, 1e9]; the default is "
             f"{DEFAULT_MAX_TERM_RATIO:g}"
@@ -124,37 +124,37 @@ def certify_orders(
     job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     _check_certifiable(job)
     errors = tuple(_equation_error(job, orders, k, len(start)) for k, orders in enumerate(start))
-    record, item = job.records[0], job.structure.equations[0]
+    record, single_equation = job.records[0], job.structure.equations[0]
     output, alpha, terms = job.equation_problem().orders
     try:
-        answer = _core.certify(
+        result = _core.certify(
             [r.core() for r in job.records],
             output=output,
             alpha=(min(alpha), max(alpha)),
             terms=[(signal, min(values), max(values)) for signal, values, _ in terms],
             min_separation=gap,
-            tolerance=share,
-            max_term_ratio=size,
-            max_cells=most,
+            tolerance=relative_tolerance,
+            max_term_ratio=term_ratio,
+            max_cells=box_limit,
             threads=job.threads,
             memory=memory_limit(),
             progress=None if progress is None else lambda count, total, _pruned: progress(count, total),
         )
     except ModelError as error:
         raise named_signals(error, record.signals) from None
-    values = [answer["alpha"], *answer["orders"]] if answer["orders"] else []
-    orders = {o.names[0]: v for o, v in zip(item.orders, values, strict=False) if o.names}
+    values = [result["alpha"], *result["orders"]] if result["orders"] else []
+    orders = {o.names[0]: v for o, v in zip(single_equation.orders, values, strict=False) if o.names}
     nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
     return OrderCertificate(
-        answer["at_least"],
-        answer["best"],
+        result["at_least"],
+        result["best"],
         orders,
-        share,
+        relative_tolerance,
         {name: (min(values), max(values)) for name, values in job.values.items()},
         gap,
-        size,
-        answer["cells"],
-        answer["open"],
+        term_ratio,
+        result["cells"],
+        result["open"],
         record.m,
         nr,
         unstable,
@@ -169,12 +169,12 @@ def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: in
     The message names the point by its `index` among `count` points.
     """
     names = {name: (min(values), max(values)) for name, values in job.values.items()}
-    numbers = {str(name): real_number("start", value) for name, value in orders.items()}
-    if set(numbers) != set(names) or not all(low <= numbers[n] <= high for n, (low, high) in names.items()):
+    theta = {str(name): real_number("start", value) for name, value in orders.items()}
+    if set(theta) != set(names) or not all(low <= theta[n] <= high for n, (low, high) in names.items()):
         intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in names.items())
         raise ModelError(f"start {index} of {count} is {short_repr(dict(orders))}; give {intervals}")
     try:
-        return run_job(replace(job, values={n: (numbers[n],) for n in names}, progress=None)).score
+        return run_job(replace(job, values={n: (theta[n],) for n in names}, progress=None)).score
     except FtlmError:
         # The terms are linearly dependent at these orders.
         return math.inf
@@ -191,16 +191,16 @@ def _check_certifiable(job: Job) -> None:
             "one by one"
         )
     check_linear(job.structure.equations, "a certificate")
-    item = job.structure.equations[0]
+    equation = job.structure.equations[0]
     if tuple(job.records[0].start) != (False, []):
         raise ModelError(
             "there is no certificate over all orders with initial terms; give the equation "
             f"{parameter('initial', 'rest')}"
         )
-    fixed_terms = [t for t in item.terms if t.fixed is not None]
+    fixed_terms = [t for t in equation.terms if t.fixed is not None]
     if fixed_terms:
         raise ModelError(
-            f"a certificate over all orders requires free coefficients, but the equation of {item.output} has "
+            f"a certificate over all orders requires free coefficients, but the equation of {equation.output} has "
             f"{plural(len(fixed_terms), 'fixed one')} (the first is {fixed_terms[0].fixed:g}); give each a name"
         )
 

@@ -218,8 +218,8 @@ class Section:
             return
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
             raise ModelError(f"block {frame.first} to {frame.last} is not a valid range")
-        place = bisect.bisect_left(self._firsts, frame.last)
-        if place and self.frames[self._firsts[place - 1]].last > frame.first:
+        index = bisect.bisect_left(self._firsts, frame.last)
+        if index and self.frames[self._firsts[index - 1]].last > frame.first:
             raise ModelError(f"block {frame.first} to {frame.last} overlaps a stored block")
         if isinstance(frame, PartialRounds):
             self._add_partial_rounds(frame)
@@ -229,14 +229,14 @@ class Section:
             raise ModelError(f"candidates {frame.first} to {frame.last} have a wrong number of verdicts")
         self.open.pop(frame.first, None)
         self.frames[frame.first] = frame
-        self._firsts.insert(place, frame.first)
+        self._firsts.insert(index, frame.first)
 
     def _add_partial_rounds(self, frame: PartialRounds) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
             raise ModelError(f"block {frame.first} to {frame.last} contradicts its earlier record")
-        _, followed, end, size, limit = frame.place
-        if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
+        _, simulated, end, block_size, limit = frame.place
+        if not (simulated <= end and block_size >= (end > 0) and not math.isnan(limit)):
             raise ModelError(f"block {frame.first} to {frame.last} has an invalid resumption point")
         if half is None or frame.restarted:
             half = self.open[frame.first] = PartialBlock(frame.last, frame.place, frame.order, [], frame.counts, ())
@@ -283,10 +283,10 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
     `corruption` describes damage to later records, or is None.
     """
     if not payloads:
-        why = (
+        reason = (
             f"cannot be used: {corruption}" if corruption else "ends before its first record: its search had not begun"
         )
-        raise DataError(f"{path} {why}; start the search again in another file")
+        raise DataError(f"{path} {reason}; start the search again in another file")
     contents: Contents | None = None
     for number, payload in enumerate(payloads, 1):
         try:
@@ -385,18 +385,18 @@ class Store:
         if [r.name for r in requests] != [r.name for r in stored]:
             names = ", ".join(r.name for r in stored)
             raise DataError(f"store {self.path} contains searches of {names}; choose another file")
-        for one, other in zip(requests, stored, strict=True):
-            difference = one.difference(other)
+        for request, stored_request in zip(requests, stored, strict=True):
+            difference = request.difference(stored_request)
             if difference is not None:
                 raise DataError(
-                    f"store {self.path} contains another search of {one.name} (this one has {difference}); choose "
+                    f"store {self.path} contains another search of {request.name} (this one has {difference}); choose "
                     "another file"
                 )
 
-    def _append(self, added: Sequence[Frame]) -> None:
-        self._file.append([RECORD_ENCODER.encode(frame) for frame in added])
+    def _append(self, frames: Sequence[Frame]) -> None:
+        self._file.append([RECORD_ENCODER.encode(frame) for frame in frames])
         self._last = time.monotonic()
-        for frame in added:
+        for frame in frames:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
@@ -419,14 +419,14 @@ class Store:
 
     def flush(self) -> None:
         """Write all queued records to the file."""
-        due = []
+        frames = []
         for key, frame in self._queued_checkpoints.items():
-            same = not frame.restarted and self._failures.get(key) == frame.failures
-            due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
+            is_unchanged = not frame.restarted and self._failures.get(key) == frame.failures
+            frames.append(msgspec.structs.replace(frame, failures=None) if is_unchanged else frame)
             self._failures[key] = frame.failures
         self._queued_checkpoints.clear()
-        if due:
-            self._append(due)
+        if frames:
+            self._append(frames)
 
     def append_block(self, frame: Rounds | Verdicts) -> None:
         """Write the record of a complete block to the file, and remove its queued partial results."""

@@ -66,10 +66,10 @@ class OrderGrid:
             elif name in highest:
                 values[name] = self._axis(name, self.orders.get("alpha", self.alpha))
         fixed = [e.order.constant for e in structure.equations if not e.order.names]
-        top = max([max(values[n]) for n in highest if n in values] + fixed, default=2.0)
+        highest_order = max([max(values[n]) for n in highest if n in values] + fixed, default=2.0)
         for name in free:
             if name not in values:
-                values[name] = order_axis(name, 0.0, min(top, MAX_ORDER), self.increment)
+                values[name] = order_axis(name, 0.0, min(highest_order, MAX_ORDER), self.increment)
         return {name: values[name] for name in free}
 
     def _axis(self, name: str, spec: Values) -> tuple[float, ...]:
@@ -131,11 +131,11 @@ def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None
             raise ModelError(f"order {name!r} of {parameter('order_grid')} is not a free order; free are {free}")
 
 
-def restrict_order_grid(grid: OrderGrid | None, part: Structure) -> OrderGrid | None:
-    """Return an order grid without orders that are not free in the structure `part`; None if the grid is None."""
+def restrict_order_grid(grid: OrderGrid | None, group: Structure) -> OrderGrid | None:
+    """Return an order grid without orders that are not free in the structure `group`; None if the grid is None."""
     if grid is None:
         return None
-    names = (*part.order_names, "alpha")
+    names = (*group.order_names, "alpha")
     return replace(grid, orders={n: v for n, v in grid.orders.items() if n in names})
 
 
@@ -232,5 +232,5 @@ class SearchSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings to show in results and reports, by name, except options of other estimators."""
-        own = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
-        return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *own)}
+        method_settings = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
+        return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *method_settings)}

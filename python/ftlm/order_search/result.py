@@ -107,9 +107,11 @@ class OrderCertificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate as a dictionary for JSON."""
-        proof = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
+        bound_fields = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
         options = ("min_separation", "max_term_ratio", "cells", "open_cells", "m")
-        attributes_shown = attributes(self, (*proof, *options, "free_run_nr", "start_errors", "beatable", "findings"))
+        attributes_shown = attributes(
+            self, (*bound_fields, *options, "free_run_nr", "start_errors", "beatable", "findings")
+        )
         return attributes_shown if self.orders else attributes_shown | {"best": None}
 
     def __str__(self) -> str:
@@ -130,19 +132,19 @@ class OrderCertificate:
         separation = f"{self.min_separation:g}"
         separations = f"orders of the output {separation} below its highest, of one signal {separation} apart"
         orders_text = ", ".join(f"{name} {value:.5g}" for name, value in self.orders.items())
-        cells = f"{self.cells} boxes of orders"
+        box_text = f"{self.cells} boxes of orders"
         if self.lower_bound == 0:
             return (
                 f"certificate: nothing is proved of all orders with {intervals} ({separations}): {self.open_cells} of "
-                f"{cells} are left; narrow the intervals, keep orders farther apart, or allow more boxes"
+                f"{box_text} are left; narrow the intervals, keep orders farther apart, or allow more boxes"
             )
         # Rounded up, so that the printed bound holds.
-        share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
+        percent = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
             f"certificate: no orders with {intervals} ({separations}), on the order grid or between, have an RMS "
             f"equation error below {self.lower_bound:.5g} with coefficients whose terms are together at most "
             f"{self.max_term_ratio:g} times the output; {orders_text} leave {self.best:.5g}, so nothing is better by "
-            f"more than {share:g} % ({cells})"
+            f"more than {percent:g} % ({box_text})"
         )
         if self.open_cells:
             text += (
@@ -291,7 +293,7 @@ class SearchResult(BestIdentification):
         """
         distinct: list[tuple[SearchRow, int]] = []
         for row in self.table:
-            at = next((k for k, (other, _) in enumerate(distinct) if _is_same_model(row, other)), None)
+            at = next((k for k, (kept_row, _) in enumerate(distinct) if _is_same_model(row, kept_row)), None)
             if at is None:
                 distinct.append((row, 1))
             else:
@@ -324,14 +326,18 @@ class SearchResult(BestIdentification):
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)
-        what = "error" if self.settings["norm"] == "l1" else "RMSE"
-        head = f"{'rank':>4}{what:>12}" + "".join(f"{n:>9}" for n in names) + "".join(f"{n:>12}" for n in coefficients)
+        criterion_text = "error" if self.settings["norm"] == "l1" else "RMSE"
+        head = (
+            f"{'rank':>4}{criterion_text:>12}"
+            + "".join(f"{n:>9}" for n in names)
+            + "".join(f"{n:>12}" for n in coefficients)
+        )
         lines = [head]
         for row, count in self.distinct_rows:
             orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
             values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
-            more = f"  (and {count - 1} more row{'s' if count > 2 else ''})" if count > 1 else ""
-            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}{more}")
+            further_rows = f"  (and {count - 1} more row{'s' if count > 2 else ''})" if count > 1 else ""
+            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}{further_rows}")
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.excluded_summary}")
         if self.verdict is not None:
             lines.append(f"rank 1: {self.verdict}")
@@ -407,8 +413,8 @@ class StoreStatus:
         return {**asdict(self), "complete": self.complete}
 
     def __str__(self) -> str:
-        share = 100 * self.done_count / self.candidates
-        text = f"{self.name}: {self.done_count} of {self.candidates} candidates done ({share:.1f} %)"
+        percent = 100 * self.done_count / self.candidates
+        text = f"{self.name}: {self.done_count} of {self.candidates} candidates done ({percent:.1f} %)"
         text += "" if self.best is None else f", best score {self.best:.6g}"
         text += f", runs {', '.join(self.runs)}"
         if self.corruption is not None:
@@ -485,5 +491,5 @@ def search_html(result: SearchResult) -> str:
         if reason == "bound" and result.excluded_by_box:
             rows.append(["of these in boxes excluded whole", result.excluded_by_box])
     name = result.model.outputs[0] if len(result.model.outputs) == 1 else "stage"
-    rest = Table(f"{result.candidates} candidates", ("outcome", "count"), rows)
-    return str(search_top(name, result).to_html() + rest.to_html())
+    outcome_table = Table(f"{result.candidates} candidates", ("outcome", "count"), rows)
+    return str(search_top(name, result).to_html() + outcome_table.to_html())

@@ -122,8 +122,8 @@ def free_run_score(
     for name, scale in zip(model.outputs, scales, strict=True):
         residuals = np.concatenate([e[name] for e in errors])
         with np.errstate(over="ignore", invalid="ignore"):
-            own = float(np.abs(residuals).sum()) if norm == "l1" else math.sqrt(float(np.mean(residuals**2)))
-        score += own / scale
+            error_measure = float(np.abs(residuals).sum()) if norm == "l1" else math.sqrt(float(np.mean(residuals**2)))
+        score += error_measure / scale
     return score if math.isfinite(score) else math.inf
 
 
@@ -222,9 +222,9 @@ class Job:
 
     def equation_problem(self) -> EquationProblem:
         """Return the search problem of the single equation, in the form that the Rust core takes."""
-        item = self.structure.equations[0]
-        orders = order_grid_tuple(item, self.records[0].signals, self.values)
-        return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed for t in item.terms])
+        equation = self.structure.equations[0]
+        orders = order_grid_tuple(equation, self.records[0].signals, self.values)
+        return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed for t in equation.terms])
 
     def coupled_problem(self) -> CoupledProblem:
         """Return the search problem of the coupled equations, in the form that the Rust core takes.
@@ -262,18 +262,19 @@ class Job:
 
         Deviations are taken from the mean of each record. Raise ModelError if a standard deviation is 0 or not finite.
         """
-        points, spreads = sum(r.m for r in self.records), []
+        points, deviations = sum(r.m for r in self.records), []
         for output in self.structure.outputs:
             with np.errstate(over="ignore", invalid="ignore"):
                 squares = sum(float(((r.of(output) - r.of(output).mean()) ** 2).sum()) for r in self.records)
-            spread = math.sqrt(squares / points)
-            if not 0 < spread < math.inf:
+            deviation = math.sqrt(squares / points)
+            if not 0 < deviation < math.inf:
                 raise ModelError(
-                    f"the deviation of {output} is {spread:g}; scale the signal so that its squares neither overflow "
+                    f"the deviation of {output} is {deviation:g}; scale the signal so that its squares neither "
+                    "overflow "
                     "nor underflow"
                 )
-            spreads.append(spread)
-        return spreads
+            deviations.append(deviation)
+        return deviations
 
 
 def check_executor(executor: object) -> None:
@@ -304,8 +305,8 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
     settings = job.settings
     if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
         count = max(settings.top, FREE_RUN_CANDIDATES)
-        first = replace(job, settings=replace(settings, criterion="equation-error", top=count))
-        ranked = run_job(first, store=store, number=number, executor=executor)
+        preliminary_job = replace(job, settings=replace(settings, criterion="equation-error", top=count))
+        ranked = run_job(preliminary_job, store=store, number=number, executor=executor)
         table = rank_by_free_runs(ranked.table, job.structure, job.records, settings.norm, job.scales())
         counts = {"candidates": ranked.candidates, "kept": min(settings.top, len(table)), **ranked.exclusion_counts}
         counts["diverged"] += len(ranked.table) - len(table)
@@ -315,24 +316,24 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
         return replace(result, free_runs=len(ranked.table))
     execution = Execution(store, number, executor, job.progress)
     if job.structure.has_order_law:
-        stage = search_coupled(job.coupled_problem(), execution)
-        return _result(job, *_stage_rows(job.structure, stage), stage["counts"], 0)
+        found_stage = search_coupled(job.coupled_problem(), execution)
+        return _result(job, *_stage_rows(job.structure, found_stage), found_stage["counts"], 0)
     try:
-        one = search_equation(job.equation_problem(), execution)
+        found = search_equation(job.equation_problem(), execution)
     except ModelError as error:
         raise named_signals(error, job.records[0].signals) from None
-    return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])
+    return _result(job, *_equation_rows(job.structure, found), found["counts"], found["boxed"])
 
 
-def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[SearchRow], Failures]:
+def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[SearchRow], Failures]:
     """Return (table rows, failures) of the search of one equation from the result of the Rust core.
 
     Orders and coefficients have names. A failure is (orders by name, reason).
     """
-    item = structure.equations[0]
+    equation = structure.equations[0]
 
     def orders_by_name(alpha: float, orders: list[float]) -> dict[str, float]:
-        return {o.names[0]: v for o, v in zip(item.orders, (alpha, *orders), strict=True) if o.names}
+        return {o.names[0]: v for o, v in zip(equation.orders, (alpha, *orders), strict=True) if o.names}
 
     table = [
         SearchRow(
@@ -340,25 +341,25 @@ def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[Sea
             row["index"],
             row["score"],
             orders_by_name(row["alpha"], row["orders"]),
-            named_coefficients(item, row["coefficients"]),
+            named_coefficients(equation, row["coefficients"]),
         )
-        for rank, row in enumerate(answer["rows"], 1)
+        for rank, row in enumerate(found["rows"], 1)
     ]
-    return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in answer["failures"]]
+    return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
 
 
-def _stage_rows(structure: Structure, answer: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
+def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
     """Return (table rows, failures) of the search of coupled equations from the result of the Rust core.
 
     Free orders and coefficients have names. A failure is (free orders by name, reason).
     """
     names, table = structure.order_names, []
-    for rank, (index, score, free, parts) in enumerate(answer["rows"], 1):
+    for rank, (index, score, free, equation_results) in enumerate(found["rows"], 1):
         coefficients: dict[str, float] = {}
-        for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
-            coefficients |= named_coefficients(item, c)
+        for equation, (_, _, _, c, _) in zip(structure.equations, equation_results, strict=True):
+            coefficients |= named_coefficients(equation, c)
         table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
-    return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in answer["failures"]]
+    return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in found["failures"]]
 
 
 def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core._Counts, boxed: int) -> SearchResult:
@@ -655,11 +656,11 @@ def score_profiles(
         x, scores = np.array(values), np.full(len(values), math.nan)
         for row in rows:
             scores[np.abs(x - row.orders[name]).argmin()] = row.score
-        chosen = np.where(x == x[np.abs(x - best[name]).argmin()], scores, math.nan)
+        minimum_scores = np.where(x == x[np.abs(x - best[name]).argmin()], scores, math.nan)
         charts.append(
             LineChart(
                 x,
-                [("score", scores), ("rank 1", chosen)],
+                [("score", scores), ("rank 1", minimum_scores)],
                 title=f"Score over {symbol(name)}",
                 x_label=f"order {symbol(name)}",
                 y_label="score" if len(structure.equations) > 1 else score,
@@ -691,12 +692,12 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
     """
     if not isinstance(progress, Progress) or progress.quiet:
         return
-    least = most = 0.0
+    lower_total = upper_total = 0.0
     for number, job in enumerate(jobs):
         fraction = 1.0 if store is None else _remaining_fraction(job, store, number)
         low, high = expected_seconds(job) if fraction > 0 else (0.0, 0.0)
-        least, most = least + fraction * low, most + fraction * high
-    progress.expect("the search", least, most)
+        lower_total, upper_total = lower_total + fraction * low, upper_total + fraction * high
+    progress.expect("the search", lower_total, upper_total)
 
 
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
@@ -705,18 +706,20 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
     The time is extrapolated from searches on finer and finer subsets of the grid, each with at most the fraction
     `MAX_PROBE_FRACTION` of all candidates. The last of these searches is the first that takes `PROBE_TIME_S` seconds.
     """
-    whole = _candidates(job)
+    candidate_count = _candidates(job)
     trials: list[tuple[float, float]] = []
-    for every in SUBSAMPLING_FACTORS:
-        part = replace(job, values={name: axis[::every] for name, axis in job.values.items()}, progress=None)
+    for factor in SUBSAMPLING_FACTORS:
+        subsampled_job = replace(job, values={name: axis[::factor] for name, axis in job.values.items()}, progress=None)
         try:
-            count = _candidates(part)
+            count = _candidates(subsampled_job)
             if trials and count <= trials[-1][0]:
                 continue
-            if count > MAX_PROBE_FRACTION * whole:
+            if count > MAX_PROBE_FRACTION * candidate_count:
                 break
             start_time = clock()
-            (part.coupled_problem() if job.structure.has_order_law else part.equation_problem()).search(None)
+            (
+                subsampled_job.coupled_problem() if job.structure.has_order_law else subsampled_job.equation_problem()
+            ).search(None)
         except FtlmError:
             # A grid this coarse may have no candidate, or none with a finite score.
             continue
@@ -725,17 +728,17 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
             break
     if not trials:
         return 0.0, 0.0
-    (count, took), power = trials[-1], TIME_EXPONENT_RANGE[1]
+    (count, elapsed), power = trials[-1], TIME_EXPONENT_RANGE[1]
     if len(trials) > 1 and trials[-2][1] > 0:
-        power = math.log(max(took / trials[-2][1], 1e-9)) / math.log(count / trials[-2][0])
+        power = math.log(max(elapsed / trials[-2][1], 1e-9)) / math.log(count / trials[-2][0])
         power = min(max(power, TIME_EXPONENT_RANGE[0]), TIME_EXPONENT_RANGE[1])
-    extrapolated = took * (whole / count) ** power
+    extrapolated = elapsed * (candidate_count / count) ** power
     boxed = (
         extrapolated
-        if whole < BOX_EXCLUSION_CANDIDATES
-        else took
+        if candidate_count < BOX_EXCLUSION_CANDIDATES
+        else elapsed
         * (BOX_EXCLUSION_CANDIDATES / count) ** power
-        * (whole / BOX_EXCLUSION_CANDIDATES) ** BOX_TIME_EXPONENT
+        * (candidate_count / BOX_EXCLUSION_CANDIDATES) ** BOX_TIME_EXPONENT
     )
     return TIME_FACTOR_RANGE[0] * boxed, TIME_FACTOR_RANGE[1] * extrapolated
 

@@ -141,12 +141,12 @@ def residual_rows(
     for k, (run, _, _) in enumerate(comparison.per_run):
         for name in comparison.output_error:
             residual = comparison.measured[name][k] - comparison.simulated[name][k]
-            what = f"Residual of {symbol(name)}{suffix}, {run}"
+            residual_title = f"Residual of {symbol(name)}{suffix}, {run}"
             axis = with_unit(f"residual of {symbol(name)}", units, name)
             over_time = LineChart(
                 pulse_times(comparison, k),
                 [("", residual)],
-                title=f"{what}: over time",
+                title=f"{residual_title}: over time",
                 x_label="time [s]",
                 y_label=axis,
                 points=points,
@@ -155,8 +155,10 @@ def residual_rows(
             )
             rows.append([over_time])
             if np.sum(np.isfinite(residual)) >= 2:
-                words = "Line: the normal curve of the same mean and deviation."
-                rows[-1].append(histogram(residual, title=f"{what}: histogram", x_label=axis, caption=words))
+                caption = "Line: the normal curve of the same mean and deviation."
+                rows[-1].append(
+                    histogram(residual, title=f"{residual_title}: histogram", x_label=axis, caption=caption)
+                )
     return rows
 
 
@@ -267,7 +269,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
     label
         Role of the data, such as "validation".
     """
-    return [correlation_chart(*each, label=label) for each in tests.tests]
+    return [correlation_chart(*test, label=label) for test in tests.tests]
 
 
 def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
@@ -276,11 +278,11 @@ def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label:
     An empty `signal` stands for the residual itself (autocorrelation).
     """
     # Lag 0 of an autocorrelation is omitted, because its value is always 1.
-    keep = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
-    values = test.values[keep]
+    is_shown = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
+    values = test.values[is_shown]
     band = np.full(values.size, test.band)
     return LineChart(
-        test.lags[keep].astype(np.float64),
+        test.lags[is_shown].astype(np.float64),
         [("", values)],
         title=f"Residual of {symbol(output)} with {symbol(signal) or 'itself'}{f', {label}' if label else ''}",
         x_label="lag [samples]",
@@ -299,19 +301,24 @@ def _residual_caption(test: CorrelationTest, values: Floats, signal: str) -> str
     An empty `signal` stands for the residual itself.
     """
     if not test.conclusive:
-        why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
-        return f"Whether the residual follows {signal} is undecided: {why}."
+        reason = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
+        return f"Whether the residual follows {signal} is undecided: {reason}."
     if not np.isfinite(test.statistic):
         return "The residual is not finite, so there are no correlations."
-    outside = int(np.sum(np.abs(values) > test.band))
-    bars = f"Shade: 99 % band of one bar; {outside} of {values.size} bars leave{'s' if outside == 1 else ''} it."
+    outside_count = int(np.sum(np.abs(values) > test.band))
+    bars = (
+        f"Shade: 99 % band of one bar; {outside_count} of {values.size} bars "
+        f"leave{'s' if outside_count == 1 else ''} it."
+    )
     if signal:
-        word = "could be independent of" if test.passed else "is not independent of"
+        verdict_text = "could be independent of" if test.passed else "is not independent of"
         result = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
-        return f"{bars} The residual {word} earlier {signal}: {result} (99 %, both through the whitening filter)."
-    word = "could be" if test.passed else "is not"
+        return (
+            f"{bars} The residual {verdict_text} earlier {signal}: {result} (99 %, both through the whitening filter)."
+        )
+    verdict_text = "could be" if test.passed else "is not"
     result = f"statistic {number(test.statistic)}, limit {number(test.limit)}"
-    return f"{bars} The residual {word} white noise: {result} (99 %)."
+    return f"{bars} The residual {verdict_text} white noise: {result} (99 %)."
 
 
 def run_charts(run: Run, *signals: str) -> Figures:
@@ -319,9 +326,11 @@ def run_charts(run: Run, *signals: str) -> Figures:
 
     Raise DataError if the run lacks a signal.
     """
-    unknown = [name for name in signals if name not in run]
-    if unknown:
-        raise DataError(f"signal {unknown[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}")
+    unknown_names = [name for name in signals if name not in run]
+    if unknown_names:
+        raise DataError(
+            f"signal {unknown_names[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}"
+        )
     return Figures(signal_chart(run, name) for name in signals or (*run.outputs, *run.inputs))
 
 
@@ -355,9 +364,9 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         return {}
     rows, bands = np.flatnonzero(np.diag(covariance)), {}
     for name, (matrix,) in sensitivities.items():
-        middle = comparison.simulated[name][0]
+        nominal = comparison.simulated[name][0]
         variance = np.einsum("kt,kl,lt->t", matrix, covariance[np.ix_(rows, rows)], matrix)
         half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         if np.all(np.isfinite(half)):
-            bands[name] = (middle - half, middle + half)
+            bands[name] = (nominal - half, nominal + half)
     return bands

@@ -141,9 +141,9 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
             axis.vlines(x, 0, values, color=color, linewidth=1.2)
             axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
         elif name in chart.dots:
-            there = np.isfinite(values)
+            is_finite = np.isfinite(values)
             dots = {"fillstyle": "none", "markersize": 4, "color": color, "label": label}
-            axis.plot(x[there], np.asarray(values)[there], "o", **dots)
+            axis.plot(x[is_finite], np.asarray(values)[is_finite], "o", **dots)
         else:
             dash = (0, [float(length) for length in dashes.split()]) if dashes else "-"
             drawn = {"drawstyle": "steps-post"} if chart.steps else {}
@@ -190,10 +190,10 @@ def _draw_plane(axis: Any, chart: PlaneChart) -> None:
 def _draw_bars(axis: Any, chart: BarChart) -> None:
     height, (low, high) = 0.8 / len(chart.tables), chart.axis_limits
     for i, (name, values) in enumerate(chart.tables):
-        places = np.arange(values.size) + (i - (len(chart.tables) - 1) / 2) * height
-        inside = np.clip(np.nan_to_num(values, nan=low), low, high) - low
+        positions = np.arange(values.size) + (i - (len(chart.tables) - 1) / 2) * height
+        clipped = np.clip(np.nan_to_num(values, nan=low), low, high) - low
         label = escape_math(name) if len(chart.tables) > 1 else None
-        bars = axis.barh(places, inside, height, low, color=LINE_STYLES[1 + i][0], label=label)
+        bars = axis.barh(positions, clipped, height, low, color=LINE_STYLES[1 + i][0], label=label)
         axis.bar_label(bars, [f"{v:.4g}" for v in values], fontsize="small", padding=3)
     axis.set_yticks(range(len(chart.names)), [escape_math(n) for n in chart.names])
     axis.invert_yaxis()
@@ -294,9 +294,9 @@ def fit(
                 replace(lower, title="", y_label="residual"),
             ]
             heights += [1.0, RESIDUAL_HEIGHT_SHARE]
-        own = [signal_chart(runs_of_result[k], name) for name in runs_of_result[k].inputs] if inputs else []
-        charts += own
-        heights += [0.7] * len(own)
+        input_charts = [signal_chart(runs_of_result[k], name) for name in runs_of_result[k].inputs] if inputs else []
+        charts += input_charts
+        heights += [0.7] * len(input_charts)
     return draw_figure([[chart] for chart in charts], ax, row=ROW_HEIGHT_INCH * 0.75, height_ratios=heights)
 
 
@@ -361,8 +361,8 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     if results is None:
         raise ModelError("the runs were too short for residual tests; give longer runs to draw them")
     rows = [
-        [correlation_chart(*each, label=each[-1].verdict) for each in tests_of_one]
-        for _, tests_of_one in groupby(results.tests, key=lambda each: each[0])
+        [correlation_chart(*test_arguments, label=test_arguments[-1].verdict) for test_arguments in tests_of_one]
+        for _, tests_of_one in groupby(results.tests, key=lambda test_arguments: test_arguments[0])
     ]
     return draw_figure(rows, ax)
 
@@ -402,8 +402,8 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         name = next(iter(result.searches)) if output is None else output
         if name not in result.searches:
             raise ModelError(f"there is no order search {name!r}; the searches are {', '.join(result.searches)}")
-        part = result.task.structure if name == "stage" else result.task.structure.equation(name)
-        surface = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
+        group = result.task.structure if name == "stage" else result.task.structure.equation(name)
+        surface = scores_of(result.task.runs, group, result.searches[name], result.task.part_order_grid(group))
     if surface is None:
         raise ModelError("this fit has no two free orders with standard errors; free two orders to draw them")
     return draw_figure([[surface]], ax, row=3.2)
@@ -656,17 +656,24 @@ def _spectrum_chart(result: DesignedInput) -> LineChart:
     spectrum is included if it has power.
     """
     rows, lines = result.run.length - 1, result.spectrum.lines.frequencies
-    every = np.fft.rfftfreq(rows, result.step)
-    shown = (every >= lines.min()) & (every <= lines.max())
+    all_frequencies = np.fft.rfftfreq(rows, result.step)
+    is_shown = (all_frequencies >= lines.min()) & (all_frequencies <= lines.max())
     drawn: list[tuple[str, ArrayLike]] = []
     for name, run in ((result.reference.name, result.reference), ("designed", result.run)):
         power = np.sum([np.abs(np.fft.rfft(run[n][:rows])) ** 2 for n in run.inputs], axis=0)
-        drawn.append((name, (np.cumsum(power[1:]) / np.sum(power[1:]))[shown[1:]]))
+        drawn.append((name, (np.cumsum(power[1:]) / np.sum(power[1:]))[is_shown[1:]]))
     order = np.argsort(lines)
-    best = np.cumsum(result.spectrum.power[order])
-    if best[-1] > 0:
-        drawn.append(("best periodic", np.interp(every[shown], lines[order], best / best[-1])))
-    return LineChart(every[shown], drawn, title="Spectrum", x_label="frequency [Hz]", y_label="power below", log_x=True)
+    cumulative_power = np.cumsum(result.spectrum.power[order])
+    if cumulative_power[-1] > 0:
+        drawn.append(
+            (
+                "best periodic",
+                np.interp(all_frequencies[is_shown], lines[order], cumulative_power / cumulative_power[-1]),
+            )
+        )
+    return LineChart(
+        all_frequencies[is_shown], drawn, title="Spectrum", x_label="frequency [Hz]", y_label="power below", log_x=True
+    )
 
 
 @check_arguments

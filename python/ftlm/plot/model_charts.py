@@ -41,8 +41,8 @@ def response_frequencies(model: Model, step: float | None = None, duration: floa
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
     corner = []
     for pairs in transfer_functions(model).denominator.values():
-        (top, high), (bottom, low) = pairs[0], pairs[-1]
-        corner.append(abs(bottom / top) ** (1 / (high - low)) if high > low else 1.0)
+        (highest, high), (lowest, low) = pairs[0], pairs[-1]
+        corner.append(abs(lowest / highest) ** (1 / (high - low)) if high > low else 1.0)
     middle = float(np.exp(np.mean(np.log(corner))))
     return np.geomspace(middle / 100, middle * 100, 240)
 
@@ -70,8 +70,8 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
     for curve in curves:
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
         gain, phase = [("", curve.gain)], [("", curve.phase)]
-        charts.append(frequency_chart(f"{title}: gain", "gain [dB]", omega, gain, curve.gain_spread))
-        charts.append(frequency_chart(f"{title}: phase", "phase [degrees]", omega, phase, curve.phase_spread))
+        charts.append(frequency_chart(f"{title}: gain", "gain [dB]", omega, gain, curve.gain_band))
+        charts.append(frequency_chart(f"{title}: phase", "phase [degrees]", omega, phase, curve.phase_band))
     return charts
 
 
@@ -86,8 +86,8 @@ def pole_points(model: Model) -> tuple[float, Complex]:
     for m in model_modes:
         angle = math.acos(max(-1.0, min(1.0, -m.damping)))
         # The zero of a relaxation of fractional order may have |arg s| > pi. It is drawn on the negative axis of s^q.
-        turn = math.pi if not m.oscillatory and not m.unstable else q * angle
-        value = m.frequency**q * complex(math.cos(turn), math.sin(turn))
+        pole_angle = math.pi if not m.oscillatory and not m.unstable else q * angle
+        value = m.frequency**q * complex(math.cos(pole_angle), math.sin(pole_angle))
         points += [value, value.conjugate()] if m.oscillatory else [complex(value.real)]
     return q, np.array(points, dtype=np.complex128)
 
@@ -109,11 +109,13 @@ def pole_charts(model: Model) -> list[PlaneChart]:
         return []
     model_modes = modes(model)
     plane = "s" if q == 1 else f"s^{q:.4g}"
-    inside = sum(m.unstable for m in model_modes)
-    words = (
-        "it has no pole" if not inside else f"it has {inside} of {len(model_modes)} modes, so the model is not stable"
+    unstable_count = sum(m.unstable for m in model_modes)
+    texts = (
+        "it has no pole"
+        if not unstable_count
+        else f"it has {unstable_count} of {len(model_modes)} modes, so the model is not stable"
     )
-    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, the unstable sector; {words}."
+    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, the unstable sector; {texts}."
     if q != 1:
         caption += f" A relaxation is drawn at −T^−{q:.4g}."
     unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
@@ -134,8 +136,8 @@ def plane_order(model: Model) -> float:
     orders = [e.order.constant for e in model.equations]
     orders += [t.order.constant for e in model.equations for t in e.terms]
     highest = max(orders)
-    whole = all(abs(o - round(o)) < 1e-9 for o in orders) or highest <= 0
-    return 1.0 if whole else round(highest / math.ceil(highest - 1e-9), 4)
+    is_integer = all(abs(o - round(o)) < 1e-9 for o in orders) or highest <= 0
+    return 1.0 if is_integer else round(highest / math.ceil(highest - 1e-9), 4)
 
 
 @dataclass(frozen=True)
@@ -149,8 +151,8 @@ class BodeCurve:
     input: str
     gain: Floats
     phase: Floats
-    gain_spread: Floats | None
-    phase_spread: Floats | None
+    gain_band: Floats | None
+    phase_band: Floats | None
 
 
 def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
@@ -159,7 +161,7 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
     Friction forces, which are inputs of the linear part, are omitted.
     """
     response = frequency_response(model, omega)
-    spread = None if covariance_of(model) is None else response_deviation(model, omega)
+    deviation = None if covariance_of(model) is None else response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
     curves = []
     for i, output in enumerate(model.outputs):
@@ -170,10 +172,13 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 gain = 20 * np.log10(np.abs(h))
             phase = np.degrees(np.unwrap(np.angle(np.where(np.isfinite(h), h, 1.0))))
-            widths: tuple[Floats | None, Floats | None] = (None, None)
-            if spread is not None:
-                widths = (DECIBELS_PER_NEPER * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
-            curves.append(BodeCurve(output, name, gain, phase, *widths))
+            half_widths: tuple[Floats | None, Floats | None] = (None, None)
+            if deviation is not None:
+                half_widths = (
+                    DECIBELS_PER_NEPER * NORMAL_95 * deviation[0][i, j],
+                    np.degrees(NORMAL_95 * deviation[1][i, j]),
+                )
+            curves.append(BodeCurve(output, name, gain, phase, *half_widths))
     return curves
 
 
@@ -235,17 +240,17 @@ def response_charts(result: Response, *, units: Mapping[str, str] | None = None)
     ]
 
 
-def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
+def response_chart(response: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
     """Return the chart of the response of output i to input j (indices), with its 95 % band if it is known."""
-    output, values = found.outputs[i], found.values[i, j]
+    output, values = response.outputs[i], response.values[i, j]
     bands, shade = [], "No covariance, so there is no band."
-    if found.deviation is not None:
-        half = NORMAL_95 * found.deviation[i, j]
+    if response.deviation is not None:
+        half = NORMAL_95 * response.deviation[i, j]
         bands, shade = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
     return LineChart(
-        found.time,
+        response.time,
         [("", values)],
-        title=f"{symbol(output)} after a unit {found.kind} of {symbol(found.inputs[j])}",
+        title=f"{symbol(output)} after a unit {response.kind} of {symbol(response.inputs[j])}",
         x_label="time [s]",
         y_label=with_unit(symbol(output), units, output),
         caption=shade,
@@ -282,13 +287,13 @@ class TimeResponse(Response):
             for j, signal in enumerate(self.inputs):
                 values = self.values[i, j]
                 at = int(np.argmax(np.abs(values)))
-                last, error = values[-1], None if self.deviation is None else self.deviation[i, j, -1]
+                final_value, error = values[-1], None if self.deviation is None else self.deviation[i, j, -1]
                 name = f"value at {self.time[-1]:.4g} s"
                 if (output, signal) in self.final_values:
-                    (last, error), name = self.final_values[output, signal], "final value"
+                    (final_value, error), name = self.final_values[output, signal], "final value"
                 uncertainty = f" ± {error:.2g}" if error else ""
                 lines.append(
-                    f"  {output} from {signal}: {name} {last:.5g}{uncertainty}, "
+                    f"  {output} from {signal}: {name} {final_value:.5g}{uncertainty}, "
                     f"peak {values[at]:.5g} at {self.time[at]:.4g} s"
                 )
         return "\n".join(lines)

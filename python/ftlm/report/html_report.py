@@ -73,13 +73,15 @@ MAX_RESPONSE_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
-def verdict_box(judgement: Verdict, of: str = "") -> Markup:
-    """Return a verdict as an HTML box for the top of a page; the prefix `of` names one of several models."""
-    remedy = Markup(' <span class="todo">→ {}</span>').format(typeset(judgement.remedy)) if judgement.remedy else ""
+def verdict_box(verdict_shown: Verdict, subject: str = "") -> Markup:
+    """Return a verdict as an HTML box for the top of a page; the prefix `subject` names one of several models."""
+    remedy = (
+        Markup(' <span class="todo">→ {}</span>').format(typeset(verdict_shown.remedy)) if verdict_shown.remedy else ""
+    )
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LEVEL_CSS_CLASSES[judgement.level],
-        f"{of}{judgement.level}" if of else judgement.level.capitalize(),
-        typeset(judgement.reason),
+        _LEVEL_CSS_CLASSES[verdict_shown.level],
+        f"{subject}{verdict_shown.level}" if subject else verdict_shown.level.capitalize(),
+        typeset(verdict_shown.reason),
         remedy,
     )
 
@@ -89,16 +91,16 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
 
     The first list has one sentence with its remedy for each of the `MAX_SUMMARY_FINDINGS` most serious groups.
     """
-    first: list[str] = []
-    rest: list[str] = []
+    main: list[str] = []
+    further: list[str] = []
     for k, group in enumerate(group_findings(findings)):
         if k >= MAX_SUMMARY_FINDINGS:
-            rest += texts(group.findings)
+            further += texts(group.findings)
             continue
         todo = Markup(' <span class="todo">→ {}</span>').format(typeset(group.remedy)) if group.remedy else Markup("")
-        first.append(Markup("{}{}{}").format(typeset(group.first_finding.text), group.count, todo))
-        rest += texts(group.findings[1:])
-    return first, rest
+        main.append(Markup("{}{}{}").format(typeset(group.first_finding.text), group.count, todo))
+        further += texts(group.findings[1:])
+    return main, further
 
 
 def title_of(model: Model) -> str:
@@ -107,8 +109,8 @@ def title_of(model: Model) -> str:
     if structure.name != "equation":
         return structure.name
     inputs = [s for s in structure.signals if s not in structure.outputs]
-    driven = f" from {', '.join(map(symbol, inputs))}" if inputs else ""
-    return f"Model of {', '.join(map(symbol, structure.outputs))}{driven}"
+    inputs_text = f" from {', '.join(map(symbol, inputs))}" if inputs else ""
+    return f"Model of {', '.join(map(symbol, structure.outputs))}{inputs_text}"
 
 
 def behavior_tables(model: Model) -> list[Table]:
@@ -129,9 +131,9 @@ def behavior_tables(model: Model) -> list[Table]:
     if states:
         rows: list[list[Cell]] = []
         for state in states:
-            above, below = (model.units.get(n, "") for n in (state.output, state.input))
+            output_unit, input_unit = (model.units.get(n, "") for n in (state.output, state.input))
             pair = Markup("{} from {}").format(symbol_html(state.output), symbol_html(state.input))
-            unit = f"{above}/{below}" if above and below else ""
+            unit = f"{output_unit}/{input_unit}" if output_unit and input_unit else ""
             uncertainty = describe_order(state)
             if state.order > 0:
                 runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
@@ -140,8 +142,8 @@ def behavior_tables(model: Model) -> list[Table]:
                 )
             else:
                 decays = state.order < 0
-                what = "0: the response decays to zero" if decays else "gain"
-                rows.append([pair, state.gain, None if decays else state.error, unit, f"{what}{uncertainty}"])
+                text = "0: the response decays to zero" if decays else "gain"
+                rows.append([pair, state.gain, None if decays else state.error, unit, f"{text}{uncertainty}"])
         tables.append(
             Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
         )
@@ -240,18 +242,18 @@ def identification_page(
         The file that was written.
     """
     check_free(path, force=force)
-    others = [] if validation is None else as_runs(validation)
-    comparisons = [validate(result, run) for run in others] or ([] if validated is None else [validated])
-    pooled = validate(result, others) if len(others) > 1 else comparisons[0] if comparisons else None
+    validation_runs = [] if validation is None else as_runs(validation)
+    comparisons = [validate(result, run) for run in validation_runs] or ([] if validated is None else [validated])
+    pooled = validate(result, validation_runs) if len(validation_runs) > 1 else comparisons[0] if comparisons else None
     # Findings name options in the words of a page. Errors, above and in writing, are for the caller.
     with use_interface("report"):
-        page = _identification_content(result, others, comparisons, pooled, sections, choice_findings)
+        page = _identification_content(result, validation_runs, comparisons, pooled, sections, choice_findings)
     return page.write(path, force=force)
 
 
 def _identification_content(
     result: Identification,
-    others: Sequence[Run],
+    validation_runs: Sequence[Run],
     comparisons: Sequence[Comparison],
     pooled: Comparison | None,
     sections: Sequence[Section],
@@ -263,33 +265,40 @@ def _identification_content(
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
         findings.append(make_finding("errors_undefined", parameter=", ".join(undefined)))
-    for run, comparison in zip(others, comparisons, strict=False):
+    for run, comparison in zip(validation_runs, comparisons, strict=False):
         findings += on_validation([*comparison.findings, *data_notes(run)], run.name)
     compared = [("estimation", result.comparison), *(("validation", c) for c in comparisons)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
-    tests += tests_on(model, others)
-    judgement = verdict(result, pooled)
+    tests += tests_on(model, validation_runs)
+    overall_verdict = verdict(result, pooled)
     task = result.task
-    runs = [*(() if task is None else task.runs), *others]
-    bands = [confidence_bands(model, run, c) for run, c in zip(others, comparisons, strict=False)]
-    first = first_sections(model, findings, compared, bool(comparisons), result.joint, runs, bands, result.offsets)
-    collapsed = [section for section in first if section.collapsed]
-    first = [*first[: len(first) - len(collapsed)], *sections, *_order_search_sections(result), *collapsed]
+    runs = [*(() if task is None else task.runs), *validation_runs]
+    bands = [confidence_bands(model, run, c) for run, c in zip(validation_runs, comparisons, strict=False)]
+    first_parts = first_sections(
+        model, findings, compared, bool(comparisons), result.joint, runs, bands, result.offsets
+    )
+    collapsed = [section for section in first_parts if section.collapsed]
+    first_parts = [
+        *first_parts[: len(first_parts) - len(collapsed)],
+        *sections,
+        *_order_search_sections(result),
+        *collapsed,
+    ]
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.joint)
-    steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
-    details += frequency_sections(model, steps)
+    sampling = [(r.step, r.duration) for r in ((() if task is None else task.runs) or validation_runs)]
+    details += frequency_sections(model, sampling)
     details += _search_sections(result)
     titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return _content(model, judgement, compared, first, details)
+    return _content(model, overall_verdict, compared, first_parts, details)
 
 
 def _content(
     model: Model,
-    judgement: Verdict,
+    overall_verdict: Verdict,
     compared: Sequence[tuple[str, Comparison]],
     sections: Sequence[Section],
     details: Sequence[Section],
@@ -298,8 +307,8 @@ def _content(
 
     `compared` has (role of the data, comparison) pairs, whose fits are summarized below the title.
     """
-    every = [*sections, *(replace(section, collapsed=True) for section in details)]
-    return Page(title_of(model), every, lead_of(compared), verdict_box(judgement))
+    all_sections = [*sections, *(replace(section, collapsed=True) for section in details)]
+    return Page(title_of(model), all_sections, lead_of(compared), verdict_box(overall_verdict))
 
 
 def first_sections(
@@ -332,43 +341,48 @@ def first_sections(
         Offsets of the estimation runs by name.
     """
     units = model.units
-    words = [
+    verdict_texts = [
         "No check raised a warning. Checked: simulation against equation error, orders close to one another or on the "
         "edge of their interval, influence of the prior, coefficient law, residuals, stability of the scheme, the data."
     ]
     if not validated:
-        words.append("No validation run was given, so the prediction of other data is unknown.")
-    every = unique(findings)
-    warned, notes = ([f for f in every if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
-    findings_shown, rest = first_findings(warned)
-    words += [f"{note}." for note in texts(notes)]
+        verdict_texts.append("No validation run was given, so the prediction of other data is unknown.")
+    distinct_findings = unique(findings)
+    warned, notes = ([f for f in distinct_findings if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
+    findings_shown, further_findings = first_findings(warned)
+    verdict_texts += [f"{note}." for note in texts(notes)]
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
-    own = compared[0][1] if compared and compared[0][0] == "estimation" else None
-    equations = [*equations_html(model, None if own is None else own.offsets), stability_note(model)]
+    estimation_comparison = compared[0][1] if compared and compared[0][0] == "estimation" else None
+    equations = [
+        *equations_html(model, None if estimation_comparison is None else estimation_comparison.offsets),
+        stability_note(model),
+    ]
     validated_on = [(label, c) for label, c in compared if label == "validation"]
     fits = [(label, c) for label, c in compared if label != "validation"]
-    left_runs = list(runs)
-    figures_with_inputs = _with_inputs(model, fits, left_runs, points)
-    new = _with_inputs(model, validated_on, left_runs, points, bands)
-    first = new or figures_with_inputs
+    remaining_runs = list(runs)
+    figures_with_inputs = _with_inputs(model, fits, remaining_runs, points)
+    validation_figures = _with_inputs(model, validated_on, remaining_runs, points, bands)
+    main_figures = validation_figures or figures_with_inputs
     sections = []
-    if first:
-        left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
-        heading = "Validation: measured and simulated" if new else "Measured and simulated"
-        sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
+    if main_figures:
+        omission_text = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
+        heading = "Validation: measured and simulated" if validation_figures else "Measured and simulated"
+        sections.append(
+            Section(heading, omission_text if charts > PAGE_CHARTS else (), figures=main_figures[:PAGE_CHARTS])
+        )
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint, offsets)]),
-        Section("Warnings", words[bool(warned) :], findings_shown, more=rest),
+        Section("Warnings", verdict_texts[bool(warned) :], findings_shown, more=further_findings),
     ]
     if figures := behavior_figures(model):
         tables = behavior_tables(model)
         sections.append(Section("Gain, modes and steps", tables=tables, figures=figures, small=True, collapsed=True))
     if compared:
         sections.append(Section("Errors", tables=[errors_table(compared, units=units)], collapsed=True))
-    if new and figures_with_inputs:
-        figures = figures_with_inputs[: max(PAGE_CHARTS - len(new), 0)]
+    if validation_figures and figures_with_inputs:
+        figures = figures_with_inputs[: max(PAGE_CHARTS - len(validation_figures), 0)]
         sections.append(Section("Estimation: measured and simulated", figures=figures, collapsed=True))
     return sections
 
@@ -387,8 +401,8 @@ def _with_inputs(
     """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
     charts: list[Figure] = []
-    for place, (label, comparison) in enumerate(compared):
-        band = bands[place] if place < len(bands) else {}
+    for index, (label, comparison) in enumerate(compared):
+        band = bands[index] if index < len(bands) else {}
         figures = comparison_charts(comparison, units=model.units, label=label, points=points, bands=band)
         for k, (name, _, _) in enumerate(comparison.per_run):
             output_count = len(comparison.output_error)
@@ -407,13 +421,13 @@ def correlation_sections(joint: JointFit | None) -> list[Section]:
     """Return a section with the correlation matrix of the estimates; [] without a joint fit or for one parameter."""
     if joint is None or len(joint.names) < 2:
         return []
-    words = (
+    texts = (
         "Two parameters whose correlation is near 1 or −1 can change together with little effect on the fit. Their "
         "combination is then better determined than each of them."
     )
     values = np.clip(joint.correlation, -1.0, 1.0)
     figure = CorrelationMap(joint.names, values, title="Correlations of the estimates")
-    return [Section("Correlations of the estimates", words, figures=[figure], small=True)]
+    return [Section("Correlations of the estimates", texts, figures=[figure], small=True)]
 
 
 def residual_section(
@@ -432,8 +446,8 @@ def residual_section(
     figures = [f for label, c in compared for f in residual_series(c, units=units, label=label, points=SERIES_POINTS)]
     figures = figures[: SMALL_CHARTS // 2]
     figures += [f for label, t in tests for f in residual_charts(t, label=label)]
-    words = () if tests else "The runs are too short for residual tests."
-    return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
+    text = () if tests else "The runs are too short for residual tests."
+    return Section("Residuals", text, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
 
 
 def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> list[Section]:
@@ -447,25 +461,25 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
         return []
     orders = [order.constant for e in model.equations for order in e.orders]
     fractional = ", without an approximation of fractional orders" if any(order % 1.0 for order in orders) else ""
-    words = f"Exact response of all equations together{fractional}."
+    text = f"Exact response of all equations together{fractional}."
     effects = ["friction"] if structure.has_friction else []
     effects += list(dict.fromkeys(INPUT_EFFECT_LABELS[limit.law] for limit in structure.limits))
     if effects:
         model = linear_part(model)
-        needed = ["every output keeps its direction of motion"] if structure.has_friction else []
+        conditions = ["every output keeps its direction of motion"] if structure.has_friction else []
         if any(e.friction is not None and e.friction.stribeck is not None for e in structure.equations):
-            needed.append("moves faster than Stribeck's speed")
-        needed += ["the inputs stay between dead zone and saturation"] if structure.limits else []
-        words = (
+            conditions.append("moves faster than Stribeck's speed")
+        conditions += ["the inputs stay between dead zone and saturation"] if structure.limits else []
+        text = (
             f"Exact response of the linear part of the model, without {' and '.join(effects)}. Small deviations "
-            f"respond in this way while {' and '.join(needed)}."
+            f"respond in this way while {' and '.join(conditions)}."
         )
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     if model.estimate is None or model.estimate.covariance is None:
         has_errors = model.estimate is None or None not in model.estimate.standard_errors.values()
-        lacking = "This estimator gives no covariance" if has_errors else "The runs do not identify all parameters"
-        words += f" {lacking}, so there are no bands."
-    return [Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)]
+        reason = "This estimator gives no covariance" if has_errors else "The runs do not identify all parameters"
+        text += f" {reason}, so there are no bands."
+    return [Section("Frequency response", text, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)]
 
 
 def _search_sections(result: Identification) -> list[Section]:
@@ -476,20 +490,20 @@ def _search_sections(result: Identification) -> list[Section]:
     sections = []
     traces = _recursion_error_charts(result)
     if traces:
-        words = (
+        text = (
             "Error (45) of the simulation after every step of the recursion, at the orders found. p weighs the data "
             "against the prior; all lines end where the closed form is."
         )
-        sections.append(Section("Convergence of the recursion", words, figures=traces))
+        sections.append(Section("Convergence of the recursion", text, figures=traces))
     cost_landscape = output_error_landscape(result)
     if cost_landscape is not None:
         first, second = map(symbol, cost_landscape.names)
-        words = (
+        text = (
             f"The two orders with the most correlated estimates are {first} and {second}: their correlation is "
             f"{number(cost_landscape.correlation, 3)}. For white residuals the 95 % region of both ends at a score of "
             "7."
         )
-        sections.append(Section("Order landscape", words, figures=[cost_landscape], small=True))
+        sections.append(Section("Order landscape", text, figures=[cost_landscape], small=True))
     return sections
 
 
@@ -506,11 +520,11 @@ def _score_charts(task: Task, searches: Mapping[str, SearchResult]) -> list[Figu
     """Return charts of the score over each order, and over two orders for searches that vary two or more."""
     maps: list[Figure] = []
     for name, search in searches.items():
-        part = task.structure if name == "stage" else task.structure.equation(name)
-        own = task.part_order_grid(part) or OrderGrid()
-        maps += score_profiles(task.runs, part, search, own)
-        if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
-            maps.append(landscape(task.runs, part, search, own))
+        group = task.structure if name == "stage" else task.structure.equation(name)
+        group_grid = task.part_order_grid(group) or OrderGrid()
+        maps += score_profiles(task.runs, group, search, group_grid)
+        if sum(len(v) > 1 for v in group_grid.values(group).values()) >= 2:
+            maps.append(landscape(task.runs, group, search, group_grid))
     return maps
 
 
@@ -525,21 +539,21 @@ def _recursion_error_charts(result: Identification) -> list[LineChart]:
     if "offset" in result.settings:
         return []
     run, settings = result.task.runs[0], result.settings
-    every = max(1, int(settings["m"]) // TRACE_POINTS)
+    stride = max(1, int(settings["m"]) // TRACE_POINTS)
     options = {n: settings[n] for n in ("prior_covariance", "row_basis", "m")}
     figures = []
-    for solved in result.model.equations:
-        single = result.task.structure.equation(solved.output)
-        pairs = zip(single.equations[0].orders, solved.orders, strict=True)
-        orders = {o.names[0]: n.constant for o, n in pairs if o.names}
-        at_orders = single.with_orders(orders)
+    for identified in result.model.equations:
+        single_equation = result.task.structure.equation(identified.output)
+        order_pairs = zip(single_equation.equations[0].orders, identified.orders, strict=True)
+        orders = {o.names[0]: n.constant for o, n in order_pairs if o.names}
+        at_orders = single_equation.with_orders(orders)
         if not at_orders.coefficient_names:
             continue
         traces = [
-            (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
+            (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=stride, **options))
             for p in sorted({*COMPARED_INNOVATION_LENGTHS, int(settings["innovation_length"])})
         ]
-        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
+        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(identified.output)}, run {run.name}"))
     return figures
 
 
@@ -563,8 +577,10 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
         for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
             true_value = [truth.get(name)] if truth else []
-            spread = [v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)]
-            rows.append([symbol_html(name), value, *spread, *true_value])
+            error_and_interval = [
+                v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)
+            ]
+            rows.append([symbol_html(name), value, *error_and_interval, *true_value])
     columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
     if truth:
         columns, groups = [*columns, "true value"], [*groups, ("", 1)]
@@ -578,13 +594,13 @@ def grouped_findings(results: Mapping[str, Identification | None]) -> list[tuple
     """
     groups: dict[tuple[str, ...], tuple[Finding, list[str]]] = {}
     for label, result in results.items():
-        for item in () if result is None else result.findings:
-            note = item.text if item.level == LEVEL_NOTE else ""
-            key = (item.code, item.run, item.output, item.input, item.parameter, note)
-            groups.setdefault(key, (item, []))[1].append(label)
+        for finding in () if result is None else result.findings:
+            note = finding.text if finding.level == LEVEL_NOTE else ""
+            key = (finding.code, finding.run, finding.output, finding.input, finding.parameter, note)
+            groups.setdefault(key, (finding, []))[1].append(label)
     return [
-        (", ".join(dict.fromkeys(labels)), f"{item}{'' if len(labels) == 1 else ' (numbers of the first)'}")
-        for item, labels in groups.values()
+        (", ".join(dict.fromkeys(labels)), f"{finding}{'' if len(labels) == 1 else ' (numbers of the first)'}")
+        for finding, labels in groups.values()
     ]
 
 
@@ -594,8 +610,8 @@ MAX_STARTS_SHOWN = 10
 
 def starts_table(joint: JointFit) -> Table:
     """Return a table of the best automatic initial guesses of a fit, with their costs on subsampled records."""
-    best = joint.starts[:MAX_STARTS_SHOWN]
-    cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best, 1)]
+    best_starts = joint.starts[:MAX_STARTS_SHOWN]
+    cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best_starts, 1)]
     note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
     return Table("Automatic initial guesses", ("rank", "start from", "cost per residual"), cells, note=note)
 
@@ -631,30 +647,30 @@ _INDEPENDENCE_PHRASES = {"yes": "independent of", "no": "not independent of", "u
 def identification_html(result: Identification) -> str:
     """Return an identification as HTML for notebooks: verdict, equations, parameters, fit, residual tests, warnings."""
     model = result.model
-    parts = [verdict_html(verdict(result))]
-    parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
-    parts += [table.to_html() for table in behavior_tables(model)]
-    parts.append(parameter_table(model, result.joint, result.offsets).to_html())
+    contents = [verdict_html(verdict(result))]
+    contents += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
+    contents += [table.to_html() for table in behavior_tables(model)]
+    contents.append(parameter_table(model, result.joint, result.offsets).to_html())
     # A notebook shows the first run only; a report shows all runs.
     figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
-    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # safe: all parts are escaped
-    parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
+    contents += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # safe: all parts are escaped
+    contents.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
         verdicts = [
             Markup("{}: residuals {}, {} the inputs").format(
                 symbol_html(o),
-                "white" if white else "not white",
+                "white" if is_white else "not white",
                 _INDEPENDENCE_PHRASES[result.residuals.independence[o]],
             )
-            for o, white in result.residuals.white.items()
+            for o, is_white in result.residuals.white.items()
         ]
-        parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
-    first, rest = first_findings(result.findings)
-    parts.append(warnings_html(first))
-    if rest:
+        contents.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
+    main, further = first_findings(result.findings)
+    contents.append(warnings_html(main))
+    if further:
         folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
-        parts.append(folded.format(len(rest), "" if len(rest) == 1 else "s", warnings_html(rest)))
-    return str(Markup("").join(parts))
+        contents.append(folded.format(len(further), "" if len(further) == 1 else "s", warnings_html(further)))
+    return str(Markup("").join(contents))
 
 
 def model_page(
@@ -675,18 +691,18 @@ def model_page(
         The file that was written.
     """
     check_free(path, force=force)
-    others = [] if validation is None else as_runs(validation)
-    validated = [validate_model(model, run) for run in others]
+    validation_runs = [] if validation is None else as_runs(validation)
+    validated = [validate_model(model, run) for run in validation_runs]
     with use_interface("report"):
-        page = _model_content(model, others, validated)
+        page = _model_content(model, validation_runs, validated)
     return page.write(path, force=force)
 
 
-def _model_content(model: Model, others: Sequence[Run], validated: Sequence[Comparison]) -> Page:
-    """Return the page of a saved model with its comparisons with validation runs (`others`)."""
+def _model_content(model: Model, validation_runs: Sequence[Run], validated: Sequence[Comparison]) -> Page:
+    """Return the page of a saved model with its comparisons with validation runs (`validation_runs`)."""
     estimate = model.estimate
     findings = [] if estimate is None else list(estimate.findings)
-    for run, comparison in zip(others, validated, strict=True):
+    for run, comparison in zip(validation_runs, validated, strict=True):
         findings_there = [*comparison.findings, *data_notes(run)]
         if estimate is not None:
             findings_there += validation_fit_findings(
@@ -695,21 +711,23 @@ def _model_content(model: Model, others: Sequence[Run], validated: Sequence[Comp
             findings_there += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
         findings += on_validation(findings_there, run.name)
     compared = [("validation", comparison) for comparison in validated]
-    bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
-    sections = first_sections(model, findings, compared, bool(others), None, others, bands)
+    bands = [confidence_bands(model, run, c) for run, c in zip(validation_runs, validated, strict=True)]
+    sections = first_sections(model, findings, compared, bool(validation_runs), None, validation_runs, bands)
     details = []
-    if tests := tests_on(model, others):
+    if tests := tests_on(model, validation_runs):
         details.append(residual_section(tests, None, compared, model.units))
-    details += frequency_sections(model, [(r.step, r.duration) for r in others])
-    about: list[list[Cell]] = [
+    details += frequency_sections(model, [(r.step, r.duration) for r in validation_runs])
+    model_rows: list[list[Cell]] = [
         ["structure", model.structure.name],
         ["coupling in simulations", model.structure.coupling],
     ]
     if estimate is not None:
-        about += [["estimator", estimate.method], ["identified from", ", ".join(estimate.runs)]]
-        about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in estimate.fit.items()]
-        about += [[n.upper().replace("AICC", "AICc"), v] for n, v in estimate.information.items()]
+        model_rows += [["estimator", estimate.method], ["identified from", ", ".join(estimate.runs)]]
+        model_rows += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in estimate.fit.items()]
+        model_rows += [[n.upper().replace("AICC", "AICc"), v] for n, v in estimate.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
-    details.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
-    judgement = saved_verdict(model, validated)
-    return _content(model, judgement, compared, sections, details)
+    details.append(
+        Section("Settings", tables=[Table("What the file says", ("setting", "value"), model_rows), *initial])
+    )
+    overall_verdict = saved_verdict(model, validated)
+    return _content(model, overall_verdict, compared, sections, details)

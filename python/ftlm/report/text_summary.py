@@ -31,8 +31,8 @@ MAX_LISTED_MODES = 6
 
 def summary(result: Identification, validation: Comparison | None = None) -> str:
     """Return the summary of an identification as text; `validation` is its comparison with validation runs."""
-    judgement = verdict(result, validation)
-    lines = [*wrap_text(str(judgement)), ""]
+    overall_verdict = verdict(result, validation)
+    lines = [*wrap_text(str(overall_verdict)), ""]
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
     lines += [*fit_lines(result, validation), *_residuals(result), *_initial_condition_lines(result)]
@@ -49,19 +49,19 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
     """
     structure = model.structure
     lines = []
-    for item in model.equations:
-        offset = _offset(item.output, comparison)
+    for equation in model.equations:
+        offset = _offset(equation.output, comparison)
         tail = structure.offset_in_words if offset is None else offset
-        lines.append(format_equation(_readable(item), structure.describe_inputs(".6g")) + tail)
+        lines.append(format_equation(_readable(equation), structure.describe_inputs(".6g")) + tail)
     return lines
 
 
-def _readable(item: Equation) -> Equation:
+def _readable(equation: Equation) -> Equation:
     """Return a copy of an equation with its orders rounded to four decimals."""
-    new = copy.copy(item)
-    terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
-    vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
-    return new
+    copied = copy.copy(equation)
+    terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in equation.terms)
+    vars(copied).update(order=Order(round(equation.order.constant, ORDER_DECIMALS)), terms=terms)
+    return copied
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
@@ -73,7 +73,7 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
         return None
     parts = comparison.offsets[0][output]
     parts_with_units = [(parts[name], tail) for name, tail in (("constant", ""), ("ramp", " t")) if name in parts]
-    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in parts_with_units)
+    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{unit_text}" for v, unit_text in parts_with_units)
 
 
 def parameter_lines(result: Identification) -> list[str]:
@@ -85,12 +85,12 @@ def parameter_lines(result: Identification) -> list[str]:
     rows = []
     for name, p in result.parameters.items():
         has_error = not math.isnan(p.standard_error)
-        spread = f"± {format_bound(p.standard_error)}" if has_error else "fixed" if p.fixed else ""
+        error_text = f"± {format_bound(p.standard_error)}" if has_error else "fixed" if p.fixed else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
         tail = "(offset of one run, not part of the model)" if name in offsets else tail
         if name in reference:
             tail = f"{tail}  (stated {reference[name]:.6g})".strip()
-        rows.append((name, f"{p.value:.6g}", spread, p.unit, tail))
+        rows.append((name, f"{p.value:.6g}", error_text, p.unit, tail))
     if not rows:
         return []
     a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
@@ -115,9 +115,9 @@ def behavior_lines(model: Model) -> list[str]:
     with contextlib.suppress(FtlmError):
         model_modes = modes(model)
         unstable = any(mode.unstable for mode in model_modes)
-        word = "mode" if len(model_modes) == 1 else "modes"
+        noun = "mode" if len(model_modes) == 1 else "modes"
         lines += [
-            f"  {word if k == 0 else '':<7}{describe_mode(mode)}"
+            f"  {noun if k == 0 else '':<7}{describe_mode(mode)}"
             for k, mode in enumerate(model_modes[:MAX_LISTED_MODES])
         ]
         if len(model_modes) > MAX_LISTED_MODES:
@@ -130,15 +130,15 @@ def behavior_lines(model: Model) -> list[str]:
 def describe_mode(mode: Mode) -> str:
     """Return text on a mode, followed by its pole [rad/s]."""
     s = mode.pole
-    where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.oscillatory else f"{s.real:.4g}"
-    return f"{mode}; pole {where}"
+    pole_text = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.oscillatory else f"{s.real:.4g}"
+    return f"{mode}; pole {pole_text}"
 
 
 def describe_gain(state: SteadyState, model: Model) -> str:
     """Return text on a steady-state gain, or on the growth or decay of the step response if there is no such gain."""
     pair = f"{state.output} from {state.input}"
-    above, below = (model.units.get(n, "") for n in (state.output, state.input))
-    unit = f" {above}/{below}" if above and below else ""
+    output_unit, input_unit = (model.units.get(n, "") for n in (state.output, state.input))
+    unit = f" {output_unit}/{input_unit}" if output_unit and input_unit else ""
     rate, uncertainty = with_error(state.rate, state.error), describe_order(state)
     if state.order > 0:
         per_time = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
@@ -153,11 +153,11 @@ def describe_order(state: SteadyState) -> str:
     error = state.order_error
     if not error:
         return ""
-    whole = float(round(state.order))
-    is_determined = abs(state.order - whole) > NORMAL_95 * error
-    meaning = {0.0: "a gain", 1.0: "an integrator"}.get(whole, f"order {whole:g}")
+    integer = float(round(state.order))
+    is_determined = abs(state.order - integer) > NORMAL_95 * error
+    meaning = {0.0: "a gain", 1.0: "an integrator"}.get(integer, f"order {integer:g}")
     return f"; order {with_error(state.order, error)}" + (
-        "" if is_determined else f", which may be {whole:g}: {meaning}"
+        "" if is_determined else f", which may be {integer:g}: {meaning}"
     )
 
 
@@ -165,11 +165,11 @@ def fit_lines(result: Identification, validation: Comparison | None) -> list[str
     """Return text lines of a table: simulation fit [%] to estimation and validation data, and RMSE, per output."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'simulation fit, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
-    for output, own in result.output_error.items():
+    for output, errors in result.output_error.items():
         unit = result.model.units.get(output, "")
-        other = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"
+        text = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"
         lines.append(
-            f"  {output:<{max(width, 22)}}{own.fit:>12.4g}{other:>12}{own.rmse:>12.4g}{f' {unit}' if unit else ''}"
+            f"  {output:<{max(width, 22)}}{errors.fit:>12.4g}{text:>12}{errors.rmse:>12.4g}{f' {unit}' if unit else ''}"
         )
     return lines
 
@@ -177,9 +177,9 @@ def fit_lines(result: Identification, validation: Comparison | None) -> list[str
 def _residuals(result: Identification) -> list[str]:
     if result.residuals is None:
         return ["residuals: the runs are too short for tests"]
-    white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
+    whiteness_text = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
     free = ", ".join(f"{o} {w}" for o, w in result.residuals.independence.items())
-    return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
+    return [f"residuals white: {whiteness_text}; independent of the inputs: {free} (99 %)"]
 
 
 def _initial_condition_lines(result: Identification) -> list[str]:
@@ -187,9 +187,9 @@ def _initial_condition_lines(result: Identification) -> list[str]:
     comparison = result.comparison
     hidden = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)
     lines = describe_offsets(replace(comparison, offsets=hidden))
-    moving = "" if comparison.offsets else describe_initial_terms(comparison)
-    if moving and not any(f.code == "runs_split" for f in result.findings):
-        lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {moving}")
+    initial_terms_text = "" if comparison.offsets else describe_initial_terms(comparison)
+    if initial_terms_text and not any(f.code == "runs_split" for f in result.findings):
+        lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {initial_terms_text}")
     return lines
 
 
@@ -206,10 +206,10 @@ def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[s
         )
         if group.remedy:
             lines += wrap_text(group.remedy, "  -> ")
-    more = hidden_findings_text(groups)
+    hidden_text = hidden_findings_text(groups)
     return (
-        [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--report FILE shows all')})"]
-        if more
+        [*lines, f"  ({hidden_text}: {how or choose_text('print(result.details())', '--report FILE shows all')})"]
+        if hidden_text
         else lines
     )
 
@@ -221,23 +221,23 @@ NORM_TEXTS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
 
 def settings_text(settings: Mapping[str, Any]) -> str:
     """Return the settings of an identification as one line of text."""
-    words = f"M = {settings['m']}"
+    text = f"M = {settings['m']}"
     if "refinement" in settings:
-        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} initial guesses"
+        text = f"all samples, {settings['refinement']} pulses each, {settings['starts']} initial guesses"
     if "seeds" in settings:
         seeds = ", ".join(map(str, settings["seeds"]))
-        words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
+        text += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
     if "innovation_length" in settings:
         prior = settings["prior_covariance"]
-        words += f", p = {settings['innovation_length']}, {'weak prior' if prior is None else f'K0 = {prior:g}'}"
-        words += f", {settings['row_basis']} rows"
+        text += f", p = {settings['innovation_length']}, {'weak prior' if prior is None else f'K0 = {prior:g}'}"
+        text += f", {settings['row_basis']} rows"
     if "loss" in settings:
-        words += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
-    words += f", initial terms: {settings['initial']}"
-    words += f", offset: {settings['offset']}, one per run" if "offset" in settings else ""
-    words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
-    words += f", noise: autoregression of order {len(settings['noise_model'])}" if "noise_model" in settings else ""
-    return words + (
+        text += f", loss: {settings['loss']} ({robust_loss_text(settings)})"
+    text += f", initial terms: {settings['initial']}"
+    text += f", offset: {settings['offset']}, one per run" if "offset" in settings else ""
+    text += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
+    text += f", noise: autoregression of order {len(settings['noise_model'])}" if "noise_model" in settings else ""
+    return text + (
         f", instrument: the part of the inputs that {settings['reference']} explains" if "reference" in settings else ""
     )
 

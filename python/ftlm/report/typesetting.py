@@ -38,7 +38,7 @@ _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
 def equation_html(
-    item: Equation,
+    equation: Equation,
     delay: Mapping[str, float] | None = None,
     limits: Sequence[InputNonlinearity] = (),
     offset: Mapping[str, float] | str = "",
@@ -47,7 +47,7 @@ def equation_html(
 
     Parameters
     ----------
-    item
+    equation
         Equation with numerical coefficients.
     delay
         Delays of inputs [s] by name. An input with a delay is written u(t − 0.035 s), with a negative delay
@@ -57,26 +57,28 @@ def equation_html(
     offset
         Offset of the equation: estimates by kind (``"constant"``, ``"ramp"``) from one run, or a text to append.
     """
-    parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
-    for k, term in enumerate(item.terms):
+    parts = [_math(_derivative_math(equation.order, equation.output) + Markup("<mo>=</mo>"))]
+    for k, term in enumerate(equation.terms):
         value = term.fixed or 0.0
         sign = "−" if value < 0 else "" if k == 0 else "+"
         # The sign of the first term is a prefix operator; the other signs are infix operators between terms.
-        lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
+        sign_math = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(
-            _math(lead + _number_math(abs(value)) + THIN_SPACE + _operand_math(term, delay or {}, limits), "term")
+            _math(sign_math + _number_math(abs(value)) + THIN_SPACE + _operand_math(term, delay or {}, limits), "term")
         )
-    if item.friction is not None:
-        fc, fs, vs = item.friction.law
-        speed = _derivative_math(Order(1.0), item.output)
+    if equation.friction is not None:
+        fc, fs, vs = equation.friction.law
+        speed = _derivative_math(Order(1.0), equation.output)
         minus, sign = Markup('<mo form="infix">−</mo>'), Markup("<mi>sgn</mi><mo>(</mo>{}<mo>)</mo>").format(speed)
         parts.append(_math(minus + _number_math(fc) + THIN_SPACE + sign, "term"))
-        if item.friction.stribeck is not None:
+        if equation.friction.stribeck is not None:
             fall = _GAUSSIAN_DECAY.format(speed, _number_math(vs))
             parts.append(_math(minus + _number_math(fs) + THIN_SPACE + fall + THIN_SPACE + sign, "term"))
     if isinstance(offset, str):
-        words = offset.removeprefix(" + ")
-        parts += [_math(Markup('<mo form="infix">+</mo><mi>{}</mi>').format(words), "term")] if words else []
+        offset_text = offset.removeprefix(" + ")
+        parts += (
+            [_math(Markup('<mo form="infix">+</mo><mi>{}</mi>').format(offset_text), "term")] if offset_text else []
+        )
     else:
         for name, value in offset.items():
             sign, time = Markup('<mo form="infix">{}</mo>').format("−" if value < 0 else "+"), _symbol_math("t")
@@ -92,14 +94,14 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
     as symbols otherwise.
     """
     structure = model.structure
-    own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
+    own_offsets = offsets[0] if offsets is not None and len(offsets) == 1 else {}
     return [
         equation_html(
             e,
             structure.delay,
             structure.limits,
             # An offset of kind "level" is omitted: it is added to the output, and is not a term of the equation.
-            "" if "level" in own.get(e.output, {}) else own.get(e.output) or structure.offset_in_words,
+            "" if "level" in own_offsets.get(e.output, {}) else own_offsets.get(e.output) or structure.offset_in_words,
         )
         for e in model.equations
     ]
@@ -112,13 +114,13 @@ def _math(content: Markup, name: str = "") -> Markup:
 
 def _number_math(value: float | Exact) -> Markup:
     mantissa, times, power = number(value).partition("×10")
-    base = Markup("<mn>{}</mn>").format(mantissa)
+    mantissa_math = Markup("<mn>{}</mn>").format(mantissa)
     if not times:
-        return base
+        return mantissa_math
     exponent = power.translate(_PLAIN_DIGITS)
     sign = Markup("<mo>−</mo>") if exponent.startswith("-") else Markup("")
     raised = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
-    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
+    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(mantissa_math, raised)
 
 
 def _rounded_number(value: float) -> Exact:
@@ -176,16 +178,16 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
         case "channel":
             return _derivative_math(Order(item.value), item.signal, delay.get(item.signal, 0.0), limits)
     parts = [_expression_math(argument, delay, limits) for argument in item.arguments]
-    first = item.arguments[0]
+    first_argument = item.arguments[0]
     match item.operation:
         case "add":
-            out = parts[0]
+            math = parts[0]
             for argument, part in zip(item.arguments[1:], parts[1:], strict=True):
                 # The text of a summand with a negative factor already begins with its sign.
-                out += part if argument.split_factor()[0] < 0 else Markup("<mo>+</mo>") + part
-            return out
+                math += part if argument.split_factor()[0] < 0 else Markup("<mo>+</mo>") + part
+            return math
         case "multiply":
-            if first.operation == "constant" and first.value == -1.0:
+            if first_argument.operation == "constant" and first_argument.value == -1.0:
                 parts[0] = Markup("<mo>−</mo>")
             operand_texts = [
                 _IN_PARENTHESES.format(part) if argument.operation == "add" else part
@@ -193,9 +195,11 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
             ]
             return THIN_SPACE.join(operand_texts)
         case "power":
-            plain = first.operation == "abs" or (first.operation == "channel" and first.value == 0)
-            base = parts[0] if plain else _IN_PARENTHESES.format(parts[0])
-            return Markup("<msup><mrow>{}</mrow><mn>{}</mn></msup>").format(base, f"{item.value:g}")
+            is_simple = first_argument.operation == "abs" or (
+                first_argument.operation == "channel" and first_argument.value == 0
+            )
+            base_math = parts[0] if is_simple else _IN_PARENTHESES.format(parts[0])
+            return Markup("<msup><mrow>{}</mrow><mn>{}</mn></msup>").format(base_math, f"{item.value:g}")
         case "abs":
             return Markup("<mrow><mo>|</mo>{}<mo>|</mo></mrow>").format(parts[0])
         case "sqrt":
@@ -248,23 +252,23 @@ def parameter_table(
         }
     has_errors = any(e is not None for e in errors.values())
 
-    def row(name: str, value: float, reference_value: float | None, place: str) -> list[Cell]:
+    def row(name: str, value: float, reference_value: float | None, description: str) -> list[Cell]:
         error = errors.get(name)
         half = None if error is None else NORMAL_95 * error
-        ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        interval: list[Cell] = [None, None] if half is None else [value - half, value + half]
         if name in profiles:
-            ends = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
-        return [symbol_html(name), value, error, *ends, reference_value, units.get(name, ""), place]
+            interval = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
+        return [symbol_html(name), value, error, *interval, reference_value, units.get(name, ""), description]
 
     rows = [row(n, v if has_errors else Exact(v), None, "free order") for n, v in model.orders.items()]
     names = set(model.orders)
-    for item in model.equations:
-        for term in item.terms:
+    for equation in model.equations:
+        for term in equation.terms:
             if term.name is None:
                 continue
             linear = term.nonlinear is None
             derivative = derivative_html(term.order, term.signal) if linear else term.format_operand({})
-            place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
+            description = Markup("of {} in the equation of {}").format(derivative, symbol_html(equation.output))
             reference_value = reference.get(term.name)
             names.add(term.name)
             # Adding 0.0 turns a negative zero, the product of signs, into a positive one.
@@ -273,27 +277,32 @@ def parameter_table(
                     term.name,
                     float(term.coefficient),
                     None if reference_value is None else reference_value + 0.0,
-                    place,
+                    description,
                 )
             )
-        if item.friction is not None:
-            near = item.friction.stribeck
-            of = {item.friction.name: "Coulomb friction"}
-            if near is not None:
-                of |= {near.name: "Stribeck friction, beyond Coulomb's at rest,", near.speed_name: "Stribeck's speed"}
-            for name, value in item.friction.identified_coefficients.items():
+        if equation.friction is not None:
+            stribeck = equation.friction.stribeck
+            friction_texts = {equation.friction.name: "Coulomb friction"}
+            if stribeck is not None:
+                friction_texts |= {
+                    stribeck.name: "Stribeck friction, beyond Coulomb's at rest,",
+                    stribeck.speed_name: "Stribeck's speed",
+                }
+            for name, value in equation.friction.identified_coefficients.items():
                 names.add(name)
-                place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
-                rows.append(row(name, value, reference.get(name), place))
+                description = Markup("{} in the equation of {}").format(
+                    friction_texts[name], symbol_html(equation.output)
+                )
+                rows.append(row(name, value, reference.get(name), description))
     inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
             inputs[limit.name] = (f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", limit.value)
-    inputs = {n: known_of for n, known_of in inputs.items() if n in errors}
+    inputs = {n: delay_texts for n, delay_texts in inputs.items() if n in errors}
     rows += [
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in names and n not in inputs
     ]
-    rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
+    rows += [row(n, v, None, description) for n, (description, v) in inputs.items()]
     for name, p in (offsets or {}).items():
         has_error = not math.isnan(p.standard_error)
         cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
@@ -306,10 +315,10 @@ def parameter_table(
             note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:
         note = "No standard errors are given here: this table does not say how many of the digits mean something."
-    left_out = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
+    omitted_columns = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
         note += " Stated values belong to the integer orders of the manufacturer's model."
-    columns_kept = [i for i in range(len(columns)) if i not in left_out]
+    columns_kept = [i for i in range(len(columns)) if i not in omitted_columns]
     groups = (("", 3), ("95 % interval", 2), ("", len(columns_kept) - 5)) if has_errors else ()
     shown_rows = [[cells[i] for i in columns_kept] for cells in rows]
     return Table(

@@ -184,8 +184,8 @@ class ArmParameters:
             )
         start = PARAMETER_SETS[base]
         stages = {name: _values_of(values.pop(name, _StageFile())) for name in ("stage1", "stage2")}
-        for where, table in (("the file", values), *stages.items()):
-            _check_values(path, where, table)
+        for location, table in (("the file", values), *stages.items()):
+            _check_values(path, location, table)
         merged = {name: replace(getattr(start, name), **table) for name, table in stages.items()}
         return replace(start, **{**values, **merged, "name": path.name[:100]})
 
@@ -214,14 +214,21 @@ class ArmParameters:
             raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1; give (J_1 + J_2)/J_2")
         hub = self.coupling * self.rotating_share * self.inertia_ratio
         arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
-        base, carried = -self.coupling * self.rotating_share, -self.coupling * (1.0 + self.reach)
+        base_coefficient, link_coefficient = -self.coupling * self.rotating_share, -self.coupling * (1.0 + self.reach)
         # Determinant of the inertia matrix, relative to that of uncoupled joints.
-        if not 1.0 + hub * base + arm * carried > 0.0:
+        if not 1.0 + hub * base_coefficient + arm * link_coefficient > 0.0:
             raise ModelError(
                 f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give joint 2 more inertia than "
                 "link 1 carries, so that the kinetic energy of the arm is not positive definite; make them smaller"
             )
-        return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
+        return {
+            "p2": -hub - arm,
+            "q2": -arm,
+            "p3": base_coefficient,
+            "q3": base_coefficient,
+            "p4": link_coefficient,
+            "q4": link_coefficient,
+        }
 
     def model(self, *, friction: bool = False) -> Model:
         """Return the model of the arm from motor currents to angles.
@@ -264,7 +271,7 @@ class ArmParameters:
         """Return the simulated arm at rest, for runs of at most `horizon` seconds with sampling interval `step` [s]."""
         model = self.model()
         links = {
-            "equations": [equation_tuple(item, ARM_SIGNALS) for item in model.equations],
+            "equations": [equation_tuple(equation, ARM_SIGNALS) for equation in model.equations],
             "coulomb": [self.stage1.coulomb, self.stage2.coulomb],
         }
         sensors = {
@@ -281,12 +288,12 @@ class ArmParameters:
         return _core.VirtualArm(links, sensors, step, MAX_SUBSTEP_S, horizon)
 
 
-def _optional_toml_keys(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
+def _optional_toml_keys(kind: type[Any], **replacements: Any) -> list[tuple[str, Any, Any]]:
     """Return the fields of a dataclass, except `name`, as (name, type, default) of optional keys of a TOML file.
 
-    `replaced` are the types of additional keys, and of keys whose type in the file differs from that of the field.
+    `replacements` are the types of additional keys, and of keys whose type in the file differs from that of the field.
     """
-    hints = {**get_type_hints(kind), **replaced}
+    hints = {**get_type_hints(kind), **replacements}
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
 
 
@@ -303,19 +310,21 @@ def _values_of(file: msgspec.Struct) -> dict[str, Any]:
     return {key: value for key, value in msgspec.structs.asdict(file).items() if value is not UNSET}
 
 
-def _check_values(path: Path, where: str, table: Mapping[str, Any]) -> None:
+def _check_values(path: Path, location: str, table: Mapping[str, Any]) -> None:
     """Raise DataError if a number in a table of a TOML file is not finite or out of range.
 
-    `where` is the name of the table in the message.
+    `location` is the name of the table in the message.
     """
     for key, value in table.items():
         values = [v for v in (value if isinstance(value, tuple) else (value,)) if not isinstance(v, str)]
         if not all(map(math.isfinite, values)):
-            raise DataError(f"{path.name}: {key} = {value!r} in {where} is not finite; write a number")
+            raise DataError(f"{path.name}: {key} = {value!r} in {location} is not finite; write a number")
         if key == "bits" and not 0 <= value <= 24:
             raise DataError(f"{path.name}: bits = {value!r} is not a whole number from 0 to 24; write one")
         if (key.endswith("noise") and min(values) < 0) or (key in ("travel", "encoder_scale") and min(values) <= 0):
-            raise DataError(f"{path.name}: {key} = {value!r} in {where} must not be negative; write a positive number")
+            raise DataError(
+                f"{path.name}: {key} = {value!r} in {location} must not be negative; write a positive number"
+            )
 
 
 _STAGE1 = StageParameters(

@@ -98,10 +98,11 @@ class Excitation:
             currents = currents * np.minimum(1.0, t / ramp)[:, None]
         currents[-1] = 0.0
         for k, limit in enumerate(CURRENT_LIMIT):
-            over = np.flatnonzero(np.abs(currents[:, k]) > limit * (1 + 1e-12))
-            if over.size:
+            exceeding_rows = np.flatnonzero(np.abs(currents[:, k]) > limit * (1 + 1e-12))
+            if exceeding_rows.size:
                 raise ModelError(
-                    f"the current of motor {k + 1} is {currents[over[0], k]:.4g} A at {t[over[0]]:.4g} s ({over.size} "
+                    f"the current of motor {k + 1} is {currents[exceeding_rows[0], k]:.4g} A at "
+                    f"{t[exceeding_rows[0]]:.4g} s ({exceeding_rows.size} "
                     f"samples in all), over the limit of {limit:g} A; use a smaller amplitude"
                 )
         return currents
@@ -122,8 +123,8 @@ class Excitation:
         return pair[0], pair[1]
 
     def _period(self, rate: float) -> float:
-        usual = {"sine": 2 * math.pi / _PAPER_SINE_RAD_S, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
-        period = usual if self.period is None else finite_number(self.period)
+        default_period = {"sine": 2 * math.pi / _PAPER_SINE_RAD_S, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
+        period = default_period if self.period is None else finite_number(self.period)
         if period is None or not period * rate >= 2:
             raise ModelError(
                 f"{setting('period')} {short_repr(self.period)} s is too short; give at least two samples, "
@@ -141,20 +142,20 @@ class Excitation:
         # A tolerance of half a sample prevents rounding from shifting an edge.
         phase = ((t + 0.5 / rate) % period) / period
         if self.shape == "square":
-            one = np.where(phase < 0.5, 1.0, -1.0)
+            signal = np.where(phase < 0.5, 1.0, -1.0)
         elif self.shape == "sine":
-            one = np.sin(2 * math.pi * t / period)
+            signal = np.sin(2 * math.pi * t / period)
         elif self.shape == "doublet":
-            one = np.where(t + 0.5 / rate < period, np.where(phase < 0.5, 1.0, -1.0), 0.0)
+            signal = np.where(t + 0.5 / rate < period, np.where(phase < 0.5, 1.0, -1.0), 0.0)
         elif self.shape == "chirp":
             low, high = self._band(rate)
             growth = math.log(high / low)
-            one = np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * t / duration))
+            signal = np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * t / duration))
         elif self.shape in ("prbs", "multisine"):
             return np.column_stack([self._random(t, rate, period, motor) for motor in (0, 1)])
         else:
             raise ModelError(f"{setting('input')} {self.shape!r} is not known; use one of {', '.join(SIGNAL_SHAPES)}")
-        return np.column_stack([one, one])
+        return np.column_stack([signal, signal])
 
     def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
         rng = np.random.default_rng([self.seed, motor])
@@ -173,19 +174,19 @@ class Excitation:
         n = max(2, round(period * rate))
         spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
         spectrum[lines] = np.exp(1j * phases)
-        one: Floats = np.fft.irfft(spectrum, n)
-        one /= np.abs(one).max()
-        return one[np.arange(t.size) % n]
+        signal: Floats = np.fft.irfft(spectrum, n)
+        signal /= np.abs(signal).max()
+        return signal[np.arange(t.size) % n]
 
     def _band(self, rate: float) -> tuple[float, float]:
         band = self.band
-        ends = [b for b in map(finite_number, band) if b is not None] if isinstance(band, (tuple, list)) else []
-        if len(ends) != 2 or len(band) != 2 or not 0 < ends[0] < ends[1] <= rate / 2:
+        frequencies = [b for b in map(finite_number, band) if b is not None] if isinstance(band, (tuple, list)) else []
+        if len(frequencies) != 2 or len(band) != 2 or not 0 < frequencies[0] < frequencies[1] <= rate / 2:
             raise ModelError(
                 f"{setting('band')} {short_repr(band)} Hz is not a band; give two increasing frequencies up to half "
                 f"the rate, {rate / 2:g} Hz"
             )
-        return ends[0], ends[1]
+        return frequencies[0], frequencies[1]
 
     def _file(self, t: Floats) -> Floats:
         if self.file is None:
@@ -199,11 +200,11 @@ class Excitation:
                 f"{str(self.file)!r} has no column I1 or I2; give the columns of the currents [A] these names"
             )
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
-        past = t > run.duration + run.step * (1 - 1e-6)
+        is_after_end = t > run.duration + run.step * (1 - 1e-6)
         currents = np.column_stack(
             [(run[name] if name in run else np.zeros(run.length))[rows] for name in CURRENT_SIGNALS]
         )
-        currents[past] = 0.0
+        currents[is_after_end] = 0.0
         return currents
 
     def to_dict(self) -> dict[str, Any]:
@@ -215,10 +216,10 @@ class Excitation:
 def finite_number(value: object) -> float | None:
     """Return a finite real number as a float; None for any other value, including bool."""
     try:
-        number = real_number("", value)
+        result = real_number("", value)
     except ModelError:
         return None
-    return number if math.isfinite(number) else None
+    return result if math.isfinite(result) else None
 
 
 def _to_json_value(value: object) -> object:

@@ -137,8 +137,8 @@ def control(
     description: dict[str, Any] = {"controller": _describe_controller(controller)}
 
     def loop(board: Board) -> ControllerSource:
-        own = getattr(board, "parameters", None)
-        travel = own.travel if isinstance(own, ArmParameters) else DEFAULT_TRAVEL_RAD
+        board_parameters = getattr(board, "parameters", None)
+        travel = board_parameters.travel if isinstance(board_parameters, ArmParameters) else DEFAULT_TRAVEL_RAD
         rows = _reference_per_sample(path, round(duration * rate) + 1, rate, travel)
         reset = getattr(controller, "reset", None)
         if callable(reset):
@@ -157,8 +157,8 @@ def _of_both_joints(controller: Controller) -> Controller:
     controller, and for an LQG controller whose input is not a motor current.
     """
     if isinstance(controller, Lqg) and controller.observer.realization.input in MOTOR_INPUTS:
-        second = controller.observer.realization.input == MOTOR_INPUTS[1]
-        return JointControllers(None, controller) if second else JointControllers(controller)
+        is_second_joint = controller.observer.realization.input == MOTOR_INPUTS[1]
+        return JointControllers(None, controller) if is_second_joint else JointControllers(controller)
     if isinstance(controller, (Lqg, DiscretePid)):
         raise ModelError(
             f"controller is {type_name(controller)} of one joint; pass JointControllers(controller) for joint 1 "
@@ -172,13 +172,14 @@ def _rate_of(controller: Controller, rate: float | None) -> float:
 
     Raise ModelError if it is out of range or differs from the rate of the controller.
     """
-    own = finite_number(getattr(controller, "rate", None))
+    controller_rate = finite_number(getattr(controller, "rate", None))
     _, _, checked = check_times(
-        MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (own or DEFAULT_RATE_HZ) if rate is None else rate
+        MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (controller_rate or DEFAULT_RATE_HZ) if rate is None else rate
     )
-    if own is not None and not same_rate(checked, own):
+    if controller_rate is not None and not same_rate(checked, controller_rate):
         raise ModelError(
-            f"{setting('rate')} {checked:g} Hz is not the {own:g} Hz that the controller is made for; leave "
+            f"{setting('rate')} {checked:g} Hz is not the {controller_rate:g} Hz that the controller is made for; "
+            "leave "
             f"{parameter('rate')} out, or make a controller for {checked:g} Hz"
         )
     return checked
@@ -206,7 +207,7 @@ class ControllerSource:
         self._rig: Rig | None = None
         self._at = -1
         self._since: float | None = None
-        self._took = 0.0
+        self._computation_time = 0.0
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
         """Return one command of 0 A, shape (1, 2), because no sample is measured yet."""
@@ -227,7 +228,7 @@ class ControllerSource:
         t = self._at / self.rate
         self._since = self.clock()
         try:
-            answer = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
+            returned = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
         except Exception as error:
             self._since = None
             self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {error_text(error)})", error)
@@ -235,57 +236,61 @@ class ControllerSource:
             with contextlib.suppress(Exception):
                 self._rig.board.write((0.0, 0.0))
             raise
-        self._took = self.clock() - self._since
+        self._computation_time = self.clock() - self._since
         self._since = None
         try:
-            currents, wrong = _currents(answer, self._rig.limits.current)
+            currents, fault_text = _currents(returned, self._rig.limits.current)
         except Exception as error:
             # User-defined sequences and numbers may raise on access.
-            words = f"at {t:.6g} s what the controller returned cannot be read ({type(error).__name__}: "
-            self._rig.fail(f"{words}{error_text(error)})", error)
-        if wrong:
-            self._rig.fail(f"at {t:.6g} s the controller {wrong}")
+            message = f"at {t:.6g} s what the controller returned cannot be read ({type(error).__name__}: "
+            self._rig.fail(f"{message}{error_text(error)})", error)
+        if fault_text:
+            self._rig.fail(f"at {t:.6g} s the controller {fault_text}")
         return currents
 
     def explain_fault(self, fault: str) -> str:
         """Return a fault message; add the computing time if the controller took over one sample or did not return."""
-        where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
+        location = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
         if self._since is not None:
-            return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
-        if self._took * self.rate > 1.0:
-            return f"{fault}; the controller took {self._took:.3g} s to answer to {where}"
+            return f"{fault}: the controller had not answered to {location} for {self.clock() - self._since:.3g} s"
+        if self._computation_time * self.rate > 1.0:
+            return f"{fault}; the controller took {self._computation_time:.3g} s to answer to {location}"
         return fault
 
 
-def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
+def _currents(returned: object, limits: tuple[float, float]) -> tuple[Floats, str]:
     """Return the currents [A] in a controller's result, shape (1, 2), and an error text ("" if they are valid).
 
     `limits` are the maximum magnitudes of both currents. Invalid currents are returned as 0.
     """
-    nothing = np.zeros((1, 2))
-    if answer is None:
-        return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"
-    if isinstance(answer, (str, bytes, bytearray)):
-        return nothing, f"returned text ({bytes(answer[:20]) if not isinstance(answer, str) else answer[:20]!r})"
-    if not isinstance(answer, (tuple, list, np.ndarray)):
-        return nothing, f"returned a {type(answer).__name__}, not both currents [A]"
-    if isinstance(answer, np.ndarray) and answer.shape != (2,):
-        return nothing, f"returned an array of shape {answer.shape}, not both currents [A]"
-    if len(answer) != 2:
-        return nothing, f"returned {len(answer)} values, not both currents [A]"
+    zero_currents = np.zeros((1, 2))
+    if returned is None:
+        return zero_currents, "returned nothing; return both currents [A], such as (0.1, 0.0)"
+    if isinstance(returned, (str, bytes, bytearray)):
+        return (
+            zero_currents,
+            f"returned text ({bytes(returned[:20]) if not isinstance(returned, str) else returned[:20]!r})",
+        )
+    if not isinstance(returned, (tuple, list, np.ndarray)):
+        return zero_currents, f"returned a {type(returned).__name__}, not both currents [A]"
+    if isinstance(returned, np.ndarray) and returned.shape != (2,):
+        return zero_currents, f"returned an array of shape {returned.shape}, not both currents [A]"
+    if len(returned) != 2:
+        return zero_currents, f"returned {len(returned)} values, not both currents [A]"
     values = []
-    for motor, (current, most) in enumerate(zip(answer, limits, strict=True), start=1):
+    for motor, (current, maximum) in enumerate(zip(returned, limits, strict=True), start=1):
         if isinstance(current, (bool, np.bool_)) or not isinstance(current, (int, float, np.integer, np.floating)):
-            return nothing, f"returned a {type(current).__name__} for motor {motor}, not a current [A]"
+            return zero_currents, f"returned a {type(current).__name__} for motor {motor}, not a current [A]"
         try:
             value = float(current)
         except OverflowError:
             value = math.inf
         if not math.isfinite(value):
-            return nothing, f"returned {value} for motor {motor}, not a finite current"
-        if abs(value) > most * (1 + 1e-12):
-            return nothing, (
-                f"asked motor {motor} for {value:.4g} A, over the limit of {most:g} A; clip what it returns, and let "
+            return zero_currents, f"returned {value} for motor {motor}, not a finite current"
+        if abs(value) > maximum * (1 + 1e-12):
+            return zero_currents, (
+                f"asked motor {motor} for {value:.4g} A, over the limit of {maximum:g} A; clip what it returns, and "
+                "let "
                 "no integral grow meanwhile"
             )
         values.append(value)
@@ -294,13 +299,13 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
 
 def _reference_array(reference: ArrayLike) -> Floats:
     """Return the reference as an array of shape (rows, 2) or (2,); raise DataError for any other shape or type."""
-    raw = as_array("reference", reference)
-    if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
+    samples = as_array("reference", reference)
+    if samples.dtype.kind not in "fiu" or samples.ndim not in (1, 2) or samples.shape[-1] != 2:
         raise DataError(
             "reference is not an array of hub angles; give numbers [rad] of shape (rows, 2), one row per sample, or a "
             "pair of angles to hold"
         )
-    return np.array(raw, dtype=np.float64)
+    return np.array(samples, dtype=np.float64)
 
 
 def _reference_per_sample(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
@@ -315,19 +320,22 @@ def _reference_per_sample(values: Floats, rows: int, rate: float, travel: tuple[
             f"reference has {plural(len(reference), 'row')}, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has "
             f"{rows}; give as many, or leave {parameter('duration')} out"
         )
-    for hub, most in enumerate(travel):
+    for hub, maximum in enumerate(travel):
         angles = reference[:, hub]
-        bad = np.flatnonzero(~np.isfinite(angles))
-        if bad.size:
+        invalid_rows = np.flatnonzero(~np.isfinite(angles))
+        if invalid_rows.size:
             raise DataError(
-                f"reference of hub {hub + 1} is {angles[bad[0]]} at row {bad[0]} ({bad.size} such rows in all); give "
+                f"reference of hub {hub + 1} is {angles[invalid_rows[0]]} at row {invalid_rows[0]} "
+                f"({invalid_rows.size} such rows in all); give "
                 "finite angles [rad]"
             )
-        over = np.flatnonzero(np.abs(angles) > most)
-        if over.size:
+        exceeding_rows = np.flatnonzero(np.abs(angles) > maximum)
+        if exceeding_rows.size:
             raise ModelError(
-                f"reference of hub {hub + 1} is {math.degrees(angles[over[0]]):.4g} degrees at {over[0] / rate:.4g} s "
-                f"({over.size} samples in all), beyond its travel of {math.degrees(most):.4g} degrees; it is in rad: "
+                f"reference of hub {hub + 1} is {math.degrees(angles[exceeding_rows[0]]):.4g} degrees at "
+                f"{exceeding_rows[0] / rate:.4g} s "
+                f"({exceeding_rows.size} samples in all), beyond its travel of {math.degrees(maximum):.4g} degrees; "
+                "it is in rad: "
                 "give a smaller one"
             )
     return reference
@@ -344,14 +352,14 @@ def _describe_controller(controller: Controller) -> dict[str, Any]:
     if callable(describe):
         description |= {"settings": describe()}
     try:
-        size = len(json.dumps(description, allow_nan=False))
+        length = len(json.dumps(description, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(
             f"the result of to_dict() of the controller is not valid JSON ({error_text(error, 200)}); correct it"
         ) from None
-    if size > MAX_CONTROLLER_JSON_CHARACTERS:
+    if length > MAX_CONTROLLER_JSON_CHARACTERS:
         raise ModelError(
-            f"the result of to_dict() of the controller is {size} characters long, more than the "
+            f"the result of to_dict() of the controller is {length} characters long, more than the "
             f"{MAX_CONTROLLER_JSON_CHARACTERS} that the metadata of a run may contain; shorten it"
         )
     return description

@@ -107,9 +107,9 @@ def driver_state() -> str:
         board.open()
     except RigFault as fault:
         return f"driver found; {fault}"
-    about = board.describe()
+    description = board.describe()
     board.close()
-    return f"driver found, board found{about}"
+    return f"driver found, board found{description}"
 
 
 class QuanserBoard:
@@ -228,9 +228,9 @@ class QuanserBoard:
 
         Raise RigFault if expiration states are not set, and ModelError if the timeout is shorter than two samples.
         """
-        missing = self.unsafe()
-        if missing is not None:
-            raise RigFault(f"Q8-USB: {missing}")
+        missing_state = self.unsafe()
+        if missing_state is not None:
+            raise RigFault(f"Q8-USB: {missing_state}")
         check_watchdog(self._rate, seconds)
         with self._translate_errors("starting the watchdog") as hil:
             self._seconds = float(seconds)
@@ -282,14 +282,14 @@ class QuanserBoard:
         safety limits, latches a fault.
         """
         for command in commands:
-            late = self._read(guard)
-            if late is None:
+            delay = self._read(guard)
+            if delay is None:
                 return
-            values = guard.read(self._analog.tolist(), self._counts.tolist(), self._digital.tolist(), late)
+            values = guard.read(self._analog.tolist(), self._counts.tolist(), self._digital.tolist(), delay)
             volts = guard.command(command)
             # A sample that is not finite is a fault and is not recorded.
             if all(map(math.isfinite, values)):
-                self._rows.append([*guard.last_currents, *values, late])
+                self._rows.append([*guard.last_currents, *values, delay])
             self._reload_and_write(guard, (volts[0], volts[1]))
             if guard.fault is not None:
                 return
@@ -400,36 +400,36 @@ class QuanserBoard:
         return self._is_expired
 
     @contextlib.contextmanager
-    def _translate_errors(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> Iterator[Any]:
+    def _translate_errors(self, operation: str, hil: Any = None, guard: _core.Guard | None = None) -> Iterator[Any]:
         """Convert errors of the vendor's package in a ``with`` block to RigFault, and latch them in `guard`, if given.
 
-        `what` is the name of the operation in the message. The block gets the vendor's board object, by default that of
-        this board. Raise RigFault if the board is not open.
+        `operation` is the name of the operation in the message. The block gets the vendor's board object, by default
+        that of this board. Raise RigFault if the board is not open.
         """
         handle = self._hil if hil is None else hil
         if handle is None:
-            raise RigFault(f"Q8-USB, {what}: the board is not open; call open() first")
+            raise RigFault(f"Q8-USB, {operation}: the board is not open; call open() first")
         try:
             yield handle
         except self._error as error:
-            fault = self._fault(what, error)
+            fault = self._fault(operation, error)
             if guard is not None:
                 # A board that is locked by its expired watchdog rejects every call, so the expiry is the cause.
                 if self._has_expired():
-                    fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {what})")
+                    fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {operation})")
                 guard.fail(str(fault))
             raise fault from None
 
-    def _fault(self, what: str, error: Exception) -> RigFault:
+    def _fault(self, operation: str, error: Exception) -> RigFault:
         code = getattr(error, "error_code", None)
-        words = ERROR_MESSAGES.get(code) if isinstance(code, int) else None
-        if words is None:
+        code_message = ERROR_MESSAGES.get(code) if isinstance(code, int) else None
+        if code_message is None:
             try:
                 message = str(error.get_error_message())  # type: ignore[attr-defined]
             except Exception:  # the message needs the vendor's runtime
                 message = str(error)
-            words = f"{message or 'no message'} (error {code})"
-        return RigFault(f"Q8-USB, {what}: {words}")
+            code_message = f"{message or 'no message'} (error {code})"
+        return RigFault(f"Q8-USB, {operation}: {code_message}")
 
 
 #: Maximum length of a string property of the board.

@@ -56,7 +56,7 @@ class PartialRecording:
     """
 
     def __init__(
-        self, target: Path | None, name: str, step: float, about: dict[str, Any], extra_columns: tuple[str, ...] = ()
+        self, target: Path | None, name: str, step: float, details: dict[str, Any], extra_columns: tuple[str, ...] = ()
     ) -> None:
         self.path = None if target is None else partial_path(target)
         self._step, self._rows = step, 0
@@ -75,7 +75,7 @@ class PartialRecording:
             units_of(extra_columns),
             dict.fromkeys(inputs, "zoh"),
             ("the recording did not end: the program died, or the disk was full",),
-            about | {"faults": ["the recording did not end"]},
+            details | {"faults": ["the recording did not end"]},
         )
 
     def open(self) -> None:
@@ -129,13 +129,13 @@ class PartialRecording:
     def _append(self, content: bytes) -> None:
         if self._descriptor is None:
             return
-        whole = os.lseek(self._descriptor, 0, os.SEEK_END)
+        file_length = os.lseek(self._descriptor, 0, os.SEEK_END)
         try:
             while content:
                 content = content[os.write(self._descriptor, content) :]
         except OSError:
             with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, whole)
+                os.ftruncate(self._descriptor, file_length)
             raise
 
     def close(self) -> None:
@@ -191,32 +191,32 @@ def save_run(
     BaseException
         The exception `ended`, if it is not a RigFault, with a note on where the samples are.
     """
-    place = "nothing was recorded until then"
+    saved_text = "nothing was recorded until then"
     if run is not None:
-        place = f"{run.length} rows were recorded until then"
+        saved_text = f"{run.length} rows were recorded until then"
         if target is not None:
             try:
                 save = run.to_csv if target.suffix.lower() == ".csv" else run.to_parquet
                 save(target, force=force)
                 partial.remove()
-                place += f" and are in {target}"
+                saved_text += f" and are in {target}"
             except DataError as error:
                 partial.close()
-                place += (
+                saved_text += (
                     f"; {partial.kept} of them are in {partial.path}" if partial.kept else "; none could be written"
                 )
-                fault = RigFault(f"{error}; {place}")
+                fault = RigFault(f"{error}; {saved_text}")
                 if ended is not None:
-                    fault = RigFault(f"{'; '.join(faults)}; {place}")
+                    fault = RigFault(f"{'; '.join(faults)}; {saved_text}")
                 fault.run = run
                 raise fault from None
     else:
         partial.remove()
     if ended is not None and not isinstance(ended, RigFault):
-        ended.add_note(place)
+        ended.add_note(saved_text)
         raise ended
     if ended is not None or faults or run is None:
-        fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
+        fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {saved_text}")
         fault.run = run
         # Keep the exception of a controller as the cause.
         raise fault from (None if ended is None else ended.__cause__)
@@ -415,13 +415,13 @@ class Experiment:
             return QuanserBoard(card=self.board), {"card": self.board}
         if not hasattr(self.rig, "hardware"):
             raise ModelError(f"rig is {type_name(self.rig)}; use 'virtual', 'q8' or a board of your own")
-        own = getattr(self.rig, "parameters", None)
-        return self.rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
+        rig_parameters = getattr(self.rig, "parameters", None)
+        return self.rig, {"parameters": rig_parameters.to_dict()} if isinstance(rig_parameters, ArmParameters) else {}
 
-    def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
+    def record_run(self, make_source: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
         """Run the experiment and return the recorded run.
 
-        `source_on` returns the command source for the selected board, and `more_details` are added to the metadata.
+        `make_source` returns the command source for the selected board, and `more_details` are added to the metadata.
         Raise ModelError or DataError for invalid arguments, and RigFault if the rig stops the run.
         """
         # Flags that permit an arm to move must be bool; other values that count as true are rejected.
@@ -449,8 +449,8 @@ class Experiment:
         target = None if self.out is None else Path(self.out)
         if target is not None:
             _check_target(target, force=self.force)
-        source = source_on(board)
-        about: dict[str, Any] = {
+        source = make_source(board)
+        run_details: dict[str, Any] = {
             "rig": board.name,
             "seed": self.seed,
             "rate": self.rate,
@@ -476,7 +476,7 @@ class Experiment:
                 "the rig's rate"
             )
         columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
-        partial = PartialRecording(target, self.name, step, about, tuple(source.extra_signals))
+        partial = PartialRecording(target, self.name, step, run_details, tuple(source.extra_signals))
         recorder = _Recorder(
             partial, source, self.progress, live, columns, _BLOCK_ROWS_REAL_TIME if paced else _BLOCK_ROWS_FAST
         )
@@ -486,14 +486,14 @@ class Experiment:
             link.signals.keep()
             partial.open()
             ended, faults = _run_commands(link, recorder)
-            about |= {"missed_deadlines": link.guard.missed_deadlines, "faults": faults}
+            run_details |= {"missed_deadlines": link.guard.missed_deadlines, "faults": faults}
             if live is not None:
-                about["live"] = {
+                run_details["live"] = {
                     "coefficients": live.coefficients,
                     "pulses": live.pulses,
                     "trouble": recorder.live_error,
                 }
-            run = recorder.finish(self.name, about, faults, step)
+            run = recorder.finish(self.name, run_details, faults, step)
             saved = save_run(run, target, partial, force=self.force, ended=ended, faults=faults)
         finally:
             partial.close()
@@ -563,8 +563,8 @@ class _Recorder:
     """Recorder that runs the commands of a source on a rig, and stores the samples in memory and in a file.
 
     `columns` are the indices of the rig's columns for the signals of `live`. `block` is the number of samples that are
-    written to the file together. `taken` are all recorded samples. `live_error` is the message of the error that ended
-    the recursive identification `live`, or None.
+    written to the file together. `samples` are all recorded samples. `live_error` is the message of the error that
+    ended the recursive identification `live`, or None.
     """
 
     partial: PartialRecording
@@ -574,10 +574,10 @@ class _Recorder:
     columns: list[int]
     block: int
     live_error: str | None = None
-    taken: list[Floats] = field(default_factory=list)
-    #: Number of entries of `taken` that were written to the file, and number of their samples.
+    samples: list[Floats] = field(default_factory=list)
+    #: Number of entries of `samples` that were written to the file, and number of their samples.
     blocks: int = 0
-    done: int = 0
+    row_count: int = 0
 
     def follow(self, rig: Rig) -> None:
         """Run all commands of the source on a rig, and store the measured samples."""
@@ -589,7 +589,7 @@ class _Recorder:
                 finally:
                     rows = self.collect(rig)
                 rig.signals.deliver()
-                if sum(map(len, self.taken[self.blocks :])) >= self.block:
+                if sum(map(len, self.samples[self.blocks :])) >= self.block:
                     self.flush()
                 commands = self.source.next_commands(rows)
         finally:
@@ -600,16 +600,16 @@ class _Recorder:
 
         Signals are deferred during the call, so that no sample is lost.
         """
-        self.taken.append(rig.take())
-        return self.taken[-1]
+        self.samples.append(rig.take())
+        return self.samples[-1]
 
     def flush(self) -> None:
         """Pass stored samples that are not in the file yet to the file, to `live`, and to the progress callback."""
-        pending, self.blocks = self.taken[self.blocks :], len(self.taken)
-        rows = self._columns(pending, self.done)
+        pending, self.blocks = self.samples[self.blocks :], len(self.samples)
+        rows = self._columns(pending, self.row_count)
         if not len(rows):
             return
-        self.done += len(rows)
+        self.row_count += len(rows)
         self.partial.write(rows)
         if self.live is not None and self.live_error is None:
             try:
@@ -618,7 +618,7 @@ class _Recorder:
                 # A failed live estimate must not stop the run, which can be identified afterwards.
                 self.live_error = str(error)
         if self.progress is not None:
-            self.progress(self.done, self.source.rows)
+            self.progress(self.row_count, self.source.rows)
 
     def _columns(self, blocks: list[Floats], start: int) -> Floats:
         """Return samples of consecutive blocks without the delay column, with the extra signals of the source appended.
@@ -629,17 +629,17 @@ class _Recorder:
         extra_values = [values[start : start + len(rows), None] for values in self.source.extra_signals.values()]
         return np.hstack([rows, *extra_values])
 
-    def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
-        """Return the recorded run with name, metadata (`about`) and faults; None if it has fewer than three samples."""
+    def finish(self, name: str, details: dict[str, Any], faults: list[str], step: float) -> Run | None:
+        """Return the recorded run with its name, `details` and faults; None if it has fewer than three samples."""
         extra_names = tuple(self.source.extra_signals)
-        rows = self._columns(self.taken, 0)
+        rows = self._columns(self.samples, 0)
         if len(rows) < 3:
             return None
         data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *extra_names))}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
         signals = {n: data[n] for n in (*CURRENT_SIGNALS, *extra_names)}, {n: data[n] for n in RIG_COLUMNS[2:]}
         arguments = RunArguments(
-            *signals, step=step, units=units_of(extra_names), name=name, notes=facts, metadata=about
+            *signals, step=step, units=units_of(extra_names), name=name, notes=facts, metadata=details
         )
         return Run._from_checked(**arguments.checked_fields())
 

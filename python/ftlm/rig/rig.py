@@ -83,9 +83,9 @@ class InterruptWatch:
                 return
             for name in _TERMINATION_SIGNALS:
                 if hasattr(signal, name):
-                    ends = os.pipe()
-                    os.set_blocking(ends[1], False)
-                    self._pipes[getattr(signal, name)] = ends
+                    pipe_ends = os.pipe()
+                    os.set_blocking(pipe_ends[1], False)
+                    self._pipes[getattr(signal, name)] = pipe_ends
             self._register()
             threading.Thread(target=self._watch, name="ftlm signals", daemon=True).start()
 
@@ -101,12 +101,12 @@ class InterruptWatch:
         self._stop()
 
     def _stop(self) -> None:
-        for number, ends in self._pipes.items():
+        for number, pipe_ends in self._pipes.items():
             # If the current handler is not a Python function, the handler of faulthandler is already replaced.
             if number in self._handlers and callable(signal.getsignal(number)):
                 faulthandler.unregister(number)
-            for end in ends:
-                os.close(end)
+            for descriptor in pipe_ends:
+                os.close(descriptor)
         self._handlers, self._pipes = {}, {}
 
     def _register(self) -> None:
@@ -121,22 +121,22 @@ class InterruptWatch:
                 self._handlers[number] = _system_handler(number)
 
     def _watch(self) -> None:
-        numbers = {ends[0]: number for number, ends in self._pipes.items()}
+        signal_numbers = {pipe_ends[0]: number for number, pipe_ends in self._pipes.items()}
         poll = select.poll()
-        for end in numbers:
-            poll.register(end, select.POLLIN)
+        for descriptor in signal_numbers:
+            poll.register(descriptor, select.POLLIN)
         while True:
-            ready = poll.poll(_HANDLER_CHECK_INTERVAL_MS)
+            ready_descriptors = poll.poll(_HANDLER_CHECK_INTERVAL_MS)
             with self._lock:
                 self._register()
                 boards = list(self._boards)
                 if not boards:
                     self._stop()
                     return
-            for end, _ in ready:
-                os.read(end, 1 << 16)
+            for descriptor, _ in ready_descriptors:
+                os.read(descriptor, 1 << 16)
                 for board in boards:
-                    _stop_motors(board, describe_signal(numbers[end]))
+                    _stop_motors(board, describe_signal(signal_numbers[descriptor]))
 
 
 def _system_handler(number: int) -> bytes:
@@ -196,13 +196,13 @@ class SignalHandlers:
     def __init__(self, uninterruptible: frozenset[CodeType] = frozenset(), board: Board | None = None) -> None:
         self.uninterruptible = uninterruptible
         self._board = board
-        self._before: dict[int, Any] = {}
-        self._waiting: int | None = None
+        self._previous_handlers: dict[int, Any] = {}
+        self._pending_signal: int | None = None
         self._watched = self._is_persistent = self._deferring = False
 
     def install(self) -> None:
         """Replace the current signal handlers; if the program ignores Ctrl-C (SIGINT), it remains ignored."""
-        if self._before or self._watched:
+        if self._previous_handlers or self._watched:
             return
         if threading.current_thread() is not threading.main_thread():
             if self._board is not None:
@@ -214,7 +214,7 @@ class SignalHandlers:
             if number is None or (name == "SIGINT" and signal.getsignal(number) in (signal.SIG_IGN, None)):
                 continue
             # Store the old handler first, so that a signal between the two statements can be handled.
-            self._before[number] = signal.getsignal(number)
+            self._previous_handlers[number] = signal.getsignal(number)
             signal.signal(number, self._handle)
 
     def keep(self) -> None:
@@ -243,16 +243,16 @@ class SignalHandlers:
 
     def ignore(self) -> None:
         """Ignore further termination signals, because the process is about to exit."""
-        for number in self._before:
+        for number in self._previous_handlers:
             signal.signal(number, signal.SIG_IGN)
-        self._before = {}
+        self._previous_handlers = {}
 
     def deliver(self) -> None:
         """Raise the exception of a deferred signal, if any; do nothing while signals are being deferred."""
         if self._deferring:
             return
-        number, self._waiting = self._waiting, None
-        if number is not None and (number == signal.SIGINT or self._before):
+        number, self._pending_signal = self._pending_signal, None
+        if number is not None and (number == signal.SIGINT or self._previous_handlers):
             signal.raise_signal(number)
         elif number is not None:
             _end(number)
@@ -262,14 +262,14 @@ class SignalHandlers:
         if self._board is not None and self._watched:
             self._watched = False
             INTERRUPT_WATCH.remove(self._board)
-        if not self._before or threading.current_thread() is not threading.main_thread():
+        if not self._previous_handlers or threading.current_thread() is not threading.main_thread():
             return
         mask = getattr(signal, "pthread_sigmask", None)
-        mask_before = None if mask is None else mask(signal.SIG_BLOCK, self._before)
+        mask_before = None if mask is None else mask(signal.SIG_BLOCK, self._previous_handlers)
         try:
-            for number, handler in self._before.items():
+            for number, handler in self._previous_handlers.items():
                 signal.signal(number, handler)
-            self._before = {}
+            self._previous_handlers = {}
         finally:
             if mask is not None:
                 mask(signal.SIG_SETMASK, mask_before)
@@ -279,9 +279,9 @@ class SignalHandlers:
         while at is not None and at.f_code not in self.uninterruptible:
             at = at.f_back
         if self._deferring or at is not None:
-            self._waiting = number
+            self._pending_signal = number
             return
-        handler = self._before.get(number)
+        handler = self._previous_handlers.get(number)
         try:
             if number == signal.SIGINT and callable(handler):
                 handler(number, frame)
@@ -496,13 +496,13 @@ def _try_step(name: str, step: Callable[[], None], errors: list[str]) -> bool:
         try:
             step()
         except (KeyboardInterrupt, SystemExit) as error:
-            why: BaseException | str = str(error) or "interrupted twice"
+            reason: BaseException | str = str(error) or "interrupted twice"
         except BaseException as error:
-            why = error
+            reason = error
             break
         else:
             return True
-    errors.append(f"{name} failed: {why}")
+    errors.append(f"{name} failed: {reason}")
     return False
 
 
@@ -578,8 +578,8 @@ class Rig:
     def __enter__(self) -> Rig:
         board = self.board
         check_thread(board)
-        earlier: OutputGate | None = getattr(board, "gate", None)
-        if earlier is not None and earlier.running:
+        previous_gate: OutputGate | None = getattr(board, "gate", None)
+        if previous_gate is not None and previous_gate.running:
             raise RigFault(f"{board.name}: another thread has not returned from a run on this board; wait for it")
         board.gate = self._gate
         try:
@@ -588,10 +588,10 @@ class Rig:
             board.open()
             board.configure(self.rate)
             board.set_expiration()
-            missing = board.unsafe()
-            if missing is not None:
+            missing_state = board.unsafe()
+            if missing_state is not None:
                 raise RigFault(
-                    f"{board.name}: {missing}; the motors are not started without a watchdog that stops them"
+                    f"{board.name}: {missing_state}; the motors are not started without a watchdog that stops them"
                 )
             board.start_watchdog(self.watchdog)
             board.start(self.rate)

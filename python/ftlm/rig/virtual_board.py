@@ -112,8 +112,8 @@ class VirtualBoard:
         check_rate(rate)
         self._rate = rate
         self._arm = self.parameters.arm(1.0 / rate, self.horizon + 2.0)
-        for what, channel, seconds, number in map(_checked_injection, self.inject):
-            self._arm.inject(what, channel, round((seconds + REST_DURATION_S) * rate), number)
+        for kind, channel, seconds, number in map(_checked_injection, self.inject):
+            self._arm.inject(kind, channel, round((seconds + REST_DURATION_S) * rate), number)
         self.write((0.0, 0.0))
 
     def set_expiration(self) -> None:
@@ -321,14 +321,14 @@ def _checked_injection(fault: object) -> tuple[str, int, float, float]:
     name, channel, time_s, number = fault
     check_choice("the injected fault", name, FAULT_INJECTIONS)
     count, meaning = _FAULT_CHANNELS.get(name, 1), FAULT_INJECTIONS[name]
-    where, when, value = whole_number(channel), finite_number(time_s), finite_number(number)
-    if where is None or not 0 <= where < count:
+    channel_index, time, value = whole_number(channel), finite_number(time_s), finite_number(number)
+    if channel_index is None or not 0 <= channel_index < count:
         channels_text = "has the channel 0 only" if count == 1 else f"has the channels 0 to {count - 1}"
         raise ModelError(f"inject has {name!r} on channel {short_repr(channel)}; the fault {channels_text}")
-    if when is None or not 0 <= when <= MAX_RUN_DURATION_S:
+    if time is None or not 0 <= time <= MAX_RUN_DURATION_S:
         raise ModelError(
             f"inject has {name!r} at {short_repr(time_s)} s; give a time of the run, from 0 to {MAX_RUN_DURATION_S:g} s"
         )
     if value is None or (name == "late" and value < 0):
         raise ModelError(f"inject has {name!r} with the number {short_repr(number)}; give {meaning or '0'}")
-    return name, where, when, value
+    return name, channel_index, time, value

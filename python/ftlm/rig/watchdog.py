@@ -119,24 +119,24 @@ def watch(path: str, *, keep: bool) -> None:
     """
     page = RegisterPage(path)
     parent = os.getppid()
-    began = time.monotonic()
-    beat, last = page.get("beat"), began
+    start_time = time.monotonic()
+    beat, last_beat = page.get("beat"), start_time
     page.set("ready", 1)
     armed = False
     try:
         while not page.get("closed"):
             timeout = page.get("timeout")
-            now = time.monotonic()
+            current_time = time.monotonic()
             beat_now = page.get("beat")
             if beat_now != beat or not armed:
-                beat, last = beat_now, now
-                page.set("last_beat", now)
+                beat, last_beat = beat_now, current_time
+                page.set("last_beat", current_time)
             armed = timeout > 0
-            if armed and now - last > timeout:
-                trip(page, now)
-                if os.getppid() != parent or now - last > _ORPHAN_TIMEOUT_S:
+            if armed and current_time - last_beat > timeout:
+                trip(page, current_time)
+                if os.getppid() != parent or current_time - last_beat > _ORPHAN_TIMEOUT_S:
                     break
-            elif not armed and (os.getppid() != parent or now - began > _ORPHAN_TIMEOUT_S):
+            elif not armed and (os.getppid() != parent or current_time - start_time > _ORPHAN_TIMEOUT_S):
                 break
             time.sleep(min(0.005, timeout / 20.0) if armed else 0.005)
     finally:
@@ -146,14 +146,14 @@ def watch(path: str, *, keep: bool) -> None:
                 os.unlink(path)
 
 
-def trip(page: RegisterPage, now: float) -> None:
+def trip(page: RegisterPage, current_time: float) -> None:
     """Mark the watchdog as expired, and apply the expiration states to the outputs by the rules of the real board.
 
-    `now` is the time [s] that the first call records as the time of expiry. Repeated calls apply the states again, and
-    thus override outputs that the program has written in the meantime.
+    `current_time` is the time [s] that the first call records as the time of expiry. Repeated calls apply the states
+    again, and thus override outputs that the program has written in the meantime.
     """
     if not page.has_expired:
-        page.set("tripped", now)
+        page.set("tripped", current_time)
         page.set("expired", 1)
     states = page.get("state1"), page.get("state2")
     if page.get("tristate") and not any(math.isnan(s) for s in states):

@@ -109,8 +109,8 @@ def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
 
     With `power_of_two`, the number is rounded down to a power of two, which Haar rows require.
     """
-    carried = min(run.length for run in runs) - 1
-    m = min(DEFAULT_PULSES, carried)
+    max_m = min(run.length for run in runs) - 1
+    m = min(DEFAULT_PULSES, max_m)
     return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
 
 
@@ -122,29 +122,30 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     """
     m = check_pulses(m, math.inf)
     for run in runs:
-        carried = run.length - 1
-        if m > carried:
+        max_m = run.length - 1
+        if m > max_m:
             raise ModelError(
-                f"{setting('m')} {m} is more than run {run.name!r} allows: {run.length} rows give {carried} pulses; "
-                f"use m = {carried} or less"
+                f"{setting('m')} {m} is more than run {run.name!r} allows: {run.length} rows give {max_m} pulses; "
+                f"use m = {max_m} or less"
             )
     if power_of_two and m & (m - 1):
-        below = 1 << (m.bit_length() - 1)
+        lower_power = 1 << (m.bit_length() - 1)
         raise ModelError(
-            f"{setting('m')} {m} is not a power of two, which Haar rows need; take m = {below} or {2 * below}, or "
+            f"{setting('m')} {m} is not a power of two, which Haar rows need; take m = {lower_power} or "
+            f"{2 * lower_power}, or "
             f"{parameter('row_basis', 'time')}"
         )
     return m
 
 
-def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True) -> Record:
+def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, local_smoothing: bool = True) -> Record:
     """Return the block-pulse record of a run for a structure, with delays and sensor filter applied.
 
     The record has a row for each signal and each non-linear term. Between samples, outputs are linear and inputs follow
     the intersample behavior of the run. `m` is the number of block pulses. It may exceed the number of sampling
     intervals only if nothing is compared with measurements. With `filtered`, the sensor filter is applied to signals
-    that were not measured through it; the equation error requires this. With `smooth`, signals are smoothed if a
-    non-linear term contains their derivatives. Missing samples of outputs are interpolated, and must not be fitted.
+    that were not measured through it; the equation error requires this. With `local_smoothing`, signals are smoothed if
+    a non-linear term contains their derivatives. Missing samples of outputs are interpolated, and must not be fitted.
 
     Raise FtlmError for a missing signal, a signal whose squares underflow, a delay of an output or a missing sample of
     an input.
@@ -157,7 +158,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smo
     return Record(
         signals,
         step,
-        make_read_only(append_columns(run, structure, means, step, smooth=smooth)),
+        make_read_only(append_columns(run, structure, means, step, local_smoothing=local_smoothing)),
         tuple(s in run.inputs or s not in structure.signals for s in signals),
         sensor,
         initial,
@@ -206,9 +207,9 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
 
 def _missing_signals_text(run: Run, structure: Structure) -> str:
     """Return the error message on signals that a run lacks, with the options that select columns for them."""
-    lacking = [n for n in structure.signals if n not in run and not n.startswith(COULOMB_PREFIX)]
-    roles = {"outputs": [n for n in lacking if n in structure.outputs]}
-    roles["inputs"] = [n for n in lacking if n not in roles["outputs"]]
+    missing = [n for n in structure.signals if n not in run and not n.startswith(COULOMB_PREFIX)]
+    roles = {"outputs": [n for n in missing if n in structure.outputs]}
+    roles["inputs"] = [n for n in missing if n not in roles["outputs"]]
     column = Placeholder("column")
     options = [
         choose_text(
@@ -221,11 +222,12 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
         f"{', '.join(f'{n} = {QUOTED_COLUMN}' for n in names)} under [{role}]" for role, names in roles.items() if names
     ]
     in_a_file = f", or in a file for {parameter('columns')} with {' and '.join(lines)}"
-    what = f"signal {lacking[0]!r}{nearest(lacking[0], run.signals)}"
-    if len(lacking) > 1:
-        what = f"signals {', '.join(map(repr, lacking))}"
+    description = f"signal {missing[0]!r}{nearest(missing[0], run.signals)}"
+    if len(missing) > 1:
+        description = f"signals {', '.join(map(repr, missing))}"
     return (
-        f"run {run.name!r} has no {what}, which the model needs; it has {', '.join(run.signals)}: name the columns "
+        f"run {run.name!r} has no {description}, which the model needs; it has {', '.join(run.signals)}: name the "
+        "columns "
         f"with {choose_text(' and ', ' ').join(options)}{choose_text(in_a_file, in_a_file, '')}"
     )
 
@@ -247,10 +249,10 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         "filtered": structure.is_filtered(name),
         "enters_others": any(name in t.signals for e in structure.equations if e.output != name for t in e.terms),
     }
-    moving = name.removeprefix(COULOMB_PREFIX)
-    if name not in run and moving != name and moving in run:
+    signal = name.removeprefix(COULOMB_PREFIX)
+    if name not in run and signal != name and signal in run:
         # The sign of the measured rate over each interval. The last value is repeated, so that there are N values.
-        rate = np.sign(np.diff(run[moving]))
+        rate = np.sign(np.diff(run[signal]))
         return {**channel, "samples": np.append(rate, rate[-1])}
     if name not in run:
         raise DataError(_missing_signals_text(run, structure))
@@ -277,9 +279,10 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
 def _check_known_inputs(structure: Structure) -> None:
     """Raise ModelError if the structure has a free delay, saturation or dead zone."""
     for item in structure.free_inputs:
-        what, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
+        description, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
         raise ModelError(
-            f"the {item.words} is free: only {parameter('method', 'output-error')} estimates {what}; give its {value}"
+            f"the {item.words} is free: only {parameter('method', 'output-error')} estimates {description}; give "
+            f"its {value}"
         )
 
 
@@ -297,20 +300,20 @@ def check_derivative_orders(run: Run, structure: Structure, order_values: Mappin
     zero-order-hold input must be at most alpha, because jumps have no derivative. `order_values` are values of free
     orders by name; terms with other free orders are not checked.
     """
-    for item in structure.equations:
-        alpha = item.order.substitute(order_values or {})
-        for term in item.terms:
+    for equation in structure.equations:
+        alpha = equation.order.substitute(order_values or {})
+        for term in equation.terms:
             order = term.order.substitute(order_values or {})
             if alpha.names or order.names or order.constant <= alpha.constant + ORDER_RESOLUTION:
                 continue
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
                 raise ModelError(
                     f"order {order.constant:g} of {term.signal} is above alpha = {alpha.constant:g} of "
-                    f"{item.output}, and {term.signal} of run {run.name!r} has a zero-order hold, whose jumps have "
+                    f"{equation.output}, and {term.signal} of run {run.name!r} has a zero-order hold, whose jumps have "
                     f"no derivative; reduce the order, or set {parameter('intersample', 'foh')} if the signal is "
                     "linear between samples"
                 )
-            _check_excess_order(term.signal, order.constant, item.output, alpha.constant)
+            _check_excess_order(term.signal, order.constant, equation.output, alpha.constant)
 
 
 def _check_excess_order(signal: str, order: float, output: str, alpha: float) -> None:
@@ -326,7 +329,7 @@ def _check_excess_order(signal: str, order: float, output: str, alpha: float) ->
 
 
 def records(
-    runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True
+    runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True, local_smoothing: bool = True
 ) -> list[Record]:
     """Return the block-pulse records of several runs; see :func:`record`.
 
@@ -335,20 +338,23 @@ def records(
     """
 
     def build() -> list[Record]:
-        return [record(run, resolve_start([run], structure), m, filtered=filtered, smooth=smooth) for run in runs]
+        return [
+            record(run, resolve_start([run], structure), m, filtered=filtered, local_smoothing=local_smoothing)
+            for run in runs
+        ]
 
     if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
         return build()
     filtered = filtered or structure.sensor_filter is None
     inputs = (structure.delay, structure.free_delays, structure.limits)
-    read = (record_signals(structure), inputs, structure.sensor_filter, structure.initial)
+    settings = (record_signals(structure), inputs, structure.sensor_filter, structure.initial)
     start = (
         structure.offset,
         structure.outputs,
         has_memory(structure),
         [e.order.constant for e in structure.equations],
     )
-    return list(runs.get_or_compute(repr((read, start, m, filtered, smooth)), build))
+    return list(runs.get_or_compute(repr((settings, start, m, filtered, local_smoothing)), build))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -384,18 +390,19 @@ def _check_missing(run: Run, structure: Structure) -> None:
     if not missing:
         return
     outputs, coupled = structure.outputs, structure.coupling == "simulated"
-    drivers = {
+    input_signals = {
         name: e.output
         for e in structure.equations
         for name in (s.removeprefix(COULOMB_PREFIX) if s not in run else s for s in e.signals)
         if name != e.output and not (coupled and name in outputs)
     }
-    lacking = next((name for name in missing if name in drivers), None)
-    if lacking is not None:
-        mask = missing[lacking]
+    first_missing = next((name for name in missing if name in input_signals), None)
+    if first_missing is not None:
+        mask = missing[first_missing]
         raise DataError(
-            f"signal {lacking!r} of run {run.name!r} has no value in {plural(int(mask.sum()), 'row')}, first row "
-            f"{int(np.flatnonzero(mask)[0])}, and enters the equation of {drivers[lacking]} as measured; fill these "
+            f"signal {first_missing!r} of run {run.name!r} has no value in {plural(int(mask.sum()), 'row')}, first row "
+            f"{int(np.flatnonzero(mask)[0])}, and enters the equation of {input_signals[first_missing]} as "
+            "measured; fill these "
             f"rows yourself, avoid them with {parameter('window')}, or use {parameter('coupling', 'simulated')}"
         )
     if structure.all_filtered and any(name in missing for name in outputs):
@@ -418,7 +425,7 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
             )
 
 
-def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
+def structure_tuple(equation: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
     """Return a linear equation as (output index, alpha, [(signal index, order), …]), the form that the Rust core takes.
 
     All orders must be numbers.
@@ -428,19 +435,19 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
     ModelError
         If the equation has friction or another non-linear term.
     """
-    check_frictionless([item], "a method that is linear in the coefficients")
-    return linear_tuple(item, signals)
+    check_frictionless([equation], "a method that is linear in the coefficients")
+    return linear_tuple(equation, signals)
 
 
 def check_linear(equations: Sequence[Equation], what: str) -> None:
     """Raise ModelError if an equation has friction or a non-linear term; `what` names the analysis."""
     check_frictionless(equations, what)
-    for item in equations:
-        for term in item.nonlinear_terms:
+    for equation in equations:
+        for term in equation.nonlinear_terms:
             point = parameter("at", dict.fromkeys(term.signals, 0.3))
             linear = choose_text(f"model.linearized({point})", "Model.linearized in Python")
             raise ModelError(
-                f"the equation of {item.output} has the non-linear term {term}, and {what} needs a linear model; "
+                f"the equation of {equation.output} has the non-linear term {term}, and {what} needs a linear model; "
                 f"use the linear model about an operating point, {linear}, or simulations (simulate, compare)"
             )
 
@@ -450,25 +457,25 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
 
     `what` names the analysis in the message.
     """
-    for item in equations:
-        if item.friction is not None:
+    for equation in equations:
+        if equation.friction is not None:
             raise ModelError(
-                f"the equation of {item.output} has friction, and {what} needs a linear model; use "
+                f"the equation of {equation.output} has friction, and {what} needs a linear model; use "
                 f"{parameter('method', 'output-error')} and simulations (simulate, compare), or remove the friction"
             )
 
 
-def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
+def linear_tuple(equation: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
     """Return an equation without its friction as (output index, alpha, [(signal index, order), …]), for Rust.
 
     `signals` are the rows of the record. A non-linear term has the index of its row; raise ModelError if there is
     no such row.
     """
     index = {name: i for i, name in enumerate(signals)}
-    if any(t.column not in index for t in item.nonlinear_terms):
-        check_linear([item], "a computation on the signals alone")
-    terms = [(index[t.column], t.order.constant) for t in item.terms]
-    return index[item.output], item.order.constant, terms
+    if any(t.column not in index for t in equation.nonlinear_terms):
+        check_linear([equation], "a computation on the signals alone")
+    terms = [(index[t.column], t.order.constant) for t in equation.terms]
+    return index[equation.output], equation.order.constant, terms
 
 
 def derived_signals(structure: Structure) -> list[_core._Derived]:
@@ -486,7 +493,7 @@ def derived_signals(structure: Structure) -> list[_core._Derived]:
 
 
 def order_grid_tuple(
-    item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
+    equation: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
     """Return an equation with grids of orders in the form that the Rust core takes.
 
@@ -498,8 +505,8 @@ def order_grid_tuple(
     def axis(order: Order) -> list[float]:
         return list(values[order.names[0]]) if order.names else [order.constant]
 
-    terms = [(signals.index(t.column), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
-    return signals.index(item.output), axis(item.order), terms
+    terms = [(signals.index(t.column), axis(t.order), bool(t.order.names) and t.fixed is None) for t in equation.terms]
+    return signals.index(equation.output), axis(equation.order), terms
 
 
 def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
@@ -509,21 +516,21 @@ def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
 
 
 def equation_tuple(
-    item: Equation, signals: Sequence[str]
+    equation: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
     """Return an identified linear equation in the form of :func:`structure_tuple`, and its coefficient values."""
-    for term in item.terms:
-        _check_excess_order(term.signal, term.order.constant, item.output, item.order.constant)
-    return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
+    for term in equation.terms:
+        _check_excess_order(term.signal, term.order.constant, equation.output, equation.order.constant)
+    return structure_tuple(equation, signals), [float(t.fixed or 0.0) for t in equation.terms]
 
 
 def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
     """Return initial conditions, offset and number of filter states in the form of :data:`InitialTuple`."""
     powers = [] if isinstance(initial, str) else list(initial)
-    decided = (initial == "caputo", powers)
+    fixed_terms = (initial == "caputo", powers)
     if states:
-        return (*decided, ("none", "constant", "ramp", "level").index(offset), states)
-    return decided if offset == "none" else (*decided, ("none", "constant", "ramp", "level").index(offset))
+        return (*fixed_terms, ("none", "constant", "ramp", "level").index(offset), states)
+    return fixed_terms if offset == "none" else (*fixed_terms, ("none", "constant", "ramp", "level").index(offset))
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
@@ -538,7 +545,7 @@ def prepare(
     *,
     power_of_two: bool,
     gaps: bool = False,
-    smooth: bool = True,
+    local_smoothing: bool = True,
 ) -> list[Record]:
     """Return the block-pulse records of runs for an equation-error estimator, with common initial conditions.
 
@@ -560,39 +567,48 @@ def prepare(
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
-    prepared = records(runs, structure, m, smooth=smooth)
+    prepared = records(runs, structure, m, local_smoothing=local_smoothing)
     common = common_initial_conditions([r.initial for r in prepared])
     if common is not None:
         # All runs of a fit have the same initial terms; those of a run from rest are estimated as zero.
-        prepared = records(runs, replace(structure, initial=common), m, smooth=smooth)
+        prepared = records(runs, replace(structure, initial=common), m, local_smoothing=local_smoothing)
     for run, rec in [] if gaps else zip(runs, prepared, strict=True):
         check_columns(run, structure, dict(zip(rec.signals, rec.means, strict=True)), rec.step)
-    for item in structure.equations:
-        for term in item.terms:
-            if term.fixed is None and term.column != item.output and not any(r.of(term.column).any() for r in prepared):
+    for equation in structure.equations:
+        for term in equation.terms:
+            if (
+                term.fixed is None
+                and term.column != equation.output
+                and not any(r.of(term.column).any() for r in prepared)
+            ):
                 raise DataError(
-                    f"{term.column} is 0 in all rows, so its coefficient in the equation of {item.output} cannot be "
+                    f"{term.column} is 0 in all rows, so its coefficient in the equation of {equation.output} "
+                    "cannot be "
                     "identified; remove the term, fix its coefficient, or add a run in which the signal is not 0"
                 )
-            if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):
+            if structure.offset in ("constant", "ramp") and _is_offset(term, equation, prepared):
                 raise DataError(
                     f"{term.column} is constant on every run, so {term} and the offset in the equation of "
-                    f"{item.output} are not separately identifiable; add a run in which it changes, fix its "
+                    f"{equation.output} are not separately identifiable; add a run in which it changes, fix its "
                     f"coefficient, or use {parameter('offset', 'none')}"
                 )
     return prepared
 
 
-def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
+def _is_offset(term: Term, equation: Equation, prepared: Sequence[Record]) -> bool:
     """Whether a free term of order 0 has a constant signal in every run, so that it is equivalent to an offset."""
-    if term.fixed is not None or term.column == item.output or term.order.names or term.order.constant != 0:
+    if term.fixed is not None or term.column == equation.output or term.order.names or term.order.constant != 0:
         return False
     return all(float(np.ptp(r.of(term.column))) == 0.0 for r in prepared)
 
 
-def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
-    """Return the free coefficients by name: the estimates `raw` divided by the known factor of each term."""
-    return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
+def named_coefficients(equation: Equation, values: Sequence[float]) -> dict[str, float]:
+    """Return the free coefficients by name: the estimates `values` divided by the known factor of each term."""
+    return {
+        t.coefficient: c / t.factor
+        for t, c in zip(equation.terms, values, strict=True)
+        if isinstance(t.coefficient, str)
+    }
 
 
 def has_nonuniform_samples(run: Run, structure: Structure) -> bool:

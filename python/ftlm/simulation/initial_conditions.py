@@ -159,30 +159,30 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
         # A constant output gives no evidence, for example in a run that is only an input for a simulation.
         return None
-    moves = [_change_indices(run[n]) for n in inputs]
-    quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
-    if quiet >= START_SETTINGS.quiet_rows:
+    change_indices = [_change_indices(run[n]) for n in inputs]
+    rest_length = min((int(rows[0]) for rows in change_indices if rows.size), default=0)
+    if rest_length >= START_SETTINGS.quiet_rows:
         levels = {}
-        visible = any(run[n][0] != 0.0 for n in inputs)
+        has_nonzero_input = any(run[n][0] != 0.0 for n in inputs)
         # A command that changes often may have changed before the run, so a longer quiet phase is required.
-        has_held_input = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
+        has_sampled_hold = has_nonzero_input and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
         for name in outputs:
             noise = noise_at_start(run[name])
-            rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
+            rows = _without_outliers(drop_missing(run[name][:rest_length]), noise)
             if rows.size < START_SETTINGS.quiet_rows or not _is_at_rest(rows, noise):
                 return None
             drift_error = noise * run.length / _noise_to_slope_error_ratio(rows.size)
-            if has_held_input and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
+            if has_sampled_hold and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
                 return None
             levels[name] = float(np.mean(rows))
-            size = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
-            visible |= abs(levels[name]) > size
-        return RestEvidence(quiet, levels, {n: float(run[n][0]) for n in inputs}, visible)
+            threshold = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
+            has_nonzero_input |= abs(levels[name]) > threshold
+        return RestEvidence(rest_length, levels, {n: float(run[n][0]) for n in inputs}, has_nonzero_input)
     constant = all(_change_indices(run[n][1:]).size == 0 for n in inputs)
     if not constant or not any(np.any(run[n][1:]) for n in inputs):
         return None
-    first = {n: float(drop_missing(run[n])[0]) for n in outputs}
-    return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not all(is_rest(run[n]) for n in outputs))
+    first_values = {n: float(drop_missing(run[n])[0]) for n in outputs}
+    return RestEvidence(0, first_values, dict.fromkeys(inputs, 0.0), not all(is_rest(run[n]) for n in outputs))
 
 
 def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
@@ -235,9 +235,9 @@ def _is_at_rest(rows: Floats, noise: float) -> bool:
 
 def _without_outliers(rows: Floats, noise: float) -> Floats:
     """Return samples without a few values far from the median; more such values are not outliers and are kept."""
-    near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
-    few = max(1.0, START_SETTINGS.outlier_share * rows.size)
-    return rows[near] if np.count_nonzero(~near) <= few else rows
+    is_inlier = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
+    max_outliers = max(1.0, START_SETTINGS.outlier_share * rows.size)
+    return rows[is_inlier] if np.count_nonzero(~is_inlier) <= max_outliers else rows
 
 
 def _noise_to_slope_error_ratio(rows: int) -> float:
@@ -263,8 +263,8 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     available = [f for f in evidence if f is not None]
     constant = structure.offset == "constant" and any(f.rows == 0 for f in available)
     direct = any(t.order == e.order for e in structure.equations for t in e.terms)
-    shown = any(f.shows_level and not (direct and f.rows == 0) for f in available)
-    offset = "level" if constant or shown else structure.offset
+    has_level = any(f.shows_level and not (direct and f.rows == 0) for f in available)
+    offset = "level" if constant or has_level else structure.offset
     initial = "rest" if automatic and len(available) == len(evidence) else structure.initial
     return replace(structure, initial=initial, offset=offset)
 
@@ -288,9 +288,9 @@ def deviations(
     if not levels_nonzero:
         return run, levels
     samples = {n: run[n] - v for n, v in levels_nonzero.items()}
-    read = run.sample_times
-    own = None if read is None else {n: read.data[n] - v for n, v in levels_nonzero.items()}
-    shifted = run.with_samples(samples, own)
+    nonuniform = run.sample_times
+    shifted_samples = None if nonuniform is None else {n: nonuniform.data[n] - v for n, v in levels_nonzero.items()}
+    shifted = run.with_samples(samples, shifted_samples)
     if run.unmasked_run is not None:
         shifted = shifted.with_unmasked_run(deviations(run.unmasked_run, structure, output_levels)[0])
     return shifted, levels
@@ -312,21 +312,23 @@ def history(run: Run, structure: Structure) -> History:
 
     Their number increases with the signal-to-noise ratio of the outputs.
     """
-    visible = 1.0
+    signal_to_noise = 1.0
     for name in structure.outputs:
         if name in run:
             samples = drop_missing(run[name])
             # Without an offset, the mean is an effect of past inputs. An offset represents the mean itself.
-            size = vector_norm(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
-            if size:
-                visible = max(visible, size / max(estimate_noise(run[name]), np.finfo(np.float64).eps * size))
+            norm = vector_norm(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
+            if norm:
+                signal_to_noise = max(
+                    signal_to_noise, norm / max(estimate_noise(run[name]), np.finfo(np.float64).eps * norm)
+                )
     quarters = REFERENCE_QUARTERS + math.ceil(
-        math.log(visible / REFERENCE_SIGNAL_RATIO) / math.log(SIGNAL_RATIO_PER_QUARTER)
+        math.log(signal_to_noise / REFERENCE_SIGNAL_RATIO) / math.log(SIGNAL_RATIO_PER_QUARTER)
     )
     quarters = max(MIN_QUARTERS, min(quarters, MAX_QUARTERS, run.length // MIN_SAMPLES_PER_QUARTER))
     highest = max((e.order.constant for e in structure.equations if not e.order.names), default=0.0)
-    whole = range(max(MIN_INTEGER_POWERS, math.ceil(highest)))
-    return History(sorted({*(POWER_INCREMENT * k for k in range(quarters + 1)), *map(float, whole)}))
+    integer_powers = range(max(MIN_INTEGER_POWERS, math.ceil(highest)))
+    return History(sorted({*(POWER_INCREMENT * k for k in range(quarters + 1)), *map(float, integer_powers)}))
 
 
 def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
@@ -365,7 +367,9 @@ def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure)
     return common_initial_conditions(starts) or starts[0]
 
 
-def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
+def huber_loss_excess(
+    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], deviations: Sequence[float]
+) -> float:
     """Return the excess of the Huber loss with few initial terms over that with many, in units of the noise variance.
 
     The excess is summed over outputs; outputs with residuals of rounding size are omitted. If the few terms are
@@ -373,32 +377,37 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 
     Parameters
     ----------
-    few, many
+    few_term_residuals, many_term_residuals
         Residuals of each output with few and with many terms; infinite if the simulation is not finite, NaN at missing
         samples.
-    sizes
+    deviations
         Standard deviation of each measured output.
     """
     excess = 0.0
-    for one, other, size in zip(few, many, sizes, strict=True):
-        is_finite = ~np.isnan(one)
-        if float(np.sqrt(np.mean(one[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * size:
-            excess += huber_excess(one[is_finite], other[is_finite])
+    for few_series, many_series, deviation in zip(few_term_residuals, many_term_residuals, deviations, strict=True):
+        is_finite = ~np.isnan(few_series)
+        if float(np.sqrt(np.mean(few_series[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * deviation:
+            excess += huber_excess(few_series[is_finite], many_series[is_finite])
     return excess
 
 
-def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the larger of :func:`misfit` and a quarter of the excess of the sum of squares, for two separate fits.
+def loss_excess_of_fits(
+    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], deviations: Sequence[float]
+) -> float:
+    """Return the larger of :func:`huber_loss_excess` and a quarter of the excess sum of squares, for two fits.
 
-    The excess is divided by the noise variance. Arguments are those of :func:`misfit`.
+    The excess is divided by the noise variance. Arguments are those of :func:`huber_loss_excess`.
     """
     squares = 0.0
-    for one, other, size in zip(few, many, sizes, strict=True):
-        is_finite = ~np.isnan(one)
-        floor, above = float(np.mean(other[is_finite] ** 2)), float(np.sum(one[is_finite] ** 2 - other[is_finite] ** 2))
-        if math.sqrt(float(np.mean(one[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * size:
-            squares += above / floor if floor > 0.0 else math.inf
-    return max(misfit(few, many, sizes), SQUARES_WEIGHT * squares)
+    for few_series, many_series, deviation in zip(few_term_residuals, many_term_residuals, deviations, strict=True):
+        is_finite = ~np.isnan(few_series)
+        floor, squares_excess = (
+            float(np.mean(many_series[is_finite] ** 2)),
+            float(np.sum(few_series[is_finite] ** 2 - many_series[is_finite] ** 2)),
+        )
+        if math.sqrt(float(np.mean(few_series[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * deviation:
+            squares += squares_excess / floor if floor > 0.0 else math.inf
+    return max(huber_loss_excess(few_term_residuals, many_term_residuals, deviations), SQUARES_WEIGHT * squares)
 
 
 def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
@@ -416,29 +425,41 @@ def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Flo
     of samples is divided by the variance inflation of the `reference` residuals, which must be the same for all
     compared fits. A smooth misfit then has the same weight in all of them.
     """
-    score, total = 0.0, 0.0
-    for own, other in zip(residuals, reference, strict=True):
-        differences = drop_missing(own)
-        size = differences.size / variance_inflation(drop_missing(other))
-        total += size
-        score += size * math.log(max(float(np.mean(differences**2)), 1e-300))
-    return score + math.log(max(total, 1.0)) * terms
+    score, effective_total = 0.0, 0.0
+    for series, reference_series in zip(residuals, reference, strict=True):
+        differences = drop_missing(series)
+        effective_count = differences.size / variance_inflation(drop_missing(reference_series))
+        effective_total += effective_count
+        score += effective_count * math.log(max(float(np.mean(differences**2)), 1e-300))
+    return score + math.log(max(effective_total, 1.0)) * terms
 
 
 def needs_history(
-    structure: Structure, few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float], terms: tuple[int, int]
+    structure: Structure,
+    few_term_residuals: Sequence[Floats],
+    many_term_residuals: Sequence[Floats],
+    deviations: Sequence[float],
+    terms: tuple[int, int],
 ) -> bool:
     """Whether residuals with Caputo's initial terms are so large that terms for past inputs (a history) are required.
 
-    `few` and `many` are the residuals of each output with Caputo's terms and with a history. `terms` are the numbers of
-    these terms, and `sizes` the standard deviations of the outputs.
+    `few_term_residuals` and `many_term_residuals` are the residuals of each output with Caputo's terms and with a
+    history. `terms` are the numbers of these terms, and `deviations` the standard deviations of the outputs.
 
     The powers of t of a history can also fit an effect that the structure lacks. The threshold is therefore higher for
     colored residuals.
     """
-    more = terms[1] - terms[0]
-    finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))
-    if finite and more > 0 and max(variance_inflation(drop_missing(r)) for r in many) > START_SETTINGS.white_inflation:
-        return start_score(many, terms[1], few) + START_SETTINGS.history_margin < start_score(few, terms[0], few)
+    additional_terms = terms[1] - terms[0]
+    finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few_term_residuals, *many_term_residuals))
+    if (
+        finite
+        and additional_terms > 0
+        and max(variance_inflation(drop_missing(r)) for r in many_term_residuals) > START_SETTINGS.white_inflation
+    ):
+        return start_score(
+            many_term_residuals, terms[1], few_term_residuals
+        ) + START_SETTINGS.history_margin < start_score(few_term_residuals, terms[0], few_term_residuals)
     significance_level = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
-    return more > 0 and misfit_of_fits(few, many, sizes) > chi_squared(more, significance_level)
+    return additional_terms > 0 and loss_excess_of_fits(
+        few_term_residuals, many_term_residuals, deviations
+    ) > chi_squared(additional_terms, significance_level)

@@ -38,25 +38,27 @@ def has_derivative_channels(structure: Structure) -> bool:
     return any(order > 0 for item in nonlinear_columns(structure).values() for _, order in item.channels)
 
 
-def append_columns(run: Run, structure: Structure, means: Floats, step: float, *, smooth: bool) -> Floats:
+def append_columns(run: Run, structure: Structure, means: Floats, step: float, *, local_smoothing: bool) -> Floats:
     """Return block-pulse means of shape (signals, pulses) with a further row for each non-linear term.
 
     An expression is evaluated at the means of its signals, which is accurate to second order in the `step` [s]. Means
-    are smoothed before differentiation if `smooth` is True. A row is NaN where its expression is not finite. The whole
-    row is NaN with a sensor filter, or if its expression contains the derivative of a zero-order-hold input; see
-    :func:`check_columns`.
+    are smoothed before differentiation if `local_smoothing` is True. A row is NaN where its expression is not finite.
+    The whole row is NaN with a sensor filter, or if its expression contains the derivative of a zero-order-hold input;
+    see :func:`check_columns`.
     """
     columns = nonlinear_columns(structure)
     if not columns:
         return means
     rows = dict(zip(structure.signals, means, strict=True))
-    unknown = np.full(means.shape[1], np.nan)
+    undefined = np.full(means.shape[1], np.nan)
     values: dict[Channel, Floats] = {}
     for signal, order in dict.fromkeys(c for item in columns.values() for c in item.channels):
         if structure.sensor_filter is not None or _is_held(run, signal, order):
-            values[signal, order] = unknown
+            values[signal, order] = undefined
         else:
-            values[signal, order] = differentiate(rows[signal], order, step, smooth=smooth) if order else rows[signal]
+            values[signal, order] = (
+                differentiate(rows[signal], order, step, local_smoothing=local_smoothing) if order else rows[signal]
+            )
     row_values = [np.asarray(item.evaluate(values), dtype=np.float64) for item in columns.values()]
     return np.vstack([means, *(np.where(np.isfinite(row), row, np.nan) for row in row_values)])
 
@@ -77,8 +79,8 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
         If a term contains the derivative of a zero-order-hold input, or the structure has a sensor filter.
     """
     for name, item in nonlinear_columns(structure).items():
-        bad = np.flatnonzero(np.isnan(rows[name]))
-        if not bad.size:
+        undefined_indices = np.flatnonzero(np.isnan(rows[name]))
+        if not undefined_indices.size:
             continue
         if structure.sensor_filter is not None:
             raise ModelError(
@@ -92,22 +94,23 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
                 f"hold for {pair[0]}, whose jumps have no derivative; give {parameter('intersample', 'foh')} if it is "
                 "linear between samples"
             )
-        first = int(bad[0])
-        where = ", ".join(f"{s} = {rows[s][first]:.6g}" for s in dict.fromkeys(s for s, _ in item.channels))
+        index = int(undefined_indices[0])
+        values_text = ", ".join(f"{s} = {rows[s][index]:.6g}" for s in dict.fromkeys(s for s, _ in item.channels))
         raise DataError(
-            f"{name} of run {run.name!r} is not finite in {bad.size} pulses, first at {(first + 0.5) * step:.6g} s, "
-            f"where {where}; use another term, a part of the run, or {parameter('method', 'output-error')}"
+            f"{name} of run {run.name!r} is not finite in {undefined_indices.size} pulses, first at "
+            f"{(index + 0.5) * step:.6g} s, "
+            f"where {values_text}; use another term, a part of the run, or {parameter('method', 'output-error')}"
         )
 
 
-def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> Floats:
+def differentiate(means: Floats, order: float, step: float, *, local_smoothing: bool) -> Floats:
     """Return the fractional derivative of a signal from its m block-pulse means, to second order in the `step` [s].
 
-    The signal is assumed to be zero before its record. With the backward shift q, the Grünwald-Letnikov weights
-    (1 - q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of order/2 steps. With `smooth`, the
-    means are smoothed first. The cost is O(m log m).
+    The signal is assumed to be zero before its record. With the backward shift q, the Grünwald-Letnikov weights (1 -
+    q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of order/2 steps. With `local_smoothing`,
+    the means are smoothed first. The cost is O(m log m).
     """
-    values = smooth_locally(means) if smooth else means
+    values = smooth_locally(means) if local_smoothing else means
     m = values.size
     weights = np.cumprod(np.concatenate([[1.0], (np.arange(m - 1) - order) / np.arange(1, m)]))
     kernel = (1.0 + order / 2) * weights - order / 2 * np.concatenate([[0.0], weights[:-1]])
@@ -125,7 +128,7 @@ def smooth_locally(values: Floats) -> Floats:
     at = np.arange(-half, half + 1) / half
     powers = np.vander(at, SMOOTHING_DEGREE + 1, increasing=True)
     projection = powers @ np.linalg.pinv(powers)
-    inner = np.convolve(values, projection[half], mode="valid")
+    interior = np.convolve(values, projection[half], mode="valid")
     # The first and the last polynomial also smooth the ends.
-    ends = projection[:half] @ values[:points], projection[half + 1 :] @ values[-points:]
-    return np.concatenate([ends[0], inner, ends[1]])
+    edges = projection[:half] @ values[:points], projection[half + 1 :] @ values[-points:]
+    return np.concatenate([edges[0], interior, edges[1]])

@@ -29,7 +29,7 @@ from ftlm.simulation.initial_conditions import (
     deviations,
     has_memory,
     history,
-    misfit,
+    huber_loss_excess,
     needs_history,
     output_residuals,
     resolve_initial_conditions,
@@ -83,18 +83,18 @@ class OutputSamples:
     change: Floats
 
 
-def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
+def initial_exponents(equation: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
     """Return the distinct exponents e of the powers t^e that enter an equation, sorted from lowest to highest.
 
     The powers are the initial terms and the offset. `states` initial states of a sensor filter are represented by the
     exponents -1, -2 and so on. All orders must be fixed.
     """
-    alpha = item.order.constant
+    alpha = equation.order.constant
     exponents = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
     if initial != "caputo":
         return sorted(exponents | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
     offsets: set[float] = set()
-    for lowest, order in [(0.0, alpha), *((alpha - t.order.constant, t.order.constant) for t in item.terms)]:
+    for lowest, order in [(0.0, alpha), *((alpha - t.order.constant, t.order.constant) for t in equation.terms)]:
         offsets |= {round(lowest + i, 9) for i in range(math.ceil(order - ORDER_TOLERANCE))}
     return sorted(
         exponents | {e for e in offsets if e == 0.0 or all(abs(e - o) > OFFSET_POWER_TOLERANCE for o in exponents)}
@@ -122,15 +122,17 @@ def output_simulation(
     """
     structure, signals = model.structure, record_signals(model.structure)
     start = resolve_initial_conditions(run, structure)
-    run, plain = without_level(run, structure)
+    run, run_without_level = without_level(run, structure)
     frictions = [(i, (model.equations[i].friction or Friction(0.0)).law) for i in structure.friction_equations]
     equations = [(linear_tuple(e, signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
-    core = _core.OutputSimulation(recording(run, plain, start), equations, frictions, times, derived_signals(structure))
+    core = _core.OutputSimulation(
+        recording(run, run_without_level, start), equations, frictions, times, derived_signals(structure)
+    )
     if initial is not None:
         return core, (False, [list(initial.get(o, {}).items()) for o in model.outputs], False)
     if not structure.is_linear:
         check_uniform_samples(run, model)
-        states = initial_tuple(start, plain.offset, plain.filter_states(start))
+        states = initial_tuple(start, run_without_level.offset, run_without_level.filter_states(start))
         return core, (False, core.fit_initial_states(states, state_refinement, stop_flag()), False)
     names = initial_names(model, start)
     exponents = [[(power, 0.0) for output, power in names if output == o] for o in model.outputs]
@@ -138,16 +140,16 @@ def output_simulation(
 
 
 def simulate_samples(
-    model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None = None
+    model: Model, run: Run, pulses_per_sample: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Return simulated samples, shape (outputs, N), and coefficients of initial terms by output and exponent.
 
     Samples are at the uniform sample times of the run, or at given `times` [s]. They are not finite if the simulation
-    diverges. The simulation uses `every` block pulses per sampling interval. `initial` are given initial terms; with
-    None, they are fitted to the run.
+    diverges. The simulation uses `pulses_per_sample` block pulses per sampling interval. `initial` are given initial
+    terms; with None, they are fitted to the run.
     """
-    core, terms = output_simulation(model, run, initial, times, every)
-    samples, initial_terms = core.samples(every, terms, stop_flag())
+    core, terms = output_simulation(model, run, initial, times, pulses_per_sample)
+    samples, initial_terms = core.samples(pulses_per_sample, terms, stop_flag())
     if initial is not None or model.structure.offset != "level":
         return samples, named_terms(model, initial_terms)
     return add_levels(model, deviations(run, model.structure)[1], samples, named_terms(model, initial_terms))
@@ -160,23 +162,26 @@ def add_levels(
 
     `outputs` and `initial` are deviations from these levels.
     """
-    terms = {o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in own.items()} for o, own in initial.items()}
+    terms = {
+        o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in exponent_values.items()}
+        for o, exponent_values in initial.items()
+    }
     return outputs + np.array([levels[o] for o in model.outputs])[:, None], terms
 
 
 def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) -> dict[str, dict[float, float]]:
     """Return initial terms, given as (exponent, coefficient) pairs for each output, by output and exponent."""
-    return {o: dict(own) for o, own in zip(model.outputs, terms, strict=True)}
+    return {o: dict(exponent_values) for o, exponent_values in zip(model.outputs, terms, strict=True)}
 
 
 def check_uniform_samples(run: Run, model: Model) -> None:
     """Raise ModelError if the sample times of a run are nonuniform, which non-linear models do not support."""
     if has_nonuniform_samples(run, model.structure):
         structure = model.structure
-        what = "friction" if structure.has_friction else "a non-linear term"
+        description = "friction" if structure.has_friction else "a non-linear term"
         output = next(e.output for e in structure.equations if e.friction is not None or e.nonlinear_terms)
         raise ModelError(
-            f"run {run.name!r} has nonuniform sample times, and the equation of {output} has {what}, "
+            f"run {run.name!r} has nonuniform sample times, and the equation of {output} has {description}, "
             "which is simulated on a regular grid; resample the run"
         )
 
@@ -196,16 +201,16 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
     try:
         outputs = measured_samples(model, run, FIRST_REFINEMENT)
         times = nonuniform_sample_times(model, run)
-        (few, ours), (many, theirs) = (
-            simulate_samples(each, run, FIRST_REFINEMENT, None, times) for each in (short, long)
+        (short_samples, short_terms), (long_samples, long_terms) = (
+            simulate_samples(model_variant, run, FIRST_REFINEMENT, None, times) for model_variant in (short, long)
         )
     except ModelError:
         # The equations are singular on this coarse grid, but may be regular on finer grids.
         return long
-    terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
-    residuals = [*output_residuals(outputs, few)], [*output_residuals(outputs, many)]
-    sizes = np.nanstd(outputs, axis=1).tolist()
-    return long if needs_history(model.structure, *residuals, sizes, terms) else short
+    terms = sum(map(len, short_terms.values())), sum(map(len, long_terms.values()))
+    residuals = [*output_residuals(outputs, short_samples)], [*output_residuals(outputs, long_samples)]
+    deviations = np.nanstd(outputs, axis=1).tolist()
+    return long if needs_history(model.structure, *residuals, deviations, terms) else short
 
 
 def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
@@ -221,17 +226,19 @@ def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
     ]
 
 
-def measured_samples(model: Model, run: Run, every: int) -> Floats:
+def measured_samples(model: Model, run: Run, pulses_per_sample: int) -> Floats:
     """Return the measured samples to compare with a simulation, shape (outputs, N), with NaN for missing samples.
 
     If the equations apply to filtered signals, the sensor filter is applied to outputs that were not measured through
-    it, with `every` block pulses per sampling interval.
+    it, with `pulses_per_sample` block pulses per sampling interval.
     """
-    through = model.structure.is_filtered
-    if not model.structure.all_filtered or all(map(through, model.outputs)):
+    is_filtered = model.structure.is_filtered
+    if not model.structure.all_filtered or all(map(is_filtered, model.outputs)):
         return np.stack([compared_values(run, model.structure, name) for name in model.outputs])
-    rec = record(run, model.structure, (run.length - 1) * every)
-    return np.stack([run[n] if through(n) else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
+    rec = record(run, model.structure, (run.length - 1) * pulses_per_sample)
+    return np.stack(
+        [run[n] if is_filtered(n) else _core.point_samples(rec.of(n))[::pulses_per_sample] for n in model.outputs]
+    )
 
 
 #: Significance level of the test of rest for runs whose first values are near zero. Such values are rare for runs in
@@ -255,13 +262,13 @@ MAX_RESIDUAL_RATIO, MIN_RESIDUAL_DROP, MAX_HISTORY_RESIDUAL, MAX_REST_RESIDUAL =
 class StartResiduals:
     """Residuals of a run simulated from rest and with a history (initial terms for past inputs), shape (outputs, N).
 
-    `terms` is the number of initial terms of the history, and `sizes` has the standard deviations of the outputs.
+    `terms` is the number of initial terms of the history, and `deviations` has the standard deviations of the outputs.
     """
 
-    rest: Floats
-    history: Floats
+    from_rest: Floats
+    with_history: Floats
     terms: int
-    sizes: Floats
+    deviations: Floats
 
 
 def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
@@ -271,26 +278,38 @@ def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
     """
     residuals = []
     for run in runs:
-        if (one := _start_residuals(structure, run)) is None:
+        if (run_residuals := _start_residuals(structure, run)) is None:
             return False
-        residuals.append(one)
+        residuals.append(run_residuals)
     return _requires_history(residuals)
 
 
 def _requires_history(residuals: Sequence[StartResiduals]) -> bool:
     """Whether a chi-squared test over all runs requires initial terms for past inputs (a history)."""
-    terms = sum(one.terms for one in residuals)
-    excess = sum(misfit([*one.rest], [*one.history], one.sizes.tolist()) for one in residuals)
+    terms = sum(run_residuals.terms for run_residuals in residuals)
+    excess = sum(
+        huber_loss_excess([*run_residuals.from_rest], [*run_residuals.with_history], run_residuals.deviations.tolist())
+        for run_residuals in residuals
+    )
     # Slow initial terms can fit colored noise in any run, so the excess is reduced by the variance inflation.
-    spread = max([1.0, *(variance_inflation(drop_missing(past)) for one in residuals for past in one.history)])
-    return terms > 0 and excess / spread > chi_squared(terms, REST_TEST_LEVEL)
+    inflation = max(
+        [
+            1.0,
+            *(
+                variance_inflation(drop_missing(series))
+                for run_residuals in residuals
+                for series in run_residuals.with_history
+            ),
+        ]
+    )
+    return terms > 0 and excess / inflation > chi_squared(terms, REST_TEST_LEVEL)
 
 
 def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
     """Return the residuals of the first samples of a run from rest and with a history; None if they are infinite."""
     if run.length > MAX_START_SAMPLES:
         run = run.window(None, MAX_START_SAMPLES * run.step)
-    ends, terms = [], 0
+    series, terms = [], 0
     for start in ("rest", history(run, structure)):
         model = Model(replace(structure, initial=start))
         try:
@@ -301,9 +320,9 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
             return None
         if not np.all(np.isfinite(samples)):
             return None
-        ends.append(output_residuals(measured_samples(model, run, FIRST_REFINEMENT), samples))
+        series.append(output_residuals(measured_samples(model, run, FIRST_REFINEMENT), samples))
         terms = sum(map(len, initial_terms.values()))
-    return StartResiduals(ends[0], ends[1], terms, np.nanstd([run[o] for o in structure.outputs], axis=1))
+    return StartResiduals(series[0], series[1], terms, np.nanstd([run[o] for o in structure.outputs], axis=1))
 
 
 def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
@@ -327,7 +346,9 @@ def _is_reportable(residuals: StartResiduals) -> bool:
     """Whether terms for past inputs reduce the residuals so much that nonzero initial conditions are reported."""
     # Overflows give infinity. If both values are infinite, there is no finding.
     with np.errstate(over="ignore", invalid="ignore"):
-        ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]
-        rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) for end in ends)
-        large = (past <= MAX_RESIDUAL_RATIO * rest) & (rest - past >= MIN_RESIDUAL_DROP)
-    return bool(np.any(large & (past <= MAX_HISTORY_RESIDUAL) & (rest <= MAX_REST_RESIDUAL)))
+        normalized = [
+            series / residuals.deviations[:, None] for series in (residuals.from_rest, residuals.with_history)
+        ]
+        rest_rms, history_rms = (np.sqrt(np.nanmean(series**2, axis=1)) for series in normalized)
+        large = (history_rms <= MAX_RESIDUAL_RATIO * rest_rms) & (rest_rms - history_rms >= MIN_RESIDUAL_DROP)
+    return bool(np.any(large & (history_rms <= MAX_HISTORY_RESIDUAL) & (rest_rms <= MAX_REST_RESIDUAL)))

@@ -144,12 +144,12 @@ def simulate(
         run = deviations(run, model.structure)[0]
     if model.structure.offset == "level":
         model = replace(model, structure=replace(model.structure, offset="none"))
-    for item in model.equations:
-        _check_initial_values(item, initial.get(item.output, {}))
-    own = run.length - 1
+    for equation in model.equations:
+        _check_initial_values(equation, initial.get(equation.output, {}))
+    default_pulses = run.length - 1
     max_m = min(max_m, MAX_M)
-    if own > max_m:
-        raise ModelError(f"run {run.name!r} has {own} intervals, more than {max_m}; slice it")
+    if default_pulses > max_m:
+        raise ModelError(f"run {run.name!r} has {default_pulses} intervals, more than {max_m}; slice it")
     free = simulate_refined(
         model, _with_missing_outputs(run, model), initial, tolerance=tolerance, max_m=max_m, on_grid=True
     )
@@ -163,7 +163,8 @@ def simulate(
     if not np.all(free.change <= tolerance):
         raise ConvergenceError(
             f"the response of {', '.join(model.outputs)} still changes by more than {tolerance:g} of its size at "
-            f"{own * free.refinement} pulses; raise {parameter('tolerance')} or {parameter('max_m')}, or check that "
+            f"{default_pulses * free.refinement} pulses; raise {parameter('tolerance')} or {parameter('max_m')}, or "
+            "check that "
             "the model is stable"
         )
     return Run.from_arrays(
@@ -176,29 +177,32 @@ def simulate(
     )
 
 
-def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
+def _check_initial_values(equation: Equation, terms: Mapping[float, float]) -> None:
     """Raise ModelError if the initial terms lack fractional powers of t that initial values imply.
 
     In an equation of order alpha, integrated alpha times, a term with Caputo's derivative D^nu y becomes
     I^(alpha - nu) (y - sum of y_i t^i / i!), where y_i are the initial values. This contains powers alpha - nu + i.
     """
-    alpha = item.order.constant
+    alpha = equation.order.constant
     values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
-    needed: dict[float, float] = {}
+    required_values: dict[float, float] = {}
     for i, value in values.items():
-        needed[float(i)] = needed.get(float(i), 0.0) + value
-        for term in item.terms:
+        required_values[float(i)] = required_values.get(float(i), 0.0) + value
+        for term in equation.terms:
             order, power = term.order.constant, round(alpha - term.order.constant + i, 9)
-            if term.column == item.output and i < math.ceil(order - 1e-9):
-                share = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
-                needed[power] = needed.get(power, 0.0) - share * value
-    lacking = [e for e in needed if e != round(e) and not any(abs(e - exponent) < 1e-6 for exponent in terms)]
-    if lacking:
-        text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(needed.items()))
+            if term.column == equation.output and i < math.ceil(order - 1e-9):
+                contribution = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
+                required_values[power] = required_values.get(power, 0.0) - contribution * value
+    missing_exponents = [
+        e for e in required_values if e != round(e) and not any(abs(e - exponent) < 1e-6 for exponent in terms)
+    ]
+    if missing_exponents:
+        text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(required_values.items()))
         raise ModelError(
-            f"initial terms of {item.output}: powers of t {', '.join(map(str, sorted(values)))}, but initial values by "
+            f"initial terms of {equation.output}: powers of t {', '.join(map(str, sorted(values)))}, but initial "
+            "values by "
             f"Caputo's definition imply further powers in an equation of fractional order; give {{{text}}} for such "
-            f"initial values, or t^{lacking[0]:g} as 0 if only the given powers are meant"
+            f"initial values, or t^{missing_exponents[0]:g} as 0 if only the given powers are meant"
         )
 
 
@@ -213,17 +217,18 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
 
     Raise DataError if such an output enters another equation as a measured signal.
     """
-    missing = [o for o in model.outputs if o not in run]
-    if not missing:
+    missing_outputs = [o for o in model.outputs if o not in run]
+    if not missing_outputs:
         return run
-    read = {s: e.output for e in model.equations for s in e.signals if s != e.output}
-    lacking = next((o for o in missing if o in read), None)
-    if lacking is not None and model.structure.coupling != "simulated":
+    users = {s: e.output for e in model.equations for s in e.signals if s != e.output}
+    first_missing = next((o for o in missing_outputs if o in users), None)
+    if first_missing is not None and model.structure.coupling != "simulated":
         raise DataError(
-            f"run {run.name!r} has no signal {lacking!r}, which enters the equation of {read[lacking]} as measured; "
+            f"run {run.name!r} has no signal {first_missing!r}, which enters the equation of {users[first_missing]} "
+            "as measured; "
             f"give it, or use {parameter('coupling', 'simulated')}"
         )
-    return run.with_outputs({n: np.zeros(run.length) for n in missing})
+    return run.with_outputs({n: np.zeros(run.length) for n in missing_outputs})
 
 
 @check_arguments

@@ -71,8 +71,8 @@ def simulate_refined(
     result = None
     if model.structure.initial == "auto":
         # A run without evidence of rest may still start from rest at a nonzero level.
-        rest = replace(model, structure=replace(model.structure, initial="rest"))
-        result = _simulate_refined(rest, shifted, None, tolerance, max_m, on_grid)
+        rest_model = replace(model, structure=replace(model.structure, initial="rest"))
+        result = _simulate_refined(rest_model, shifted, None, tolerance, max_m, on_grid)
         model = replace(model, structure=replace(model.structure, initial=conditions_in_motion(model.structure)))
     if result is None or not _has_white_residuals(model, shifted, result):
         free = _simulate_refined(model, shifted, None, tolerance, max_m, on_grid)
@@ -92,14 +92,14 @@ def _has_white_residuals(model: Model, run: Run, simulated: OutputSamples) -> bo
     return all(bool(np.all(np.isfinite(e))) and is_white(e) for e in residuals)
 
 
-def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
+def _explains_as_well(model: Model, run: Run, short_samples: OutputSamples, long_samples: OutputSamples) -> bool:
     """Whether :func:`start_score` of a simulation with few initial terms is at most that of one with many terms."""
-    if not (np.all(np.isfinite(few.outputs)) and np.all(np.isfinite(many.outputs))):
+    if not (np.all(np.isfinite(short_samples.outputs)) and np.all(np.isfinite(long_samples.outputs))):
         return False
-    residuals = [_residuals(model, run, s) for s in (few, many)]
+    residuals = [_residuals(model, run, s) for s in (short_samples, long_samples)]
     scores = [
-        start_score(own, sum(map(len, s.initial.values())), residuals[0])
-        for own, s in zip(residuals, (few, many), strict=True)
+        start_score(series, sum(map(len, s.initial.values())), residuals[0])
+        for series, s in zip(residuals, (short_samples, long_samples), strict=True)
     ]
     return scores[0] <= scores[1]
 
@@ -117,20 +117,29 @@ def _simulate_refined(
         run.time if on_grid and has_nonuniform_samples(run, model.structure) else nonuniform_sample_times(model, run)
     )
     core, terms = output_simulation(model, run, initial, times, INITIAL_STATE_REFINEMENT)
-    exact = exact_samples(core, terms)
-    if exact is not None:
-        return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))
+    exact_outputs = exact_samples(core, terms)
+    if exact_outputs is not None:
+        return OutputSamples(exact_outputs[0], named_terms(model, exact_outputs[1]), 1, np.zeros(len(model.outputs)))
     if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
         terms = _fit_past_inputs(core, model, terms, max_m) or terms
     # The core takes only powers of time as initial terms; levels are added to its result.
-    levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
-    powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
+    levels = {
+        o: dict(exponent_values).get(LEVEL_EXPONENT, 0.0)
+        for o, exponent_values in zip(model.outputs, terms[1], strict=True)
+    }
+    powers = (
+        terms[0],
+        [[term for term in exponent_values if term[0] != LEVEL_EXPONENT] for exponent_values in terms[1]],
+        terms[2],
+    )
     (outputs, initial_values), refinement, change = core.refine(
         powers, tolerance, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
     )
     if not any(levels.values()):
         return OutputSamples(outputs, named_terms(model, initial_values), refinement, change)
-    initial_terms = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, initial_values).items()}
+    initial_terms = {
+        o: {**exponent_values, LEVEL_EXPONENT: 0.0} for o, exponent_values in named_terms(model, initial_values).items()
+    }
     return OutputSamples(*add_levels(model, levels, outputs, initial_terms), refinement, change)
 
 
@@ -143,7 +152,10 @@ def _fit_past_inputs(
     """
     names = initial_names(model, "caputo")
     free = [[exponent for output, exponent in names if output == o] for o in model.outputs]
-    exponents = [sorted({*ours, *(e for e, _ in own)}) for ours, own in zip(free, terms[1], strict=True)]
+    exponents = [
+        sorted({*free_exponents, *(e for e, _ in terms_by_exponent)})
+        for free_exponents, terms_by_exponent in zip(free, terms[1], strict=True)
+    ]
     history = core.fit_past_inputs(
         exponents, free, terms[2], RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
     )

@@ -11,9 +11,9 @@ Polynomial: TypeAlias = dict[float, float]
 POWER_TOLERANCE = 1e-9
 
 
-def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
-    """Add `factor` times the polynomial `other` to the polynomial `into` in place; nearly equal powers are merged."""
-    for power, value in other.items():
+def add_polynomial(into: Polynomial, summand: Polynomial, factor: float = 1.0) -> None:
+    """Add `factor` times the polynomial `summand` to the polynomial `into` in place; nearly equal powers are merged."""
+    for power, value in summand.items():
         at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
         into[at] = into.get(at, 0.0) + factor * value
 

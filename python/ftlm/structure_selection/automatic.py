@@ -89,18 +89,18 @@ class IntegerOrderForm:
 
     def structure(self, problem: OutputProblem) -> Structure:
         """Return the structure that has this form, for one output."""
-        output, end = problem.output, problem.suffix
+        output, suffix = problem.output, problem.suffix
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
-        own = [f"a{k}{end} {derivative_text(k, output)}" for k in powers]
-        driving = [
-            f"b{number}{k}{end} {derivative_text(k, name)}"
-            for number, name in problem.numbered_drivers
+        output_terms = [f"a{k}{suffix} {derivative_text(k, output)}" for k in powers]
+        input_terms = [
+            f"b{index}{k}{suffix} {derivative_text(k, name)}"
+            for index, name in problem.numbered_drivers
             for k in range(self.zeros, -1, -1)
         ]
-        text = f"{derivative_text(self.order, output)} = {' + '.join([*own, *driving])}"
+        text = f"{derivative_text(self.order, output)} = {' + '.join([*output_terms, *input_terms])}"
         if self.friction != "none":
             slope = problem.tanh_slope if self.friction == "output" else math.inf
-            text += " " + friction_term(output, f"fc{end}", slope)
+            text += " " + friction_term(output, f"fc{suffix}", slope)
         delay = problem.input_delays(delayed=self.delayed)
         return _with_offset(equation(text, delay=delay, initial=problem.initial), self.offset)
 
@@ -218,12 +218,12 @@ class AutomaticSelection:
         if fits:
             # High orders overfit under colored noise, so the best form of each order is validated, whatever its BIC.
             best_by_order = _best_of_each_order(fits)
-            near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in best_by_order]
-            leading = [f for f in fits if f.form in best_by_order]
-            best = self._validate([*leading, *near[: VALIDATED_CANDIDATES - len(leading)]])
-            every = _rank([*fits, *self._fit_fractional_forms(fits, best)])
-            least = min(f.bic for f in every if f.form is not None)
-            fractional = [f for f in every if f.form is None and f.bic < least + MAX_FRACTIONAL_BIC_GAP]
+            close_fits = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in best_by_order]
+            best_fits = [f for f in fits if f.form in best_by_order]
+            best = self._validate([*best_fits, *close_fits[: VALIDATED_CANDIDATES - len(best_fits)]])
+            all_fits = _rank([*fits, *self._fit_fractional_forms(fits, best)])
+            lowest_bic = min(f.bic for f in all_fits if f.form is not None)
+            fractional = [f for f in all_fits if f.form is None and f.bic < lowest_bic + MAX_FRACTIONAL_BIC_GAP]
             self._validate(fractional[:VALIDATED_FRACTIONAL])
         return self.evaluator.trials
 
@@ -269,12 +269,12 @@ class AutomaticSelection:
         self.feedback = self._inputs_in_loop(fits)
         fits = self._fit_neighbors(self._fit_friction(fits, offset))
         # Fewer zeros may be better within an order even if a higher order fits the noise.
-        while fewer := [
+        while reduced := [
             form
             for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
             if form not in {f.form for f in fits}
         ]:
-            integer_fits = self._fit(fewer, fits)
+            integer_fits = self._fit(reduced, fits)
             if not integer_fits:
                 break
             fits = _rank([*fits, *integer_fits])
@@ -291,15 +291,15 @@ class AutomaticSelection:
         if not fits:
             return ()
         best = fits[0]
-        problem, end = self.problem, self.problem.suffix
-        residuals = [part[problem.output] for part in best.joint.residuals]
+        problem, suffix = self.problem, self.problem.suffix
+        residuals = [run_residuals[problem.output] for run_residuals in best.joint.residuals]
         signals = {n: [values_at_residuals(r, best.structure, n) for r in problem.runs] for n in problem.drivers}
         coefficients = best.joint.coefficients
         names = []
-        for number, name in problem.numbered_drivers:
+        for index, name in problem.numbered_drivers:
             values = signals[name]
             test = feedback_test(residuals, values, [v for n, v in signals.items() if n != name])
-            gain = -coefficients.get(f"a0{end}", -1.0) * coefficients[f"b{number}0{end}"]
+            gain = -coefficients.get(f"a0{suffix}", -1.0) * coefficients[f"b{index}0{suffix}"]
             if test.has_feedback or test.is_feedback_within_row(gain):
                 names.append(name)
         return tuple(names)
@@ -311,15 +311,15 @@ class AutomaticSelection:
         therefore moves to neighbors that have the property at a lower order, while BIC decreases.
         """
         forms_before = {f.form for f in fits}
-        new = [f.form for f in fits[:EXTENDED_CANDIDATES]]
-        expanded: set[IntegerOrderForm | None] = {None}
-        while new:
-            expanded.update(new)
-            near = [n for form in new if form for n in _neighbors(form) if self._is_admissible(n)]
-            more = [n for n in dict.fromkeys(near) if n not in forms_before]
-            forms_before.update(more)
-            fits = _rank([*fits, *self._fit(more, fits)])
-            new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
+        newest = [f.form for f in fits[:EXTENDED_CANDIDATES]]
+        extended_forms: set[IntegerOrderForm | None] = {None}
+        while newest:
+            extended_forms.update(newest)
+            neighbors = [n for form in newest if form for n in _neighbors(form) if self._is_admissible(n)]
+            untried = [n for n in dict.fromkeys(neighbors) if n not in forms_before]
+            forms_before.update(untried)
+            fits = _rank([*fits, *self._fit(untried, fits)])
+            newest = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in extended_forms]
         return fits
 
     def _is_admissible(self, form: IntegerOrderForm) -> bool:
@@ -334,16 +334,16 @@ class AutomaticSelection:
         variants that can still have the lowest BIC are fitted.
         """
         forms_before = {f.form for f in fits}
-        full = _rank([*fits, *self._fit([f for f in forms if f not in forms_before])])
-        least = min((f.bic for f in full), default=math.inf)
-        fewer = [
+        ranked = _rank([*fits, *self._fit([f for f in forms if f not in forms_before])])
+        lowest_bic = min((f.bic for f in ranked), default=math.inf)
+        reduced = [
             replace(form, zeros=m)
-            for form, fit in ((f.form, f) for f in full)
+            for form, fit in ((f.form, f) for f in ranked)
             if form is not None and form in forms
             for m in range(form.order - 1)
-            if fit.bic - (form.order - 1 - m) * self._penalty(fit) < least
+            if fit.bic - (form.order - 1 - m) * self._penalty(fit) < lowest_bic
         ]
-        return _rank([*full, *self._fit(fewer)])
+        return _rank([*ranked, *self._fit(reduced)])
 
     def _penalty(self, fit: FittedForm) -> float:
         """Return the penalty in BIC for one more zero of every input signal."""
@@ -385,8 +385,8 @@ class AutomaticSelection:
                     f for f in self._fit([form], fits) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0
                 ]
                 ranked = _rank([*fits, *friction_fits])
-                least = min(f.bic for f in ranked if f.form != form)
-                fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
+                lowest_bic = min(f.bic for f in ranked if f.form != form)
+                fits = ranked if ranked[0].bic < lowest_bic - MIN_BIC_DECREASE else fits
         return fits
 
     def _is_friction_likely(self, form: IntegerOrderForm) -> bool:
@@ -435,32 +435,34 @@ class AutomaticSelection:
         fitted with a delay.
         """
         form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
-        y, end = self.problem.output, self.problem.suffix
-        frequency = _natural_frequency(fits, form.offset, end)
+        y, suffix = self.problem.output, self.problem.suffix
+        frequency = _natural_frequency(fits, form.offset, suffix)
         drivers = self.problem.numbered_drivers
-        highest, own = f"D^alpha{end} {y}", f"a0{end} {y}"
-        damping = f"a1{end} D^mu{end} {y}"
-        driving = [f"b{number}0{end} {name}" for number, name in drivers]
-        direct = [f"b{number}1{end} D^alpha{end} {name}" for number, name in drivers]
-        sides = {
-            (highest, own, *driving): INITIAL_FRACTIONAL_ORDERS,
-            (highest, damping, own, *driving): INITIAL_FRACTIONAL_ORDERS[1:],
+        highest, output_term = f"D^alpha{suffix} {y}", f"a0{suffix} {y}"
+        damping = f"a1{suffix} D^mu{suffix} {y}"
+        input_terms = [f"b{index}0{suffix} {name}" for index, name in drivers]
+        direct = [f"b{index}1{suffix} D^alpha{suffix} {name}" for index, name in drivers]
+        equation_parts = {
+            (highest, output_term, *input_terms): INITIAL_FRACTIONAL_ORDERS,
+            (highest, damping, output_term, *input_terms): INITIAL_FRACTIONAL_ORDERS[1:],
         }
-        if driving:
-            sides[highest, *driving] = INITIAL_FRACTIONAL_ORDERS[:2]
-        if driving and not self.feedback:
-            sides[highest, *direct, *driving] = INITIAL_FRACTIONAL_ORDERS[:2]
+        if input_terms:
+            equation_parts[highest, *input_terms] = INITIAL_FRACTIONAL_ORDERS[:2]
+        if input_terms and not self.feedback:
+            equation_parts[highest, *direct, *input_terms] = INITIAL_FRACTIONAL_ORDERS[:2]
         if form.order == FRACTIONAL_DAMPING_ORDER:
-            sides[f"D^2 {y}", damping, own, *driving] = (2.0,)
-        texts = {f"{lhs} = {' + '.join(right)}": orders for (lhs, *right), orders in sides.items()}
+            equation_parts[f"D^2 {y}", damping, output_term, *input_terms] = (2.0,)
+        texts = {f"{lhs} = {' + '.join(right_terms)}": orders for (lhs, *right_terms), orders in equation_parts.items()}
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
             delay = self.problem.input_delays(delayed=delayed)
             return _with_offset(equation(text, delay=delay, initial=self.problem.initial), form.offset)
 
-        late = {} if best is None else {n: v for n, v in best.joint.values_by_name.items() if n.startswith("delay_")}
+        delay_values = (
+            {} if best is None else {n: v for n, v in best.joint.values_by_name.items() if n.startswith("delay_")}
+        )
 
-        def start(of: Structure, alpha: float) -> dict[str, float]:
+        def start(structure: Structure, alpha: float) -> dict[str, float]:
             values_of_form = {
                 "a0": -(frequency**alpha),
                 "a1": -0.3 * frequency ** (alpha - 0.5),
@@ -468,10 +470,10 @@ class AutomaticSelection:
                 "mu": 0.5,
             }
             # The coefficients of the inputs are eliminated at every iterate.
-            gains = dict.fromkeys(of.coefficient_names, frequency**alpha)
-            delays = {i.name: late.get(i.name, i.bounds[0]) for i in of.free_inputs}
-            names = (*of.order_names, *of.coefficient_names)
-            values = {**gains, **{n + end: v for n, v in values_of_form.items()}}
+            gains = dict.fromkeys(structure.coefficient_names, frequency**alpha)
+            delays = {i.name: delay_values.get(i.name, i.bounds[0]) for i in structure.free_inputs}
+            names = (*structure.order_names, *structure.coefficient_names)
+            values = {**gains, **{n + suffix: v for n, v in values_of_form.items()}}
             return {n: v for n, v in values.items() if n in names} | delays
 
         items = [(structure(t), orders) for t, orders in texts.items()]
@@ -479,8 +481,11 @@ class AutomaticSelection:
         if form.delayed and candidates:
             text = next(t for t in texts if structure(t) == candidates[0].structure)
             delayed = structure(text, delayed=True)
-            begin = [{**late, **candidates[0].joint.values_by_name}, *(start(delayed, a) for a in texts[text])]
-            candidates += self._fit_structures([(delayed, None, begin)])
+            guesses = [
+                {**delay_values, **candidates[0].joint.values_by_name},
+                *(start(delayed, a) for a in texts[text]),
+            ]
+            candidates += self._fit_structures([(delayed, None, guesses)])
         return _rank(candidates)
 
 
@@ -515,11 +520,11 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     return [f for f in dict.fromkeys(forms) if f.zeros >= 0 and f.order > 0]
 
 
-def _bic_decrease(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
+def _bic_decrease(fits: Sequence[FittedForm], has_property: Callable[[IntegerOrderForm], bool]) -> float:
     """Return by how much a property lowers the lowest BIC of all forms; 0 if no form has the property."""
-    with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
-    without = [f.bic for f in fits if f.form is not None and not has(f.form)]
-    return min(without, default=math.inf) - min(with_it) if with_it else 0.0
+    with_property = [f.bic for f in fits if f.form is not None and has_property(f.form)]
+    without_property = [f.bic for f in fits if f.form is not None and not has_property(f.form)]
+    return min(without_property, default=math.inf) - min(with_property) if with_property else 0.0
 
 
 def _natural_frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
@@ -531,10 +536,10 @@ def _natural_frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> 
         for item in fits:
             form = item.form
             if form is not None and (form.order, form.offset, form.integrator) == (order, offset, False):
-                size = abs(item.joint.coefficients.get(f"a0{suffix}", 0.0))
+                stiffness = abs(item.joint.coefficients.get(f"a0{suffix}", 0.0))
                 damping = abs(item.joint.coefficients.get(f"a1{suffix}", 0.0))
-                if order == 1 and size > 0.0:
-                    return size
-                if size > 0.0 and damping < 2.0 * math.sqrt(size):
-                    return math.sqrt(size)
+                if order == 1 and stiffness > 0.0:
+                    return stiffness
+                if stiffness > 0.0 and damping < 2.0 * math.sqrt(stiffness):
+                    return math.sqrt(stiffness)
     return 1.0

@@ -78,10 +78,10 @@ class Column:
 class BaseModel:
     """Terms of the output at integer orders, with coefficients from a grid, and the candidate input terms (columns)."""
 
-    inside: NestedStructures
+    nested: NestedStructures
     variant: Variant
     structure: Structure
-    own: tuple[tuple[str, float], ...]
+    output_coefficients: tuple[tuple[str, float], ...]
     columns: tuple[Column, ...]
     runs: tuple[Run, ...]
 
@@ -90,14 +90,14 @@ class BaseModel:
 
         There is one coordinate for each free coefficient of an output term.
         """
-        if not self.own:
+        if not self.output_coefficients:
             yield ()
             return
         longest = max(r.length * r.step for r in self.runs)
         low, high = math.log(1.0 / longest), math.log(math.pi / (2.0 * min(r.step for r in self.runs)))
-        steps = np.linspace(low, high, max(2, math.ceil((high - low) / LOG_FREQUENCY_SPACING) + 1)).tolist()
-        for w in steps:
-            yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING_FACTORS]
+        frequencies = np.linspace(low, high, max(2, math.ceil((high - low) / LOG_FREQUENCY_SPACING) + 1)).tolist()
+        for w in frequencies:
+            yield from [(w,)] if len(self.output_coefficients) == 1 else [(w, math.log(g)) for g in DAMPING_FACTORS]
 
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
         """Return the coefficients of the output terms at a grid point.
@@ -106,53 +106,53 @@ class BaseModel:
         the damping for the other order.
         """
         w = math.exp(point[0]) if point else 1.0
-        shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
-        ordered = sorted(self.own, key=lambda item: item[1])
+        factors = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
+        ordered = sorted(self.output_coefficients, key=lambda item: item[1])
         alpha = self.structure.equations[0].order.constant
-        return {n: -g * w ** (alpha - order) for (n, order), g in zip(ordered, shares, strict=False)}
+        return {n: -g * w ** (alpha - order) for (n, order), g in zip(ordered, factors, strict=False)}
 
     def is_stable(self, point: tuple[float, ...]) -> bool:
         """Whether the model is stable at a grid point; True if no coefficient of an output term is free."""
         if not point:
             return True
         values = self.coefficients(point)
-        item = self.structure.equations[0]
-        own = [
+        equation = self.structure.equations[0]
+        output_terms = [
             (
                 t.factor * values[t.coefficient] if isinstance(t.coefficient, str) else float(t.fixed or 0.0),
                 t.order.constant,
             )
-            for t in item.terms
-            if t.signal == item.output
+            for t in equation.terms
+            if t.signal == equation.output
         ]
-        return not _core.has_unstable_pole(item.order.constant, own)
+        return not _core.has_unstable_pole(equation.order.constant, output_terms)
 
 
-def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
+def screen_subsets(nested: NestedStructures, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
     """Return every subset of input terms at integer orders, best prediction first; [] if screening does not apply.
 
     Screening requires several runs or a validation run, because blocks of one run share initial terms.
     """
     # Optional friction is not linear in its parameters; stepwise selection adds it to the best subset.
-    inside = NestedStructures(inside.without_optional_friction)
-    structure = inside.structure
-    drives = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
+    nested = NestedStructures(nested.without_optional_friction)
+    structure = nested.structure
+    input_terms = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
     if (
         len(structure.equations) > 1
         or not structure.is_linear
         or structure.free_inputs
-        or sum(t.coefficient in inside.droppable for t in drives) < MIN_INPUT_TERMS
+        or sum(t.coefficient in nested.droppable for t in input_terms) < MIN_INPUT_TERMS
         or any(f.rows is not None for f in folds.parts)
     ):
         return []
     runs = list(folds.runs)
     runs += [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in runs)]
     subsets: dict[str, ScreenedSubset] = {}
-    for base in base_models(inside, tuple(runs)):
-        for one in score_subsets(base, folds, pool):
-            key = signature(inside.build(one.change.variant))
-            if key not in subsets or one.score < subsets[key].score:
-                subsets[key] = one
+    for base in base_models(nested, tuple(runs)):
+        for subset in score_subsets(base, folds, pool):
+            key = signature(nested.build(subset.change.variant))
+            if key not in subsets or subset.score < subsets[key].score:
+                subsets[key] = subset
     return sorted(subsets.values(), key=lambda s: (s.score, s.change.words))
 
 
@@ -160,16 +160,16 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
 Free = tuple[tuple[str, float], ...]
 
 
-def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
+def base_models(nested: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
     """Yield the base models: at most two output terms at integer orders, with and without an offset."""
-    structure = inside.structure
-    item = structure.equations[0]
-    own = [t for t in item.terms if t.signal == item.output]
-    tops = inside.integer_values(item.order.names[0]) if item.order.is_single else [item.order.constant]
-    input_terms = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
-    droppable = [t for t in item.terms if t.signal != item.output and t.coefficient in inside.droppable]
+    structure = nested.structure
+    equation = structure.equations[0]
+    output_terms = [t for t in equation.terms if t.signal == equation.output]
+    tops = nested.integer_values(equation.order.names[0]) if equation.order.is_single else [equation.order.constant]
+    input_terms = [t for t in equation.terms if t.signal != equation.output and t.fixed is not None]
+    droppable = [t for t in equation.terms if t.signal != equation.output and t.coefficient in nested.droppable]
 
-    def base_model(variant: Variant, present: Sequence[Term], top: float, free: Free) -> BaseModel | None:
+    def base_model(variant: Variant, fixed_terms: Sequence[Term], highest_order: float, free: Free) -> BaseModel | None:
         """Return a base model with every valid column; None if there is none, or if two terms share a coefficient."""
         if {t.coefficient for t in droppable} & {n for n, _ in free}:
             return None
@@ -177,56 +177,56 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
         terms: list[Term] = []
         for term in droppable:
             names = term.order.names
-            for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
-                column = Column(str(term.coefficient), place, tuple(names))
-                column_term = replace(term, order=Order(place), coefficient=f"column{len(columns)}")
-                if _is_valid_input_set(structure, [*present, *input_terms, column_term], top, runs):
+            for value in nested.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
+                column = Column(str(term.coefficient), value, tuple(names))
+                column_term = replace(term, order=Order(value), coefficient=f"column{len(columns)}")
+                if _is_valid_input_set(structure, [*fixed_terms, *input_terms, column_term], highest_order, runs):
                     columns.append(column)
                     terms.append(column_term)
         if not columns:
             return None
         offset: Offset = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
-        whole = _with_terms(structure, [*present, *input_terms, *terms], top, offset)
-        return BaseModel(inside, variant, fix_initial_conditions(whole, runs), free, tuple(columns), runs)
+        full_structure = _with_terms(structure, [*fixed_terms, *input_terms, *terms], highest_order, offset)
+        return BaseModel(nested, variant, fix_initial_conditions(full_structure, runs), free, tuple(columns), runs)
 
     keys: set[str] = set()
-    for top in (v for v in tops if v > 0):
-        for places in itertools.product(*(_candidate_orders(inside, t, top) for t in own)):
-            terms_present = [(t, p) for t, p in zip(own, places, strict=True) if p is not None]
-            if len({p for _, p in terms_present}) < len(terms_present) or (own and not terms_present):
+    for highest_order in (v for v in tops if v > 0):
+        for constants in itertools.product(*(_candidate_orders(nested, t, highest_order) for t in output_terms)):
+            terms_present = [(t, p) for t, p in zip(output_terms, constants, strict=True) if p is not None]
+            if len({p for _, p in terms_present}) < len(terms_present) or (output_terms and not terms_present):
                 continue
             free = tuple((t.coefficient, p) for t, p in terms_present if isinstance(t.coefficient, str))
             if len(free) > 2:
                 continue
-            whole = {t.order.names[0]: p for t, p in terms_present if t.order.is_single}
-            whole |= {item.order.names[0]: top} if item.order.is_single else {}
-            offsets = (False, True) if inside.offset_allowed else (False,)
+            integer_orders = {t.order.names[0]: p for t, p in terms_present if t.order.is_single}
+            integer_orders |= {equation.order.names[0]: highest_order} if equation.order.is_single else {}
+            offsets = (False, True) if nested.offset_allowed else (False,)
             for offset in (True,) if structure.offset == "constant" else offsets:
-                variant = Variant(frozenset(n for n, _ in free), tuple(sorted(whole.items())), offset)
-                present = [replace(t, order=Order(p)) for t, p in terms_present]
-                base = base_model(variant, present, top, free)
+                variant = Variant(frozenset(n for n, _ in free), tuple(sorted(integer_orders.items())), offset)
+                fixed_terms = [replace(t, order=Order(p)) for t, p in terms_present]
+                base = base_model(variant, fixed_terms, highest_order, free)
                 key = "" if base is None else signature(base.structure)
                 if base is not None and key not in keys:
                     keys.add(key)
                     yield base
 
 
-def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[float | None]:
+def _candidate_orders(nested: NestedStructures, term: Term, highest_order: float) -> list[float | None]:
     """Return the integer orders that an output term may have below the highest order, and None if it is optional."""
-    out: list[float | None] = [None] if term.coefficient in inside.droppable else []
-    places = inside.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
-    return out + [p for p in places if p < top]
+    out: list[float | None] = [None] if term.coefficient in nested.droppable else []
+    values = nested.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
+    return out + [p for p in values if p < highest_order]
 
 
-def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset: Offset) -> Structure:
-    item = replace(structure.equations[0], order=Order(top), terms=tuple(terms))
-    return restrict_structure(structure, (item,), offset=offset)
+def _with_terms(structure: Structure, terms: Sequence[Term], highest_order: float, offset: Offset) -> Structure:
+    equation = replace(structure.equations[0], order=Order(highest_order), terms=tuple(terms))
+    return restrict_structure(structure, (equation,), offset=offset)
 
 
-def _is_valid_input_set(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
+def _is_valid_input_set(structure: Structure, terms: Sequence[Term], highest_order: float, runs: Sequence[Run]) -> bool:
     """Whether an equation with these input terms can be simulated on the runs."""
     try:
-        candidate = fix_initial_conditions(_with_terms(structure, terms, top, "none"), runs)
+        candidate = fix_initial_conditions(_with_terms(structure, terms, highest_order, "none"), runs)
         Objective(FreeProblem.of(candidate), runs[:1], [1.0], decimation=_decimation(runs)).experiments  # noqa: B018
     except FtlmError:
         return False
@@ -243,52 +243,54 @@ def score_subsets(base: BaseModel, folds: Folds, pool: TaskPool) -> list[Screene
     The coefficients of output terms are those on a grid that is refined around the best ones.
     """
     problem = FreeProblem.of(base.structure)
-    grid = Objective(problem, base.runs, [1.0], decimation=_decimation(base.runs))
+    objective = Objective(problem, base.runs, [1.0], decimation=_decimation(base.runs))
     # Computed once here, because the threads share them.
-    experiments, ends = grid.experiments, np.cumsum([0, *(count for _, count in grid.counts)]).tolist()
-    places = [problem.coefficients.index(f"column{k}") for k in range(len(base.columns))]
+    experiments, boundaries = objective.experiments, np.cumsum([0, *(count for _, count in objective.counts)]).tolist()
+    indices = [problem.coefficients.index(f"column{k}") for k in range(len(base.columns))]
 
     def products_at(point: tuple[float, ...]) -> Floats | None:
         """Return the Gram matrix of column responses and residual for each run; None if a response diverges."""
         values = base.coefficients(point)
         iterate = Iterate([], [values.get(n, 0.0) for n in problem.coefficients], "", {})
         try:
-            outcome = minimize_cost(problem, experiments, iterate, evaluations=1, plain=True).outcome
+            outcome = minimize_cost(problem, experiments, iterate, evaluations=1, linear_scale=True).outcome
         except FtlmError:
             return None
-        rows = np.vstack([np.asarray(outcome["jacobian"])[places], np.asarray(outcome["residuals"])])
+        rows = np.vstack([np.asarray(outcome["jacobian"])[indices], np.asarray(outcome["residuals"])])
         if not np.isfinite(rows).all():
             return None
-        return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(ends)])
+        return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(boundaries)])
 
-    def one(points: Sequence[tuple[float, ...]]) -> list[Floats | None]:
+    def products_of_chunk(points: Sequence[tuple[float, ...]]) -> list[Floats | None]:
         return [products_at(point) for point in points]
 
-    def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
+    def solutions_at(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
         stable = [p for p in points if base.is_stable(p)]
         chunks = [stable[k : k + POINTS_PER_TASK] for k in range(0, len(stable), POINTS_PER_TASK)]
-        gram_matrices = [g for part in pool.map_items(one, chunks) for g in part]
+        gram_matrices = [g for chunk in pool.map_items(products_of_chunk, chunks) for g in chunk]
         return [(p, g) for p, g in zip(stable, gram_matrices, strict=True) if g is not None]
 
-    solutions = all_of(list(base.grid_points()))
-    scorer = SubsetScorer.of(base, folds, [float(np.nanvar(r[base.structure.outputs[0]])) for r in base.runs], ends)
+    solutions = solutions_at(list(base.grid_points()))
+    scorer = SubsetScorer.of(
+        base, folds, [float(np.nanvar(r[base.structure.outputs[0]])) for r in base.runs], boundaries
+    )
     spacing = (LOG_FREQUENCY_SPACING, math.log(DAMPING_FACTORS[1] / DAMPING_FACTORS[0]))
     for zoom in range(GRID_REFINEMENTS + 1):
         if not solutions:
             return []
         scores = scorer.score_all(np.array([g for _, g in solutions]))
-        if zoom == GRID_REFINEMENTS or not base.own:
+        if zoom == GRID_REFINEMENTS or not base.output_coefficients:
             break
         spacing = (spacing[0] / 2, spacing[1] / 2)
         points_before = {p for p, _ in solutions}
         best = sorted(scores, key=lambda s: scores[s].score)[:REFINED_SUBSETS]
-        centres = dict.fromkeys(solutions[k][0] for s in best for k in scores[s].points)
-        near = (
-            tuple(c + m * w for c, m, w in zip(centre, moves, spacing, strict=False))
-            for centre in centres
-            for moves in itertools.product((-1, 0, 1), repeat=len(centre))
+        centers = dict.fromkeys(solutions[k][0] for s in best for k in scores[s].points)
+        neighbors = (
+            tuple(c + m * w for c, m, w in zip(center, shifts, spacing, strict=False))
+            for center in centers
+            for shifts in itertools.product((-1, 0, 1), repeat=len(center))
         )
-        solutions += all_of([p for p in dict.fromkeys(near) if p not in points_before])
+        solutions += solutions_at([p for p in dict.fromkeys(neighbors) if p not in points_before])
     out = []
     for subset, verdict in scores.items():
         change = _change(base, subset)
@@ -302,12 +304,12 @@ def score_subsets(base: BaseModel, folds: Folds, pool: TaskPool) -> list[Screene
 def _change(base: BaseModel, subset: Sequence[int]) -> Change | None:
     """Return the change that adds a subset of columns to a structure; None if the result is invalid."""
     columns = [base.columns[k] for k in subset]
-    whole = {**base.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
+    integer_orders = {**base.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
     coefficients = base.variant.coefficients | {c.coefficient for c in columns}
-    variant = replace(base.variant, coefficients=frozenset(coefficients)).with_integer_orders(whole)
-    if not base.inside.is_valid(variant):
+    variant = replace(base.variant, coefficients=frozenset(coefficients)).with_integer_orders(integer_orders)
+    if not base.nested.is_valid(variant):
         return None
-    return Change(describe_structure(base.inside.build(variant)), variant)
+    return Change(describe_structure(base.nested.build(variant)), variant)
 
 
 @dataclass(frozen=True)
@@ -334,33 +336,35 @@ class SubsetScorer:
         Indices of the estimation runs of each fold. The last entry has the indices of all runs.
     validation_runs
         Index of the validation run in each fold.
-    sizes
+    output_power
         For each run, the sum of squared deviations of the output from its mean.
     """
 
     columns: tuple[Column, ...]
     estimation_runs: tuple[tuple[int, ...], ...]
     validation_runs: tuple[int, ...]
-    sizes: Floats
+    output_power: Floats
 
     @classmethod
-    def of(cls, base: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
+    def of(cls, base: BaseModel, folds: Folds, variances: Sequence[float], boundaries: Sequence[int]) -> SubsetScorer:
         """Return the scorer for the columns of a base model and the folds of a validation.
 
-        `spread` are the variances of the output in each run, and `ends` are the boundaries of the runs among the
-        compared samples.
+        `variances` are the variances of the output in each run, and `boundaries` are the boundaries of the runs among
+        the compared samples.
         """
 
-        def place(run: Run) -> int:
+        def run_index(run: Run) -> int:
             return next(k for k, r in enumerate(base.runs) if r is run)
 
-        fit_parts = [tuple(place(r) for r in f.runs) for f in folds.parts]
-        sizes = np.array([v * (b - a) for v, (a, b) in zip(spread, itertools.pairwise(ends), strict=True)])
+        fit_parts = [tuple(run_index(r) for r in f.runs) for f in folds.parts]
+        output_power = np.array(
+            [v * (b - a) for v, (a, b) in zip(variances, itertools.pairwise(boundaries), strict=True)]
+        )
         return cls(
             base.columns,
-            (*fit_parts, tuple(place(r) for r in folds.runs)),
-            tuple(place(f.validation_run) for f in folds.parts),
-            sizes,
+            (*fit_parts, tuple(run_index(r) for r in folds.runs)),
+            tuple(run_index(f.validation_run) for f in folds.parts),
+            output_power,
         )
 
     def score_subset(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> SubsetScore:
@@ -371,19 +375,19 @@ class SubsetScorer:
         """
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]
-        matrix, right, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
+        matrix, vector, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
         scale = np.sqrt(np.maximum(np.einsum("...kk->...k", matrix), np.finfo(float).tiny))
-        even = matrix / scale[..., None] / scale[..., None, :] + RELATIVE_RIDGE * np.eye(len(subset))
-        solutions = -np.linalg.solve(even, (right / scale)[..., None])[..., 0] / scale
-        remainders = rest + np.einsum("pfk,pfk->pf", solutions, right)
+        scaled = matrix / scale[..., None] / scale[..., None, :] + RELATIVE_RIDGE * np.eye(len(subset))
+        solutions = -np.linalg.solve(scaled, (vector / scale)[..., None])[..., 0] / scale
+        remainders = rest + np.einsum("pfk,pfk->pf", solutions, vector)
         points = np.argmin(remainders, axis=0)
         scores = []
         for fold, run in enumerate(self.validation_runs):
             at, c = points[fold], solutions[points[fold], fold]
-            whole = products[at, run][keys][:, keys]
-            with_one = np.append(c, 1.0)
-            share = math.sqrt(max(float(with_one @ whole @ with_one), 0.0) / float(self.sizes[run]))
-            scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
+            gram = products[at, run][keys][:, keys]
+            extended = np.append(c, 1.0)
+            relative_error = math.sqrt(max(float(extended @ gram @ extended), 0.0) / float(self.output_power[run]))
+            scores.append(math.log(min(max(relative_error, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
         return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(solutions[points[-1], -1].tolist()))
 
     def score_all(self, products: Floats) -> dict[tuple[int, ...], SubsetScore]:
@@ -412,16 +416,16 @@ class SubsetScorer:
                 if any(k is not None for k in subset)
             )
             return out
-        width = max(4, MAX_EXHAUSTIVE_SUBSETS // len(self.columns) ** 2)
+        beam_width = max(4, MAX_EXHAUSTIVE_SUBSETS // len(self.columns) ** 2)
         candidate_subsets: list[tuple[int, ...]] = [()]
         for _ in choices:
-            wider = {
+            extended_subsets = {
                 tuple(sorted((*subset, k)))
                 for subset in candidate_subsets
-                for places in choices.values()
-                if not set(places) & set(subset)
-                for k in places
+                for indices in choices.values()
+                if not set(indices) & set(subset)
+                for k in indices
             }
-            score_missing(sorted(wider))
-            candidate_subsets = sorted(wider, key=lambda s: (out[s].score, s))[:width]
+            score_missing(sorted(extended_subsets))
+            candidate_subsets = sorted(extended_subsets, key=lambda s: (out[s].score, s))[:beam_width]
         return out

@@ -91,27 +91,29 @@ class NestedStructures:
         Stribeck friction requires Coulomb friction.
         """
         out: dict[str, str | None] = {}
-        for item in self.structure.equations:
-            friction = item.friction
+        for equation in self.structure.equations:
+            friction = equation.friction
             if friction is None:
                 continue
-            own = f"friction of {item.output}"
+            friction_name = f"friction of {equation.output}"
             if isinstance(friction.coefficient, str):
-                out[own] = None
+                out[friction_name] = None
             if friction.stribeck is not None and isinstance(friction.stribeck.coefficient, str):
-                out[f"{own} near rest"] = own if own in out else None
+                out[f"{friction_name} near rest"] = friction_name if friction_name in out else None
         return out
 
-    def _with_frictions(self, item: Equation, frictions: frozenset[str]) -> Equation:
+    def _with_frictions(self, equation: Equation, frictions: frozenset[str]) -> Equation:
         """Return an equation with all mandatory friction terms and the given optional friction terms."""
-        friction, own, choices = item.friction, f"friction of {item.output}", self.frictions
+        friction, friction_name, choices = equation.friction, f"friction of {equation.output}", self.frictions
         if friction is None:
-            return item
-        if own in choices and own not in frictions:
-            return replace(item, coulomb=UNSET)
-        near = f"{own} near rest"
+            return equation
+        if friction_name in choices and friction_name not in frictions:
+            return replace(equation, coulomb=UNSET)
+        stribeck_name = f"{friction_name} near rest"
         return (
-            replace(item, coulomb=replace(friction, more=UNSET)) if near in choices and near not in frictions else item
+            replace(equation, coulomb=replace(friction, more=UNSET))
+            if stribeck_name in choices and stribeck_name not in frictions
+            else equation
         )
 
     @property
@@ -124,11 +126,11 @@ class NestedStructures:
         """Return the structure of a variant."""
         structure, droppable = self.structure, set(self.droppable)
         equations = []
-        for item in structure.equations:
+        for equation in structure.equations:
             terms = tuple(
-                t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.coefficients
+                t for t in equation.terms if t.coefficient not in droppable or t.coefficient in variant.coefficients
             )
-            equations.append(self._with_frictions(replace(item, terms=terms), variant.frictions))
+            equations.append(self._with_frictions(replace(equation, terms=terms), variant.frictions))
         dropped = {i.name for i in structure.free_inputs} - variant.inputs
         candidate = restrict_structure(
             structure,
@@ -151,12 +153,12 @@ class NestedStructures:
             candidate = self.build(variant)
         except ModelError:
             return False
-        for item in candidate.equations:
-            places = [(t.column, t.order.constant) for t in item.terms if not t.order.names]
-            if len(set(places)) < len(places):
+        for equation in candidate.equations:
+            columns_and_orders = [(t.column, t.order.constant) for t in equation.terms if not t.order.names]
+            if len(set(columns_and_orders)) < len(columns_and_orders):
                 return False
-            own = [order for signal, order in places if signal == item.output]
-            if not item.order.names and any(o >= item.order.constant for o in own):
+            output_orders = [order for signal, order in columns_and_orders if signal == equation.output]
+            if not equation.order.names and any(o >= equation.order.constant for o in output_orders):
                 return False
         return True
 
@@ -177,75 +179,91 @@ class NestedStructures:
         free = [n for n in self.structure.order_names if n in self._highest]
         tops: list[dict[str, float]] = [{}]
         for name in free:
-            tops = [{**top, name: v} for top in tops for v in self.integer_values(name) if v > 0]
-        for top in tops:
-            base = self._with_own_terms(top)
-            if base is None:
+            tops = [{**orders, name: v} for orders in tops for v in self.integer_values(name) if v > 0]
+        for orders in tops:
+            variant = self._with_output_terms(orders)
+            if variant is None:
                 continue
             # A non-linear term that contains the output is not an input term.
-            item = self.structure.equations[0]
-            drives = [t for t in item.terms if t.coefficient in self.droppable and item.output not in t.signals]
-            has_fixed_terms = any(not self._owns(t) and t.fixed is not None for t in item.terms)
-            if not drives or has_fixed_terms:
-                yield Change(describe_structure(self.build(base)), base)
+            equation = self.structure.equations[0]
+            input_terms = [
+                t for t in equation.terms if t.coefficient in self.droppable and equation.output not in t.signals
+            ]
+            has_fixed_terms = any(not self._is_optional_output_term(t) and t.fixed is not None for t in equation.terms)
+            if not input_terms or has_fixed_terms:
+                yield Change(describe_structure(self.build(variant)), variant)
                 continue
-            for term in drives:
-                yield from self._with_term(base, term)
+            for term in input_terms:
+                yield from self._with_term(variant, term)
 
     def highest_orders(self, variant: Variant) -> tuple[float | None, ...]:
         """Return the order of each equation in a variant if it is fixed to an integer, else None."""
         orders = variant.integer_order_values()
         return tuple(orders.get(n) for n in sorted(self._highest))
 
-    def _owns(self, term: Term) -> bool:
+    def _is_optional_output_term(self, term: Term) -> bool:
         return any(term in e.terms and term.column == e.output for e in self.structure.equations)
 
-    def _with_own_terms(self, highest_order_values: Mapping[str, float]) -> Variant | None:
+    def _with_output_terms(self, highest_order_values: Mapping[str, float]) -> Variant | None:
         """Return the variant with all output terms at distinct integer orders and all mandatory terms; None if invalid.
 
         `highest_order_values` are the integer values of the highest orders by name.
         """
         droppable = self.droppable
-        whole: dict[str, float] = dict(highest_order_values)
+        integer_orders: dict[str, float] = dict(highest_order_values)
         names_used: list[str] = []
-        for item in self.structure.equations:
-            highest = highest_order_values.get(item.order.names[0]) if item.order.is_single else item.order.constant
-            values_used = {t.order.constant for t in item.terms if t.column == item.output and not t.order.names}
-            for term in item.terms:
-                if term.order.is_single and term.order.names[0] in whole:
+        for equation in self.structure.equations:
+            highest = (
+                highest_order_values.get(equation.order.names[0])
+                if equation.order.is_single
+                else equation.order.constant
+            )
+            values_used = {
+                t.order.constant for t in equation.terms if t.column == equation.output and not t.order.names
+            }
+            for term in equation.terms:
+                if term.order.is_single and term.order.names[0] in integer_orders:
                     continue
-                own = term.column == item.output
-                if not own and term.coefficient in droppable:
+                is_output_term = term.column == equation.output
+                if not is_output_term and term.coefficient in droppable:
                     continue
                 if term.order.is_single:
                     name = term.order.names[0]
-                    places = [
+                    values = [
                         v
                         for v in self.integer_values(name)
-                        if not own or (v < (highest or 0.0) and v not in values_used)
+                        if not is_output_term or (v < (highest or 0.0) and v not in values_used)
                     ]
-                    if not places:
+                    if not values:
                         if term.coefficient in droppable:
                             continue
                         return None
                     # The last output term with a free order is damping (order 1). Output terms before it have lower
                     # orders.
-                    later = item.terms[item.terms.index(term) + 1 :]
-                    below = any(t.column == item.output and t.order.is_single for t in later)
-                    value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
-                    whole[name] = value
-                    values_used |= {value} if own else set()
-                elif own and not term.order.names and term.order.constant >= (highest or 0.0):
+                    later_terms = equation.terms[equation.terms.index(term) + 1 :]
+                    has_lower_term = any(t.column == equation.output and t.order.is_single for t in later_terms)
+                    value = (
+                        1.0
+                        if is_output_term and 1.0 in values and not (has_lower_term and 0.0 in values)
+                        else values[0]
+                    )
+                    integer_orders[name] = value
+                    values_used |= {value} if is_output_term else set()
+                elif is_output_term and not term.order.names and term.order.constant >= (highest or 0.0):
                     if term.coefficient in droppable:
                         continue
                     return None
                 if isinstance(term.coefficient, str):
                     names_used.append(term.coefficient)
         names_used += [n for n in self.structure.coefficient_names if n not in droppable]
-        variant = Variant(frozenset(names_used), tuple(sorted(whole.items())), self.structure.offset == "constant")
+        variant = Variant(
+            frozenset(names_used), tuple(sorted(integer_orders.items())), self.structure.offset == "constant"
+        )
         # Without output terms, the equation becomes valid only when an input term is added.
-        alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
-        return variant if self.is_valid(variant) or not alone else None
+        has_output_term = any(
+            self._is_optional_output_term(t) for equation in self.structure.equations for t in equation.terms
+        )
+        return variant if self.is_valid(variant) or not has_output_term else None
 
     def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
         """Yield the variants with one more term, at each integer value of its order."""
@@ -255,12 +273,12 @@ class NestedStructures:
         if term.order.is_single and term.order.names[0] not in variant.integer_order_values():
             name = term.order.names[0]
             variants = [extended.with_integer_orders({name: v}) for v in self.integer_values(name)]
-            if self._owns(term):
+            if self._is_optional_output_term(term):
                 # If other output terms occupy all integer orders, the order is free from the start.
                 variants = [v for v in variants if self.is_valid(v)] or [extended]
-        for one in variants:
-            if self.is_valid(one):
-                yield Change(f"+ {self._term_in(one, term)}", one)
+        for smaller in variants:
+            if self.is_valid(smaller):
+                yield Change(f"+ {self._term_in(smaller, term)}", smaller)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
         """Return the text of a term at its order in a variant."""
@@ -270,8 +288,8 @@ class NestedStructures:
 
     def richest(self, variant: Variant) -> Variant:
         """Return the variant extended by all terms for which an unused integer order remains."""
-        for item in self.structure.equations:
-            for term in item.terms:
+        for equation in self.structure.equations:
+            for term in equation.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
                     variants = [c.variant for c in self._with_term(variant, term)]
                     free = set(self.build(variant).order_names)
@@ -280,8 +298,8 @@ class NestedStructures:
 
     def larger(self, variant: Variant) -> Iterator[Change]:
         """Yield every valid variant with one more term, free order, offset, free input parameter or friction term."""
-        for item in self.structure.equations:
-            for term in item.terms:
+        for equation in self.structure.equations:
+            for term in equation.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
                     yield from self._with_term(variant, term)
         present = self.build(variant.with_integer_orders(dict.fromkeys(variant.integer_order_values()))).order_names
@@ -290,11 +308,11 @@ class NestedStructures:
                 yield Change(f"{name} free", variant.with_integer_orders({name: None}))
         if self.offset_allowed and not variant.offset:
             yield Change("an offset of each run", replace(variant, offset=True))
-        for number in self.structure.free_inputs:
-            if number.name not in variant.inputs:
-                yield Change(f"{number.name} free", replace(variant, inputs=variant.inputs | {number.name}))
-        for name, below in self.frictions.items():
-            if name not in variant.frictions and (below is None or below in variant.frictions):
+        for parameter in self.structure.free_inputs:
+            if parameter.name not in variant.inputs:
+                yield Change(f"{parameter.name} free", replace(variant, inputs=variant.inputs | {parameter.name}))
+        for name, simpler_name in self.frictions.items():
+            if name not in variant.frictions and (simpler_name is None or simpler_name in variant.frictions):
                 yield Change(name, replace(variant, frictions=variant.frictions | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
@@ -303,26 +321,28 @@ class NestedStructures:
         Optional elements are terms, the offset, free input parameters and friction terms.
         """
         candidate = self.build(variant)
-        for item in candidate.equations:
-            for term in item.terms:
-                own = term.column == item.output
-                others = [t for t in item.terms if t is not term and (t.column == item.output) == own]
-                if term.coefficient in self.droppable and others:
-                    less = replace(variant, coefficients=variant.coefficients - {str(term.coefficient)})
-                    if self.is_valid(less):
-                        yield Change(f"without {term}", less)
+        for equation in candidate.equations:
+            for term in equation.terms:
+                is_output_term = term.column == equation.output
+                remaining = [
+                    t for t in equation.terms if t is not term and (t.column == equation.output) == is_output_term
+                ]
+                if term.coefficient in self.droppable and remaining:
+                    reduced = replace(variant, coefficients=variant.coefficients - {str(term.coefficient)})
+                    if self.is_valid(reduced):
+                        yield Change(f"without {term}", reduced)
         for name in candidate.order_names:
             for value in self.integer_values(name):
-                less = variant.with_integer_orders({name: value})
-                if self.is_valid(less):
-                    yield Change(f"{name} = {value:g}", less)
+                reduced = variant.with_integer_orders({name: value})
+                if self.is_valid(reduced):
+                    yield Change(f"{name} = {value:g}", reduced)
         if self.offset_allowed and variant.offset:
             yield Change("without an offset", replace(variant, offset=False))
         for name in sorted(variant.inputs):
             yield Change(f"without {name}", replace(variant, inputs=variant.inputs - {name}))
         for name in sorted(variant.frictions):
-            above = {n for n, below in self.frictions.items() if below == name}
-            yield Change(f"without {name}", replace(variant, frictions=variant.frictions - {name} - above))
+            dependent_names = {n for n, simpler_name in self.frictions.items() if simpler_name == name}
+            yield Change(f"without {name}", replace(variant, frictions=variant.frictions - {name} - dependent_names))
 
 
 def describe_structure(structure: Structure) -> str:
@@ -334,15 +354,15 @@ def describe_structure(structure: Structure) -> str:
 def signature(structure: Structure) -> str:
     """Return a text that identifies a structure up to parameter names."""
     parts = []
-    for item in structure.equations:
+    for equation in structure.equations:
         terms = sorted(
             (t.column, "free" if t.order.is_single else str(t.order), "free" if t.fixed is None else repr(t.fixed))
-            for t in item.terms
+            for t in equation.terms
         )
-        parts.append(f"{item.output} {'free' if item.order.is_single else item.order} {terms}")
+        parts.append(f"{equation.output} {'free' if equation.order.is_single else equation.order} {terms}")
     frictions = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
-    rest = (structure.offset, structure.initial, structure.coupling, frictions)
-    return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
+    options = (structure.offset, structure.initial, structure.coupling, frictions)
+    return f"{parts} {options} {[i.name for i in structure.free_inputs]}"
 
 
 def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structure | str]) -> dict[str, Structure]:
@@ -355,12 +375,12 @@ def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structu
     ModelError
         If there is no candidate, an object is not a structure, or two candidates differ only in parameter names.
     """
-    given = list(structures.values() if isinstance(structures, Mapping) else structures)
-    if not given:
+    listed = list(structures.values() if isinstance(structures, Mapping) else structures)
+    if not listed:
         raise ModelError("there are no candidates; give structures, or one structure whose terms are selected")
-    every = [as_structure(f"candidate {place} of {len(given)}", s) for place, s in enumerate(given)]
-    names = list(structures) if isinstance(structures, Mapping) else [describe_structure(s) for s in every]
-    items = list(zip(names, every, strict=True))
+    parsed = [as_structure(f"candidate {position} of {len(listed)}", s) for position, s in enumerate(listed)]
+    names = list(structures) if isinstance(structures, Mapping) else [describe_structure(s) for s in parsed]
+    items = list(zip(names, parsed, strict=True))
     if len({n for n, _ in items}) < len(items):
         # Structures with equal texts may differ in other properties. Numbers distinguish their names.
         items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]
@@ -373,10 +393,12 @@ def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structu
             out[name] = structure
     names_by_content: dict[str, str] = {}
     for name, structure in out.items():
-        other = names_by_content.setdefault(_content(structure), name)
-        if other != name:
-            only = "" if repr(out[other]) == repr(structure) else " except for parameter names"
-            raise ModelError(f"candidates {other!r} and {name!r} are the same structure{only}; leave one out")
+        first_name = names_by_content.setdefault(_content(structure), name)
+        if first_name != name:
+            exception_text = "" if repr(out[first_name]) == repr(structure) else " except for parameter names"
+            raise ModelError(
+                f"candidates {first_name!r} and {name!r} are the same structure{exception_text}; leave one out"
+            )
     return out
 
 
@@ -384,7 +406,7 @@ def _content(structure: Structure) -> str:
     """Return a text that identifies a candidate up to parameter names and the sequence of its terms."""
     if structure.has_order_law or structure.coefficient_law:
         return repr(structure)
-    rest = (
+    options = (
         sorted((v[0], v[-1], len(v)) for v in structure.order_values.values()),
         sorted(structure.delay.items()),
         sorted(structure.free_delays.items()),
@@ -392,4 +414,4 @@ def _content(structure: Structure) -> str:
         structure.sensor_filter,
         [e.friction for e in structure.equations],
     )
-    return f"{signature(structure)} {rest!r}"
+    return f"{signature(structure)} {options!r}"

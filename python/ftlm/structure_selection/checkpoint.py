@@ -63,18 +63,22 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     def difference(self, other: Request) -> str | None:
         """Return text on the first of runs, candidates and validation that differs from another request, else None."""
-        words = {
+        descriptions = {
             "runs": "of other runs",
             "candidates": "of other candidates",
             "validation": "with other validation data",
         }
-        return next((text for n, text in words.items() if getattr(self, n) != getattr(other, n)), None)
+        return next((text for n, text in descriptions.items() if getattr(self, n) != getattr(other, n)), None)
 
 
 def _run_content(run: Run) -> list[object]:
     """Return all data of a run that affect a fit, for a digest."""
-    own = run.sample_times
-    times = [] if own is None else [own.times.tobytes(), {n: v.tobytes() for n, v in own.data.items()}]
+    nonuniform_samples = run.sample_times
+    times = (
+        []
+        if nonuniform_samples is None
+        else [nonuniform_samples.times.tobytes(), {n: v.tobytes() for n, v in nonuniform_samples.data.items()}]
+    )
     samples = {n: np.ascontiguousarray(run[n], "<f8").tobytes() for n in run.signals}
     return [run.name, run.step, run.inputs, run.outputs, samples, run.units, run.intersample, times]
 
@@ -114,7 +118,7 @@ class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fi
         joint, count = self.joint, len(self.joint.names)
         if (joint.covariance.shape, joint.finest_grid_values.shape) != ((count, count), (count,)):
             return f"a covariance or values of another size than its {count} parameters"
-        if any(e.ndim != 1 for part in joint.residuals for e in part.values()):
+        if any(e.ndim != 1 for run_residuals in joint.residuals for e in run_residuals.values()):
             return "residuals that are not one-dimensional"
         if self.history and isinstance(joint.initial, str):
             return f"the initial terms {joint.initial!r} instead of powers of t"
@@ -160,7 +164,7 @@ class Store:
     """
 
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
-        self._answers: dict[bytes, Answer] = {}
+        self._results: dict[bytes, Answer] = {}
         self._lock = threading.Lock()
         self._file = CheckpointFile(path, "selection", "create")
         try:
@@ -196,10 +200,10 @@ class Store:
             self._check_same(request, record)
             return
         # Digests detect damage, not wrong contents.
-        wrong = record.answer.inconsistency() if isinstance(record.answer, StoredFit) else None
-        if wrong is not None:
-            raise DataError(f"store {path} contains a fit with {wrong} in record {number}; choose another file")
-        self._answers[record.request] = record.answer
+        inconsistency = record.answer.inconsistency() if isinstance(record.answer, StoredFit) else None
+        if inconsistency is not None:
+            raise DataError(f"store {path} contains a fit with {inconsistency} in record {number}; choose another file")
+        self._results[record.request] = record.answer
 
     def _check_same(self, request: Request, stored: Request) -> None:
         path = self._file.path
@@ -214,47 +218,47 @@ class Store:
         if difference is not None:
             raise DataError(f"store {path} contains a selection {difference}; choose another file")
 
-    def _check_result_type(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
+    def _check_result_type(self, result: Answer, kind: type[Expected], description: str) -> Expected:
         """Return a stored result if its type is `kind`, otherwise raise DataError.
 
         `description` is the name of the expected result in the message.
         """
-        if isinstance(answer, kind):
-            return answer
-        words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
+        if isinstance(result, kind):
+            return result
+        descriptions = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
         raise DataError(
-            f"store {self._file.path} contains {words[type(answer)]} where {description} is expected; choose "
+            f"store {self._file.path} contains {descriptions[type(result)]} where {description} is expected; choose "
             "another file"
         )
 
     def __len__(self) -> int:
-        return len(self._answers)
+        return len(self._results)
 
     def recall_or_compute(
         self,
         request: object,
         compute: Callable[[], Result],
         write: Callable[[Result], Answer | None],
-        read: Callable[[Answer], Result],
+        convert: Callable[[Answer], Result],
     ) -> Result:
         """Return the result of a step from the file, or compute it and store it there.
 
-        `write` and `read` convert a result to and from its stored form. A result for which `write` returns None is not
-        stored.
+        `write` and `convert` convert a result to and from its stored form. A result for which `write` returns None is
+        not stored.
         """
         key = _digest(request)
         with self._lock:
-            answer = self._answers.get(key)
-        if answer is None:
+            stored = self._results.get(key)
+        if stored is None:
             result = compute()
-            answer = write(result)
-            if answer is None:
+            stored = write(result)
+            if stored is None:
                 return result
             with self._lock:
-                self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, answer))])
-                self._answers[key] = answer
+                self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, stored))])
+                self._results[key] = stored
         # Decode the stored form even of a new result, so that a resumed selection gives the same bits.
-        return read(answer)
+        return convert(stored)
 
     def fit(
         self,
@@ -268,33 +272,33 @@ class Store:
         def write(result: JointFit | FtlmError) -> Answer | None:
             return StoredFit.of(result) if isinstance(result, JointFit) else FitError.of(result)
 
-        def read(answer: Answer) -> JointFit | FtlmError:
-            if isinstance(answer, FitError):
-                return answer.error()
-            return self._check_result_type(answer, StoredFit, "a fit").fit()
+        def convert(result: Answer) -> JointFit | FtlmError:
+            if isinstance(result, FitError):
+                return result.error()
+            return self._check_result_type(result, StoredFit, "a fit").fit()
 
-        return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
+        return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, convert)
 
     def validation(
-        self, name: str, structure: Structure, joint: JointFit, fine: bool, compute: Callable[[], Trial]
+        self, name: str, structure: Structure, joint: JointFit, is_final: bool, compute: Callable[[], Trial]
     ) -> Trial:
         """Return the stored or computed trial of a fitted candidate on validation data."""
 
-        def read(answer: Answer) -> Trial:
-            trial = self._check_result_type(answer, StoredTrial, "a validation").trial
+        def convert(result: Answer) -> Trial:
+            trial = self._check_result_type(result, StoredTrial, "a validation").trial
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
-        request = ("judge", structure, joint.names, joint.values, joint.initial, fine)
-        return self.recall_or_compute(request, compute, lambda trial: StoredTrial(replace(trial, joint=None)), read)
+        request = ("judge", structure, joint.names, joint.values, joint.initial, is_final)
+        return self.recall_or_compute(request, compute, lambda trial: StoredTrial(replace(trial, joint=None)), convert)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return the stored or computed result of the best-subset search."""
 
-        def read(answer: Answer) -> list[ScreenedSubset]:
-            return self._check_result_type(answer, StoredSubsets, "subsets").subsets
+        def convert(result: Answer) -> list[ScreenedSubset]:
+            return self._check_result_type(result, StoredSubsets, "subsets").subsets
 
-        return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, read)
+        return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, convert)
 
     def close(self) -> None:
         """Close the file and release the lock."""

@@ -60,16 +60,16 @@ class Fold:
     @property
     def has_estimation_excitation(self) -> bool:
         """Whether an input changes in the estimation samples; True if no input ever changes."""
-        inside = 0
+        masked_changes = 0
         for run in self.runs:
             masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
             for name in run.inputs:
                 rows = np.flatnonzero(np.diff(run[name])) + 1
-                within = int(np.count_nonzero((rows >= masked[0]) & (rows < masked[1])))
-                if within < rows.size:
+                changes = int(np.count_nonzero((rows >= masked[0]) & (rows < masked[1])))
+                if changes < rows.size:
                     return True
-                inside += within
-        return inside == 0
+                masked_changes += changes
+        return masked_changes == 0
 
     @property
     def has_motion(self) -> bool:
@@ -94,8 +94,8 @@ class Fold:
         With the standard deviation of the block itself, no model would fit a block in which the output rests.
         """
         values = self.validation_run[output]
-        first, last = self.rows or (0, values.size)
-        count = np.count_nonzero(np.isfinite(values[first:last]))
+        start, stop = self.rows or (0, values.size)
+        count = np.count_nonzero(np.isfinite(values[start:stop]))
         return max(math.sqrt(count) * float(np.nanstd(values)), 1e-300)
 
     def fit(self, model: Model) -> dict[str, float]:
@@ -112,16 +112,16 @@ class Fold:
             freedom = {o: 1.0 - len(comparison.initial[0].get(o, ())) / max(n, 1) for o, n in samples.items()}
             return {o: 100.0 - (100.0 - f) / math.sqrt(max(freedom[o], 1e-3)) for o, f in comparison.fit.items()}
         # Without the first block, initial terms that decay early would not be identifiable.
-        moving = self.rows[0] == 0 and model.structure.initial != "rest"
+        is_in_motion = self.rows[0] == 0 and model.structure.initial != "rest"
         rest_comparison = compare(
-            model, self.validation_run if moving else mask_outputs(self.validation_run, outputs, self.rows)
+            model, self.validation_run if is_in_motion else mask_outputs(self.validation_run, outputs, self.rows)
         )
-        answer = simulate(
+        simulated = simulate(
             model, self.validation_run, tolerance=SIMULATION_TOLERANCE, initial=rest_comparison.initial[0]
         )
         out = {}
         for name in outputs:
-            output, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, answer))
+            output, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, simulated))
             out[name] = 100.0 * (1.0 - vector_norm(drop_missing(output - free)) / self.norm(name))
         return out
 
@@ -186,38 +186,40 @@ class Folds:
         DataError
             If runs differ in names or units, or are too short to be divided.
         """
-        every = as_runs(runs)
+        all_runs = as_runs(runs)
         if not isinstance(validation, (str, Run)) and not validation:
             raise ModelError(
                 "validation = [] has no run; give a run that is not an estimation run, or use 'runs' or 'blocks'"
             )
         if not isinstance(validation, str):
-            others = as_runs(validation)
-            as_runs([*every, *others])
-            for run in others:
-                if any(_have_equal_samples(run, estimation_run) for estimation_run in every):
+            validation_runs = as_runs(validation)
+            as_runs([*all_runs, *validation_runs])
+            for run in validation_runs:
+                if any(_have_equal_samples(run, estimation_run) for estimation_run in all_runs):
                     raise ModelError(
                         f"validation run {run.name} is also an estimation run, so it does not validate the model; "
                         f"leave it out of one of the two, or use {parameter('validation', 'runs')}"
                     )
-            names = ", ".join(r.name for r in others)
-            return cls(every, tuple(Fold(every, run) for run in others), f"{names}, not fitted to")
+            names = ", ".join(r.name for r in validation_runs)
+            return cls(all_runs, tuple(Fold(all_runs, run) for run in validation_runs), f"{names}, not fitted to")
         if validation == "runs":
-            if len(every) < 2:
+            if len(all_runs) < 2:
                 raise ModelError(
                     f"{parameter('validation', 'runs')} leaves one run out at a time, but there is only one; give "
                     f"several runs, a separate run as {parameter('validation')}, or use "
                     f"{parameter('validation', 'blocks')}"
                 )
-            parts = [Fold(Runs(r for k, r in enumerate(every) if k != out), every[out]) for out in range(len(every))]
-            return cls(every, tuple(parts), f"each of {len(every)} runs by the others")
+            parts = [
+                Fold(Runs(r for k, r in enumerate(all_runs) if k != out), all_runs[out]) for out in range(len(all_runs))
+            ]
+            return cls(all_runs, tuple(parts), f"each of {len(all_runs)} runs by the others")
         if validation != "blocks":
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
-        blocks = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
+        blocks = [Fold(all_runs, run, rows) for run in all_runs for rows in block_ranges(run)]
         # Without the only samples in which an input changes, the plant is not identifiable. A block at standstill
         # contains only noise, which does not validate a prediction.
         parts = [fold for fold in blocks if fold.has_estimation_excitation and fold.has_motion] or blocks
-        return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
+        return cls(all_runs, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
     @classmethod
     def of_pieces(cls, runs: Runs, duration: float) -> Folds:
@@ -226,17 +228,17 @@ class Folds:
         `duration` is the shortest duration of a piece [s]. At most :data:`MAX_SPLIT_FOLDS` pieces, evenly distributed,
         are used. The final estimate uses all pieces.
         """
-        every = [piece for run in runs for piece in run.split(duration)]
-        indices = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
-        folds = cls.of([every[k] for k in indices], "runs")
-        words = f"each of {len(indices)} pieces of {duration:.2g} s by the others"
-        return replace(folds, description=words, split=(runs, duration))
+        pieces = [piece for run in runs for piece in run.split(duration)]
+        indices = np.unique(np.linspace(0, len(pieces) - 1, MAX_SPLIT_FOLDS).astype(int))
+        folds = cls.of([pieces[k] for k in indices], "runs")
+        description = f"each of {len(indices)} pieces of {duration:.2g} s by the others"
+        return replace(folds, description=description, split=(runs, duration))
 
 
-def _have_equal_samples(one: Run, other: Run) -> bool:
+def _have_equal_samples(first: Run, second: Run) -> bool:
     """Whether two runs have equal samples."""
-    names = one.signals
-    return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
+    names = first.signals
+    return first.length == second.length and all(np.array_equal(first[n], second[n], equal_nan=True) for n in names)
 
 
 def block_ranges(run: Run) -> list[tuple[int, int]]:
@@ -354,35 +356,37 @@ def fit(
     starts: Sequence[Mapping[str, float]],
     *,
     refine: bool = True,
-    near: JointFit | None = None,
+    initial_fit: JointFit | None = None,
 ) -> JointFit:
     """Return the best output-error fit from the initial guesses `starts`, or from automatic ones if there are none.
 
-    If `near` is given, which is a fit of this structure to nearly the same runs, the fit starts from it alone. Raise
-    the last error if every fit fails.
+    If `initial_fit` is given, which is a fit of this structure to nearly the same runs, the fit starts from it alone.
+    Raise the last error if every fit fails.
 
     If an initial guess omits a parameter, this parameter starts at 0 or 1. The gradient may vanish at such values, for
     example at a friction coefficient of 0. Automatic initial guesses are therefore added.
     """
     fixed_structure = fix_initial_conditions(structure, runs)
-    if near is not None:
-        return fit_output_error(runs, fixed_structure, refine=refine, near=near)
+    if initial_fit is not None:
+        return fit_output_error(runs, fixed_structure, refine=refine, initial_fit=initial_fit)
     problem = FreeProblem.of(fixed_structure)
     if not starts or any(n not in s for s in starts for n in problem.names):
         # With zero friction the Stribeck speed is arbitrary.
-        nothing = {n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)}
-        return fit_output_error(runs, fixed_structure, refine=refine, guesses=[{**nothing, **s} for s in starts])
-    ends: list[JointFit] = []
-    last: FtlmError | None = None
+        null_values = {
+            n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)
+        }
+        return fit_output_error(runs, fixed_structure, refine=refine, guesses=[{**null_values, **s} for s in starts])
+    fits: list[JointFit] = []
+    last_error: FtlmError | None = None
     for start in starts:
         try:
-            ends.append(fit_output_error(runs, fixed_structure, start=start, refine=refine))
+            fits.append(fit_output_error(runs, fixed_structure, start=start, refine=refine))
         except FtlmError as error:
-            last = error
-    if not ends:
-        assert last is not None
-        raise last
-    return min(ends, key=log_residual_power)
+            last_error = error
+    if not fits:
+        assert last_error is not None
+        raise last_error
+    return min(fits, key=log_residual_power)
 
 
 def log_residual_power(joint: JointFit) -> float:
@@ -390,29 +394,33 @@ def log_residual_power(joint: JointFit) -> float:
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
-def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
+def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, is_final: bool = False) -> Trial:
     """Return the trial of a candidate, which is fitted to each fold from the optimum `joint` of the fit to all runs.
 
-    With `fine`, the time step of these fits is refined until converged. Raise FtlmError, with the name of the fold, if
-    a fit or a simulation fails.
+    With `is_final`, the time step of these fits is refined until converged. Raise FtlmError, with the name of the fold,
+    if a fit or a simulation fails.
     """
     model = fitted_model(joint, structure)
     estimation = compare(model, folds.runs).fit
-    grows = (
+    is_unstable = (
         folds.split is None and structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     )
     start = joint.values_by_name
     # A fine fit compares its last two grids. Each fold starts on the coarser one, so that it compares the same grids.
-    near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint
+    initial_fit = (
+        replace(joint, refinement=max(1, joint.refinement // 2)) if is_final and joint.step_converged else joint
+    )
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
         runs = fold.estimation_runs(structure.outputs)
         try:
             if runs is not folds.runs and fold.rows is not None and _has_measured_drivers(structure):
-                validation[fold.name] = _validate_separately(structure, fold, joint, refine=fine)
+                validation[fold.name] = _validate_separately(structure, fold, joint, refine=is_final)
                 continue
-            own = joint if runs is folds.runs else fit(runs, structure, [], refine=fine, near=near)
-            validation[fold.name] = fold.fit(fitted_model(replace(own, initial=joint.initial), structure))
+            fold_fit = (
+                joint if runs is folds.runs else fit(runs, structure, [], refine=is_final, initial_fit=initial_fit)
+            )
+            validation[fold.name] = fold.fit(fitted_model(replace(fold_fit, initial=joint.initial), structure))
         except FtlmError as error:
             # The message is about the estimation data of the fold, not about the given runs.
             raise type(error)(f"without {fold.name}: {error}") from error
@@ -432,16 +440,18 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         values=start,
         errors=joint.standard_errors,
         insignificant=insignificant_coefficients(joint),
-        unstable=grows,
+        unstable=is_unstable,
         joint=joint,
-        refined=fine,
+        refined=is_final,
     )
 
 
 def _has_measured_drivers(structure: Structure) -> bool:
     """Whether measured outputs enter the equations of other outputs as inputs."""
-    others = ({*item.signals} - {item.output} for item in structure.equations)
-    return structure.coupling == "measured" and any(name in structure.outputs for names in others for name in names)
+    other_signals = ({*equation.signals} - {equation.output} for equation in structure.equations)
+    return structure.coupling == "measured" and any(
+        name in structure.outputs for names in other_signals for name in names
+    )
 
 
 def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, refine: bool) -> dict[str, float]:
@@ -452,9 +462,9 @@ def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, r
     """
     fits: dict[str, float] = {}
     for output in structure.outputs:
-        alone = replace(structure.equation(output), initial=joint.initial)
-        own = fit(fold.estimation_runs([output]), alone, [joint.values_by_name], refine=refine)
-        fits |= fold.fit(fitted_model(replace(own, initial=joint.initial), alone))
+        single = replace(structure.equation(output), initial=joint.initial)
+        fold_fit = fit(fold.estimation_runs([output]), single, [joint.values_by_name], refine=refine)
+        fits |= fold.fit(fitted_model(replace(fold_fit, initial=joint.initial), single))
     return fits
 
 
@@ -467,24 +477,26 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
     """
     if not joint.converged:
         return -math.inf
-    pooled = {o: drop_missing(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
+    pooled = {
+        o: drop_missing(np.concatenate([run_residuals[o] for run_residuals in joint.residuals])) for o in joint.noise
+    }
     # Stored residuals are divided by the standard deviations that weighted them. This scale restores the noise level.
     scale = {o: v / max(float(np.sqrt(np.mean(pooled[o] ** 2))), 1e-300) for o, v in joint.noise.items()}
     scores = []
     for fold in folds.parts:
-        place = next((k for k, run in enumerate(folds.runs) if run is fold.validation_run), None)
-        if place is None:
+        run_index = next((k for k, run in enumerate(folds.runs) if run is fold.validation_run), None)
+        if run_index is None:
             return -math.inf
-        first, last = fold.rows or (0, fold.validation_run.length)
-        if fold.rows is not None and first == 0 and joint.initial != "rest":
+        start, stop = fold.rows or (0, fold.validation_run.length)
+        if fold.rows is not None and start == 0 and joint.initial != "rest":
             # The initial terms of this block are estimated from all samples, so its residuals may be smaller.
             return -math.inf
-        for output, residuals in joint.residuals[place].items():
+        for output, residuals in joint.residuals[run_index].items():
             if residuals.size != fold.validation_run.length - 2:
                 return -math.inf
-            residual = residuals[max(first - 1, 0) : last - 1]
-            share = scale[output] * vector_norm(drop_missing(residual)) / fold.norm(output)
-            scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
+            residual = residuals[max(start - 1, 0) : stop - 1]
+            relative_error = scale[output] * vector_norm(drop_missing(residual)) / fold.norm(output)
+            scores.append(math.log(min(max(relative_error, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
     return float(np.mean(scores))
 
 
@@ -510,8 +522,8 @@ def insignificant_coefficients(joint: JointFit) -> tuple[str, ...]:
 
 def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
     """Return the number of estimated parameters, including the offsets of the runs."""
-    each = {"none": 0, "auto": 0, "level": 1, "constant": 1, "ramp": 2}[structure.offset]
-    return len(joint.names) + each * len(structure.equations) * len(folds.runs)
+    offset_count = {"none": 0, "auto": 0, "level": 1, "constant": 1, "ramp": 2}[structure.offset]
+    return len(joint.names) + offset_count * len(structure.equations) * len(folds.runs)
 
 
 def residual_variance_inflation(joint: JointFit) -> float:
@@ -520,7 +532,12 @@ def residual_variance_inflation(joint: JointFit) -> float:
     The variance inflation is the variance of the sum of the residuals, divided by its value for white noise of the same
     power.
     """
-    return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
+    return max(
+        [
+            1.0,
+            *(variance_inflation(drop_missing(e)) for run_residuals in joint.residuals for e in run_residuals.values()),
+        ]
+    )
 
 
 def fit_criterion(joint: JointFit, inflation: float = 1.0) -> float:
@@ -529,7 +546,7 @@ def fit_criterion(joint: JointFit, inflation: float = 1.0) -> float:
     The number of samples is divided by `inflation`, the variance inflation of correlated residuals. Initial terms and
     offsets count as parameters, because the initial term of a canceled pole and zero can model a level.
     """
-    counts = {o: sum(drop_missing(part[o]).size for part in joint.residuals) for o in joint.noise}
+    counts = {o: sum(drop_missing(run_residuals[o]).size for run_residuals in joint.residuals) for o in joint.noise}
     # The floor keeps differences between candidates finite.
     noise = [(counts[o] / inflation, max(v, 1e-300)) for o, v in joint.noise.items()]
     parameters = len(joint.names) + joint.initial_terms + len(joint.noise)

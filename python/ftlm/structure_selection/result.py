@@ -103,7 +103,7 @@ class Selection(BestIdentification):
 
     def tables(self) -> list[Table]:
         """Return a table of the candidates for an HTML page, and one of candidates without a fit if there are any."""
-        least = min((t.effective_bic for t in self.trials if t.effective_bic is not None), default=0.0)
+        lowest_bic = min((t.effective_bic for t in self.trials if t.effective_bic is not None), default=0.0)
         rows: list[list[Cell]] = [
             [
                 ("chosen: " if trial is self.winner else "") + trial.name + (UNSTABLE_NOTE if trial.unstable else ""),
@@ -112,7 +112,7 @@ class Selection(BestIdentification):
                 trial.validation_fit,
                 trial.worst_fold,
                 None if trial.bic is None else Exact(round(trial.bic, 1)),
-                None if trial.effective_bic is None else Exact(round(trial.effective_bic - least, 1)),
+                None if trial.effective_bic is None else Exact(round(trial.effective_bic - lowest_bic, 1)),
                 ", ".join(trial.insignificant),
             ]
             for trial in self.trials
@@ -136,18 +136,18 @@ class Selection(BestIdentification):
 
     def figure(self) -> LineChart:
         """Return a chart of the best fit over the number of parameters."""
-        best: dict[int, Trial] = {}
+        best_by_count: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
-            if trial.parameters not in best or trial.score < best[trial.parameters].score:
-                best[trial.parameters] = trial
-        along = sorted(best)
+            if trial.parameters not in best_by_count or trial.score < best_by_count[trial.parameters].score:
+                best_by_count[trial.parameters] = trial
+        counts = sorted(best_by_count)
         estimation, validation_data = (
-            [best[n].estimation_fit for n in along],
-            [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
+            [best_by_count[n].estimation_fit for n in counts],
+            [max(best_by_count[n].validation_fit, MIN_FIT_PERCENT) for n in counts],
         )
-        choice = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
+        choice = [v if n == self.winner.parameters else math.nan for n, v in zip(counts, validation_data, strict=True)]
         return LineChart(
-            [float(n) for n in along],
+            [float(n) for n in counts],
             [("estimation", estimation), ("validation", validation_data), ("chosen", choice)],
             title="Fit by number of parameters",
             x_label="estimated parameters",
@@ -222,9 +222,9 @@ class Selection(BestIdentification):
         """Return the table of the candidates and the reason for the choice, as text."""
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates validated: {self.validation}"]
         lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
-        for place, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
-            mark = "> " if place == self.chosen else "  "
-            lines += _row_lines(mark, trial)
+        for index, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
+            prefix = "> " if index == self.chosen else "  "
+            lines += _row_lines(prefix, trial)
         if self.chosen >= MAX_PRINTED_ROWS:
             lines += _row_lines("> ", self.winner)
         if len(self.trials) > MAX_PRINTED_ROWS:
@@ -232,13 +232,13 @@ class Selection(BestIdentification):
         return "\n".join([*lines, self.reason, *(f"warning: {w}" for w in self.warnings)])
 
 
-def _row_lines(mark: str, trial: Trial) -> list[str]:
+def _row_lines(prefix: str, trial: Trial) -> list[str]:
     """Return the text lines of a candidate in the ranking: its fits, and its structure in as many lines as it takes."""
     fits = trial.validation_fit, trial.worst_fold, trial.estimation_fit
-    validation, worst, estimation = ("-" if trial.failed is not None else format_fit(fit) for fit in fits)
-    lead = f"{mark}{validation:>9}{worst:>9}{estimation:>10}{trial.parameters:>9}  "
-    lines = wrap_text(trial.name + (UNSTABLE_NOTE if trial.unstable else ""), lead, " " * len(lead))
-    return lines if trial.failed is None else lines + wrap_text(trial.failed, " " * len(lead))
+    validation, worst_fold, estimation = ("-" if trial.failed is not None else format_fit(fit) for fit in fits)
+    row_start = f"{prefix}{validation:>9}{worst_fold:>9}{estimation:>10}{trial.parameters:>9}  "
+    lines = wrap_text(trial.name + (UNSTABLE_NOTE if trial.unstable else ""), row_start, " " * len(row_start))
+    return lines if trial.failed is None else lines + wrap_text(trial.failed, " " * len(row_start))
 
 
 def format_fit(fit: float) -> str:

@@ -56,23 +56,24 @@ def automatic_problems(
     ModelError
         If a signal in `driven_by` is not in the runs or is the output itself.
     """
-    first, drivers_by_output = runs[0], dict(driven_by or {})
+    first_run, drivers_by_output = runs[0], dict(driven_by or {})
     for output, drivers in drivers_by_output.items():
-        if output not in first.outputs:
+        if output not in first_run.outputs:
             raise ModelError(
-                f"{parameter('driven_by')}: {output!r} is not an output{nearest(output, first.outputs)}; the runs have "
-                f"{', '.join(first.outputs)}"
+                f"{parameter('driven_by')}: {output!r} is not an output{nearest(output, first_run.outputs)}; the "
+                "runs have "
+                f"{', '.join(first_run.outputs)}"
             )
         for name in drivers:
-            if name not in first or name == output:
+            if name not in first_run or name == output:
                 raise ModelError(
                     f"{parameter('driven_by')}: {name!r} cannot be an input of {output}; name an input or another "
-                    f"output of the runs: {', '.join(n for n in first.signals if n != output)}"
+                    f"output of the runs: {', '.join(n for n in first_run.signals if n != output)}"
                 )
     problems = []
-    for output in first.outputs:
-        drivers = tuple(dict.fromkeys(drivers_by_output.get(output, first.inputs)))
-        suffix = f"_{output}" if len(first.outputs) > 1 else ""
+    for output in first_run.outputs:
+        drivers = tuple(dict.fromkeys(drivers_by_output.get(output, first_run.inputs)))
+        suffix = f"_{output}" if len(first_run.outputs) > 1 else ""
         problems.append(OutputProblem(runs, output, drivers, dict(delays or {}), suffix))
     return problems
 
@@ -186,8 +187,8 @@ def select(
     fits.
     """
     workers = check_threads(threads)
-    several = as_runs(runs)
-    folds = Folds.of(several, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
+    run_list = as_runs(runs)
+    folds = Folds.of(run_list, validation if validation is not None else "runs" if len(run_list) > 1 else "blocks")
     if not isinstance(candidates, (str, Structure, Sequence, Mapping)):
         raise ModelError(
             f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
@@ -200,14 +201,16 @@ def select(
             f"{len(candidates)} candidates are more than {MAX_CANDIDATES}; give one structure instead, from which "
             "terms are selected stepwise"
         )
-    every = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
+    listed = name_candidates(candidates) if not isinstance(candidates, (str, Structure)) else {}
     if isinstance(candidates, str) and candidates != "auto":
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
     problems_by_output = automatic_problems(folds.runs, delay, driven_by) if isinstance(candidates, str) else []
     searched = [candidates] if isinstance(candidates, Structure) else []
-    idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
-    if idle:
-        raise ModelError(f"{idle[0]} has no free parameter; name a coefficient or an order, or use model.compare(runs)")
+    without_parameters = [describe_structure(s) for s in (*searched, *listed.values()) if not FreeProblem.of(s).names]
+    if without_parameters:
+        raise ModelError(
+            f"{without_parameters[0]} has no free parameter; name a coefficient or an order, or use model.compare(runs)"
+        )
     if delay and not problems_by_output:
         raise ModelError(f"{parameter('delay')} is used with 'auto'; give the delays to ftlm.equation instead")
     if driven_by and not problems_by_output:
@@ -218,7 +221,7 @@ def select(
             f"runs have {', '.join(folds.runs[0].inputs)}"
         )
     automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in problems_by_output]
-    for structure in (*searched, *every.values(), *automatic):
+    for structure in (*searched, *listed.values(), *automatic):
         # Raise here once, instead of a failure of every candidate.
         prepare(
             folds.runs,
@@ -229,21 +232,21 @@ def select(
         )
     work = CandidateEvaluator(folds, workers, progress)
     if store is None:
-        return _run_selection(work, searched, every, problems_by_output)
-    request = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
+        return _run_selection(work, searched, listed, problems_by_output)
+    request = Request.of(folds.runs, [searched, listed, *automatic], folds.unseen_runs, folds.description)
     with Store(store, request) as open_store:
-        return _run_selection(replace(work, store=open_store), searched, every, problems_by_output)
+        return _run_selection(replace(work, store=open_store), searched, listed, problems_by_output)
 
 
 def _run_selection(
     work: CandidateEvaluator,
     searched: Sequence[Structure],
-    every: Mapping[str, Structure],
+    listed: Mapping[str, Structure],
     problems_by_output: Sequence[OutputProblem],
 ) -> Selection:
     """Return the selection among automatic structures, or among given ones and those nested in them.
 
-    Automatic structures are used if there are `problems_by_output`. Otherwise, the structures in `every` and those
+    Automatic structures are used if there are `problems_by_output`. Otherwise, the structures in `listed` and those
     nested in the structures in `searched` are used.
     """
     if problems_by_output:
@@ -259,8 +262,8 @@ def _run_selection(
         return split if split.trials[split.chosen].validation_fit > winner.validation_fit else selection
     for structure in searched:
         StepwiseSelection(NestedStructures(structure), work).run()
-    if every:
-        evaluate_list(every, work)
+    if listed:
+        evaluate_list(listed, work)
     return _identify_choice(work, _choose(work, prefers_integer_orders=False))
 
 
@@ -303,9 +306,9 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
     """
     fits = [t for t in work.trials if t.joint is not None]
     if not fits:
-        why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
+        reason = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
         raise ConvergenceError(
-            f"no candidate can be fitted to {work.folds.description}; give simpler candidates or longer runs{why}"
+            f"no candidate can be fitted to {work.folds.description}; give simpler candidates or longer runs{reason}"
         )
     best_trials: dict[str, Trial] = {}
     for trial in work.trials:
@@ -315,14 +318,14 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
     ranked = _rank_trials(list(best_trials.values()))
     ranked = _with_criteria(ranked)
     best = ranked[0]
-    near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
+    close = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
     # Refine the best candidates: over thousands of samples the criterion depends on the step of the grid.
-    for k, trial in zip(near, work.map_items(work.refine_trial, [ranked[k] for k in near]), strict=True):
+    for k, trial in zip(close, work.map_items(work.refine_trial, [ranked[k] for k in close]), strict=True):
         ranked[k] = trial
     ranked = _with_criteria(ranked)
-    eligible, words = _eligible_indices(ranked, near) if prefers_integer_orders else (near, "")
+    eligible, text = _eligible_indices(ranked, close) if prefers_integer_orders else (close, "")
     best, winner = ranked[0], _winner([ranked[k] for k in eligible])
-    return Choice(tuple(ranked), winner, _reason(winner, best, ranked) + words)
+    return Choice(tuple(ranked), winner, _reason(winner, best, ranked) + text)
 
 
 def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Choice:
@@ -348,7 +351,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
         combination = replace(combination, initial="caputo")
     start = {n: v for w in winners for n, v in w.values.items()}
     trial = work.validate(
-        describe_structure(combination), combination, work.fit_candidate(combination, [start]), fine=True
+        describe_structure(combination), combination, work.fit_candidate(combination, [start]), is_final=True
     )
     reason = " ".join(c.reason for c in choices)
     if not has_common_delays:
@@ -365,10 +368,10 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
     """Whether the delay estimates of each input agree within their errors in all equations."""
     for name in {i.name for w in winners for i in w.structure.free_inputs}:
         signal = next(i.signal for w in winners for i in w.structure.free_inputs if i.name == name)
-        driven = [w for w in winners if signal in w.structure.signals]
-        if any(name not in w.values for w in driven):
+        concerned = [w for w in winners if signal in w.structure.signals]
+        if any(name not in w.values for w in concerned):
             return False
-        values, errors = np.array([(w.values[name], w.errors[name]) for w in driven]).T
+        values, errors = np.array([(w.values[name], w.errors[name]) for w in concerned]).T
         if np.any(np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)):
             return False
     return True
@@ -379,8 +382,8 @@ def _without_free_delays(choice: Choice) -> Choice:
     ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_inputs]
     if not choice.winner.structure.free_inputs or not ranked:
         return choice
-    near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], ranked[0])]
-    winner = _winner([ranked[k] for k in near])
+    close = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], ranked[0])]
+    winner = _winner([ranked[k] for k in close])
     return replace(choice, winner=winner, reason=_reason(winner, ranked[0], ranked))
 
 
@@ -400,11 +403,11 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < MIN_VALIDATION_FIT:
         findings.append(make_finding("no_candidate_fits", fit=format_fit(winner.validation_fit)))
-    worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
-    if worse:
-        findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
-    for part in choice.parts or (choice,):
-        findings += _fractional_order_findings(part.winner, part.ranked, result)
+    poor_parts = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
+    if poor_parts:
+        findings.append(make_finding("worse_than_mean", parts=", ".join(poor_parts)))
+    for single_choice in choice.parts or (choice,):
+        findings += _fractional_order_findings(single_choice.winner, single_choice.ranked, result)
     validated = result.validate(folds.unseen_runs) if folds.unseen_runs else None
     if validated is not None:
         findings += on_validation(validated.findings, ", ".join(run.name for run in folds.unseen_runs))
@@ -445,51 +448,53 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
         return []
     orders_text = ", ".join(f"{n} = {result.orders[n]:.3g}" for n in orders)
-    rival = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
-    if rival is None or set(rival.parts) != set(winner.parts):
+    integer_trial = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
+    if integer_trial is None or set(integer_trial.parts) != set(winner.parts):
         reason = "no candidate with integer orders was fitted"
         return [make_finding("fractional_orders_inconclusive", parameter=orders_text, reason=reason)]
-    gains = [fit - rival.parts[name] for name, fit in winner.parts.items()]
+    gains = [fit - integer_trial.parts[name] for name, fit in winner.parts.items()]
     parts = f"{len(gains)} part{'s' if len(gains) > 1 else ''}"
-    about = {"parameter": orders_text, "other": rival.name, "parts": parts, "gain": median(gains)}
-    if is_degenerate(result) or rival.unstable or not rival.validation_fit >= MIN_VALIDATION_FIT:
-        reason = f"the fit of {rival.name}, or of the chosen candidate, must not be used"
-        return [make_finding("fractional_orders_inconclusive", reason=reason, **about)]
+    details = {"parameter": orders_text, "other": integer_trial.name, "parts": parts, "gain": median(gains)}
+    if is_degenerate(result) or integer_trial.unstable or not integer_trial.validation_fit >= MIN_VALIDATION_FIT:
+        reason = f"the fit of {integer_trial.name}, or of the chosen candidate, must not be used"
+        return [make_finding("fractional_orders_inconclusive", reason=reason, **details)]
     intervals = {n: {"all": result.intervals[n]} for n in orders if n in result.intervals}
-    whole = {n: float(round(orders[n])) for n in intervals}
-    gained = improves_prediction(gains, intervals, whole) if intervals else None
-    if gained is None:
+    integer_orders = {n: float(round(orders[n])) for n in intervals}
+    is_improvement = improves_prediction(gains, intervals, integer_orders) if intervals else None
+    if is_improvement is None:
         is_worse = min(gains) <= -MIN_FIT_GAIN
-        others = "lower" if is_worse else "not higher"
-        reason = f"compared with {rival.name}, the fit is higher on some parts and {others} on other parts"
-        return [make_finding("fractional_orders_inconclusive", reason=reason, **about)]
-    return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
+        comparison_text = "lower" if is_worse else "not higher"
+        reason = (
+            f"compared with {integer_trial.name}, the fit is higher on some parts and {comparison_text} on other parts"
+        )
+        return [make_finding("fractional_orders_inconclusive", reason=reason, **details)]
+    return [make_finding("fractional_orders_gain" if is_improvement else "fractional_orders_gain_nothing", **details)]
 
 
-def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
+def _failed_parts(trials: Sequence[Trial]) -> list[list[str]]:
     """Return, for each trial, the names of the parts of the validation data on which it fails.
 
     A trial fails on a part if its prediction is poor while a stable trial predicts this part far better.
     """
-    scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
-    least: dict[str, float] = {}
-    for scores in (part for part, t in zip(scores_by_part, every, strict=True) if not t.unstable):
+    scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in trials]
+    lowest_scores: dict[str, float] = {}
+    for scores in (part for part, t in zip(scores_by_part, trials, strict=True) if not t.unstable):
         for name, score in scores.items():
-            least[name] = min(score, least.get(name, math.inf))
+            lowest_scores[name] = min(score, lowest_scores.get(name, math.inf))
     return [
-        [n for n, v in s.items() if v > FAILURE_SCORE and v > least.get(n, math.inf) + FAILURE_SCORE_GAP]
+        [n for n, v in s.items() if v > FAILURE_SCORE and v > lowest_scores.get(n, math.inf) + FAILURE_SCORE_GAP]
         for s in scores_by_part
     ]
 
 
-def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
+def _rank_trials(trials: Sequence[Trial]) -> list[Trial]:
     """Return trials sorted by stability, number of failures and mean score, best first; failed fits are last.
 
     By the mean score alone, good fits on other blocks would compensate for a failure on one block.
     """
-    failures = dict(zip(map(id, every), map(len, _failed_parts(every)), strict=True))
+    failures = dict(zip(map(id, trials), map(len, _failed_parts(trials)), strict=True))
     return sorted(
-        every, key=lambda t: (t.failed is not None, t.unstable, failures[id(t)], t.score, t.parameters, t.name)
+        trials, key=lambda t: (t.failed is not None, t.unstable, failures[id(t)], t.score, t.parameters, t.name)
     )
 
 
@@ -514,58 +519,60 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
     too few folds for a t-test, its residual must also be at most 5 % larger.
     """
     differences = np.array(trial.scores) - np.array(best.scores)
-    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
+    score_gap, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
     if differences.size < MIN_T_TEST_FOLDS:
-        return far <= SCORE_TOLERANCE or (far <= MAX_SCORE_TOLERANCE and likely)
+        return score_gap <= SCORE_TOLERANCE or (score_gap <= MAX_SCORE_TOLERANCE and likely)
     error = float(np.std(differences, ddof=1)) / math.sqrt(differences.size)
     quantile = STUDENT_QUANTILES_95[min(differences.size - MIN_T_TEST_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
-    return (far <= quantile * error and likely) or far <= max(
+    return (score_gap <= quantile * error and likely) or score_gap <= max(
         SCORE_TOLERANCE, min(quantile * error, MAX_SCORE_TOLERANCE)
     )
 
 
-def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
+def _eligible_indices(ranked: Sequence[Trial], close: Sequence[int]) -> tuple[list[int], str]:
     """Return the indices of eligible trials under a preference for integer orders, and text on fractional orders.
 
-    `near` are the indices of the trials that predict as well as the best one.
+    `close` are the indices of the trials that predict as well as the best one.
 
     Fractional orders are eligible if their residuals are significantly smaller over the folds, by at least 1 %, than
     those of the best integer orders. They are also eligible if they predict as well and their Schwarz criterion is much
     lower.
     """
-    whole = [k for k in _peer_indices(ranked) if not has_memory(ranked[k].structure)]
-    other = [k for k in near if has_memory(ranked[k].structure)]
-    if not whole or not other:
-        return list(near), ""
-    least = ranked[min(whole, key=lambda k: ranked[k].score)]
-    peers = [k for k in whole if _predicts_equally(ranked[k], least)]
+    integer_order_indices = [k for k in _peer_indices(ranked) if not has_memory(ranked[k].structure)]
+    fractional_indices = [k for k in close if has_memory(ranked[k].structure)]
+    if not integer_order_indices or not fractional_indices:
+        return list(close), ""
+    best_integer = ranked[min(integer_order_indices, key=lambda k: ranked[k].score)]
+    peers = [k for k in integer_order_indices if _predicts_equally(ranked[k], best_integer)]
     limit = min(_bic(ranked[k]) for k in peers) - BIC_STRONG_EVIDENCE
-    better = [k for k in other if _predicts_better(ranked[k], least)]
+    better = [k for k in fractional_indices if _predicts_better(ranked[k], best_integer)]
     if better:
         return better, ""
-    alike = [k for k in other if _predicts_equally(ranked[k], least) and _bic(ranked[k]) < limit]
-    if alike:
-        return alike, " Integer orders with a delay and zeros predict as well, with a higher Schwarz criterion."
+    equivalent = [
+        k for k in fractional_indices if _predicts_equally(ranked[k], best_integer) and _bic(ranked[k]) < limit
+    ]
+    if equivalent:
+        return equivalent, " Integer orders with a delay and zeros predict as well, with a higher Schwarz criterion."
     return peers, ""
 
 
-def _predicts_better(trial: Trial, other: Trial) -> bool:
+def _predicts_better(trial: Trial, reference: Trial) -> bool:
     """Whether the residuals of a trial are smaller than another's by at least 1 %, and significantly over the folds."""
-    differences = np.array(trial.scores) - np.array(other.scores)
-    if differences.size < MIN_T_TEST_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
+    differences = np.array(trial.scores) - np.array(reference.scores)
+    if differences.size < MIN_T_TEST_FOLDS or trial.score > reference.score - SCORE_TOLERANCE:
         return False
     error = float(np.std(differences, ddof=1)) / math.sqrt(differences.size)
     return float(np.mean(differences)) < -MIN_BETTER_T_STATISTIC * error
 
 
-def _winner(near: Sequence[Trial]) -> Trial:
+def _winner(close: Sequence[Trial]) -> Trial:
     """Return the trial with the lowest Schwarz criterion; ties go to fewer parameters, then to the lower order.
 
     From rest, an equation and its derivative are equivalent, so the lower order is preferred.
     """
-    least = min(_bic(t) for t in near)
-    alike = [t for t in near if _bic(t) <= least + BIC_TOLERANCE]
-    return min(alike, key=lambda t: (t.parameters, _total_integer_order(t), t.score, t.mean_relative_error))
+    lowest_bic = min(_bic(t) for t in close)
+    equivalent = [t for t in close if _bic(t) <= lowest_bic + BIC_TOLERANCE]
+    return min(equivalent, key=lambda t: (t.parameters, _total_integer_order(t), t.score, t.mean_relative_error))
 
 
 def _total_integer_order(trial: Trial) -> int:
@@ -598,14 +605,15 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     else:
         text += " Of the candidates that predict as well as the best, it has the lowest Schwarz criterion."
     peers = [ranked[k] for k in _peer_indices(ranked)]
-    fewer = [t for t in peers if t.parameters < winner.parameters]
-    more = [t for t in peers if t.parameters > winner.parameters]
-    for others in filter(None, (fewer, more)):
-        near = min(others, key=lambda t: t.score)
-        change = 100 * (math.exp(near.score - winner.score) - 1)
-        side = "larger" if change >= 0 else "smaller"
+    smaller_models = [t for t in peers if t.parameters < winner.parameters]
+    larger_models = [t for t in peers if t.parameters > winner.parameters]
+    for compared in filter(None, (smaller_models, larger_models)):
+        closest = min(compared, key=lambda t: t.score)
+        change = 100 * (math.exp(closest.score - winner.score) - 1)
+        comparison = "larger" if change >= 0 else "smaller"
         text += (
-            f" With {near.parameters} parameters, validation residuals are {float(f'{abs(change):.2g}'):g} % {side}."
+            f" With {closest.parameters} parameters, validation residuals are {float(f'{abs(change):.2g}'):g} % "
+            f"{comparison}."
         )
     return text + _failure_text(winner, ranked)
 
@@ -616,16 +624,18 @@ def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
     text = ""
     better = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]
     if better:
-        other = min(better, key=lambda t: t.score)
-        name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
+        alternative = min(better, key=lambda t: t.score)
+        name, excess_percent = failures[id(alternative)][0], 100 * (1 - math.exp(alternative.score - winner.score))
         text += (
-            f" {other.name} has {share:.2g} % smaller residuals on average and is not chosen: it fails on {name}, with "
-            f"a fit of {format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])} %."
+            f" {alternative.name} has {excess_percent:.2g} % smaller residuals on average and is not chosen: it "
+            f"fails on {name}, with "
+            f"a fit of {format_fit(alternative.parts[name])} % where the chosen one has "
+            f"{format_fit(winner.parts[name])} %."
         )
     for name in failures[id(winner)]:
-        other = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
+        alternative = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
         text += (
-            f" It fails on {name}, with a fit of {format_fit(winner.parts[name])} %; {other.name} has "
-            f"{format_fit(other.parts[name])} % there, but fails elsewhere."
+            f" It fails on {name}, with a fit of {format_fit(winner.parts[name])} %; {alternative.name} has "
+            f"{format_fit(alternative.parts[name])} % there, but fails elsewhere."
         )
     return text

@@ -46,19 +46,19 @@ Result = TypeVar("Result")
 Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
-def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
+def prescreen(runs: Sequence[Run], starts: Sequence[Start], min_count: int, pool: TaskPool) -> list[int]:
     """Return the ascending indices of the structures that are worth a fit on all samples.
 
     Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
-    exceeds `MAX_PRESCREEN_COST_RATIO` times the lowest cost. At least `least` structures remain. All remain if records
-    are too short for subsampling or a structure is non-linear.
+    exceeds `MAX_PRESCREEN_COST_RATIO` times the lowest cost. At least `min_count` structures remain. All remain if
+    records are too short for subsampling or a structure is non-linear.
     """
-    every = list(range(len(starts)))
+    all_indices = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))
-    if decimation == 1 or len(starts) <= least or not all(s.is_linear for s, _ in starts):
-        return every
+    if decimation == 1 or len(starts) <= min_count or not all(s.is_linear for s, _ in starts):
+        return all_indices
 
-    def level(start: Start) -> float:
+    def power(start: Start) -> float:
         structure, points = start
         try:
             return _prescreen_cost(runs, fix_initial_conditions(structure, runs), points, decimation)
@@ -66,10 +66,10 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
             # The fit to all samples reports the error.
             return math.inf
 
-    levels = pool.map_items(level, starts)
+    levels = pool.map_items(power, starts)
     limit = MAX_PRESCREEN_COST_RATIO * min(levels)
-    best_levels = sorted(every, key=lambda k: (levels[k], k))[:least]
-    return [k for k in every if levels[k] <= limit or k in best_levels]
+    best_levels = sorted(all_indices, key=lambda k: (levels[k], k))[:min_count]
+    return [k for k in all_indices if levels[k] <= limit or k in best_levels]
 
 
 def _prescreen_cost(
@@ -77,7 +77,7 @@ def _prescreen_cost(
 ) -> float:
     """Return the lowest cost from some initial guesses on subsampled records, with equally weighted outputs."""
     problem = FreeProblem.of(structure)
-    grid = Objective(
+    objective = Objective(
         problem,
         runs,
         [1.0 / (COARSE_SHARE * size) for size in output_deviations(runs, structure)],
@@ -86,7 +86,9 @@ def _prescreen_cost(
     cost = math.inf
     for point in points:
         try:
-            cost = min(cost, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual)
+            cost = min(
+                cost, objective.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual
+            )
         except FtlmError:
             # Initial guesses without a finite simulation are skipped.
             continue
@@ -133,7 +135,7 @@ class CandidateEvaluator:
         Function that returns the time [s].
     store
         Checkpoint file with the results of each step, if any.
-    done_count, known_count
+    done_count, announced_count
         Numbers of candidates that are fitted, and that are known up to now.
     trials
         Trials of all validated candidates.
@@ -145,19 +147,19 @@ class CandidateEvaluator:
     clock: Callable[[], float] = time.perf_counter
     store: Store | None = None
     done_count: int = 0
-    known_count: int = 0
+    announced_count: int = 0
     trials: list[Trial] = field(default_factory=list)
 
     def map_candidates(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return the results of a function for candidates, in the sequence of the candidates, with progress reports."""
-        self.known_count += len(items)
+        self.announced_count += len(items)
         out: list[Result] = []
         with interruptible_pool(self.threads) as workers:
             for result in workers.map(work, items):
                 out.append(result)
                 self.done_count += 1
                 if self.progress is not None:
-                    self.progress(self.done_count, self.known_count)
+                    self.progress(self.done_count, self.announced_count)
         return out
 
     def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -165,18 +167,20 @@ class CandidateEvaluator:
         with interruptible_pool(self.threads) as workers:
             return list(workers.map(work, items))
 
-    def validate(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
+    def validate(
+        self, name: str, structure: Structure, joint: JointFit | FtlmError, *, is_final: bool = False
+    ) -> Trial:
         """Return the trial of a fitted candidate on validation data; a failed fit gives a failed trial."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
 
         def compute() -> Trial:
             try:
-                return validate_fit(name, structure, self.folds, joint, fine=fine)
+                return validate_fit(name, structure, self.folds, joint, is_final=is_final)
             except FtlmError as error:
                 return Trial(name, structure, parameter_count(structure, joint, self.folds), failed=str(error))
 
-        return compute() if self.store is None else self.store.validation(name, structure, joint, fine, compute)
+        return compute() if self.store is None else self.store.validation(name, structure, joint, is_final, compute)
 
     def refine_trial(self, trial: Trial) -> Trial:
         """Return a trial refitted with a time step that is refined until the parameters converge."""
@@ -202,13 +206,13 @@ class CandidateEvaluator:
 
         return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
 
-    def best_subsets(self, inside: NestedStructures) -> list[ScreenedSubset]:
+    def best_subsets(self, nested: NestedStructures) -> list[ScreenedSubset]:
         """Return every subset of input terms, best prediction first; see :func:`screen_subsets`."""
 
         def compute() -> list[ScreenedSubset]:
-            return screen_subsets(inside, self.folds, self)
+            return screen_subsets(nested, self.folds, self)
 
-        return compute() if self.store is None else self.store.subsets(inside.structure, compute)
+        return compute() if self.store is None else self.store.subsets(nested.structure, compute)
 
 
 @dataclass(frozen=True)
@@ -221,26 +225,26 @@ class FittedVariant:
 
 
 def initial_guesses(
-    structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
+    structure: Structure, values: Mapping[str, float], integer_orders: Mapping[str, float]
 ) -> list[dict[str, float]]:
     """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
     Orders that are free in this structure but were fixed to integers in the nested one start near these integers, which
-    `whole` contains by name. A coefficient that is not in `values` starts at zero. A friction parameter that is not in
-    `values` is omitted.
+    `integer_orders` contains by name. A coefficient that is not in `values` starts at zero. A friction parameter that
+    is not in `values` is omitted.
     """
     problem = FreeProblem.of(structure)
-    usual: dict[str, list[float]] = {}
+    defaults: dict[str, list[float]] = {}
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
-        at = whole.get(name, 0.5 * (low + high))
-        usual[name] = [min(max(at + shift, low), high) for shift in INITIAL_ORDER_SHIFTS]
+        at = integer_orders.get(name, 0.5 * (low + high))
+        defaults[name] = [min(max(at + shift, low), high) for shift in INITIAL_ORDER_SHIFTS]
     friction_names = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
-    usual |= {n: [0.0] for n in problem.coefficients if n in values or n not in friction_names}
-    usual |= {
+    defaults |= {n: [0.0] for n in problem.coefficients if n in values or n not in friction_names}
+    defaults |= {
         i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in INITIAL_INPUT_FRACTIONS] for i in problem.inputs
     }
-    places = {n: [values[n]] if n in values else places for n, places in usual.items()}
-    return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]
+    values_by_name = {n: [values[n]] if n in values else values_by_name for n, values_by_name in defaults.items()}
+    return [dict(zip(values_by_name, point, strict=True)) for point in itertools.product(*values_by_name.values())]
 
 
 @dataclass
@@ -249,7 +253,7 @@ class StepwiseSelection:
 
     Parameters
     ----------
-    inside
+    nested
         The nested structures.
     work
         Evaluator of the candidates.
@@ -257,7 +261,7 @@ class StepwiseSelection:
         Signatures of the structures that are not fitted again.
     """
 
-    inside: NestedStructures
+    nested: NestedStructures
     work: CandidateEvaluator
     keys: set[str] = field(default_factory=set)
 
@@ -270,28 +274,28 @@ class StepwiseSelection:
         there are enough input terms for best-subset screening, selection starts from the best subset. If no term is
         optional, the structure with all orders free is a second initial structure.
         """
-        subsets = self.work.best_subsets(self.inside)
+        subsets = self.work.best_subsets(self.nested)
         ends_from_subsets = self._select_from_subsets(subsets)
         if ends_from_subsets:
             # Screened subsets are not fitted again as neighbors of other variants.
             self.keys = {self._key(s.change) for s in subsets}
             return self._eliminate_from_ends(ends_from_subsets)
-        if not self.inside.droppable:
+        if not self.nested.droppable:
             return self._select_from_full()
-        pairs = self._fit_roughly(self._untried_changes(self.inside.simplest()))
+        pairs = self._fit_roughly(self._untried_changes(self.nested.simplest()))
         fits = [joint.values_by_name for _, joint in pairs if not isinstance(joint, FtlmError)]
         if not fits:
             return self._validate_failures(pairs)
         roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
         for change, joint in pairs:
-            roots.setdefault(self.inside.highest_orders(change.variant), []).append((change, joint))
-        ends = [self._select_forward(best) for root in roots.values() for best in self._by_criterion(root)[:1]]
-        first = min(ends, key=lambda end: _ranking_key(end[0]))
-        from_above = self._eliminate_from_full(first[1], fits)
-        return self._eliminate_from_ends([*ends, *([] if from_above is None else [from_above])])
+            roots.setdefault(self.nested.highest_orders(change.variant), []).append((change, joint))
+        results = [self._select_forward(best) for root in roots.values() for best in self._by_criterion(root)[:1]]
+        best_result = min(results, key=lambda pair: _ranking_key(pair[0]))
+        from_above = self._eliminate_from_full(best_result[1], fits)
+        return self._eliminate_from_ends([*results, *([] if from_above is None else [from_above])])
 
     def _build(self, change: Change) -> Structure:
-        return self.inside.build(change.variant)
+        return self.nested.build(change.variant)
 
     def _key(self, change: Change) -> str:
         return signature(self._build(change))
@@ -313,11 +317,11 @@ class StepwiseSelection:
         self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
         return self.work.trials
 
-    def _eliminate_from_ends(self, ends: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
-        """Run backward elimination from each result in `ends` that predicts as well as the best; return all trials."""
-        least = min(_ranking_key(trial) for trial, _ in ends)
-        for trial, at in ends:
-            if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
+    def _eliminate_from_ends(self, results: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
+        """Run backward elimination from each of the `results` that predicts as well as the best; return all trials."""
+        lowest_key = min(_ranking_key(trial) for trial, _ in results)
+        for trial, at in results:
+            if (trial.unstable, trial.score) <= (lowest_key[0], lowest_key[1] + SCORE_TOLERANCE):
                 self._eliminate_backward(trial, at)
         return self.work.trials
 
@@ -327,23 +331,23 @@ class StepwiseSelection:
         Forward selection is skipped if the validation residual with integer orders far exceeds that with all orders
         free.
         """
-        structure = self.inside.structure
-        full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
-        everything = Change(describe_structure(self.inside.build(full)), full)
-        pairs = self._fit_roughly(self._untried_changes([*self.inside.simplest(), everything]))
-        roots = self._by_criterion([p for p in pairs if p[0].variant == full])
-        roots += self._by_criterion([p for p in pairs if p[0].variant != full])[:1]
+        structure = self.nested.structure
+        full_variant = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
+        full_change = Change(describe_structure(self.nested.build(full_variant)), full_variant)
+        pairs = self._fit_roughly(self._untried_changes([*self.nested.simplest(), full_change]))
+        roots = self._by_criterion([p for p in pairs if p[0].variant == full_variant])
+        roots += self._by_criterion([p for p in pairs if p[0].variant != full_variant])[:1]
         if not roots:
             return self._validate_failures(pairs)
-        first = self.validate_variants(roots, limit=-math.inf, margin=MAX_ROOT_SCORE_GAP)
+        root_trials = self.validate_variants(roots, limit=-math.inf, margin=MAX_ROOT_SCORE_GAP)
         self.keys = {self._key(r.change) for r in roots}
-        least = min(trial.score for trial in first)
-        ends = [
+        lowest_score = min(trial.score for trial in root_trials)
+        results = [
             self._select_forward(at, trial)
-            for trial, at in reversed(list(zip(first, roots, strict=False)))
-            if trial.score <= least + MAX_ROOT_SCORE_GAP
+            for trial, at in reversed(list(zip(root_trials, roots, strict=False)))
+            if trial.score <= lowest_score + MAX_ROOT_SCORE_GAP
         ]
-        return self._eliminate_from_ends(ends)
+        return self._eliminate_from_ends(results)
 
     def _select_from_subsets(self, subsets: Sequence[ScreenedSubset]) -> list[tuple[Trial, FittedVariant]]:
         """Return the best fitted subset, then its extension by forward selection; [] if no subset can be fitted."""
@@ -351,39 +355,39 @@ class StepwiseSelection:
             return []
         best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
         by_size: dict[int, ScreenedSubset] = {}
-        for one in subsets:
-            by_size.setdefault(len(one.start), one)
+        for subset in subsets:
+            by_size.setdefault(len(subset.start), subset)
         best_subsets += [s for s in by_size.values() if s not in best_subsets]
         joints = self.work.map_candidates(
             lambda s: self.work.fit_candidate(self._build(s.change), [s.start], refine=False), best_subsets
         )
-        steps = self._by_criterion([(s.change, j) for s, j in zip(best_subsets, joints, strict=True)])
-        if not steps:
+        ranked = self._by_criterion([(s.change, j) for s, j in zip(best_subsets, joints, strict=True)])
+        if not ranked:
             return []
-        ends = list(zip(self.validate_variants(steps), steps, strict=True))
+        results = list(zip(self.validate_variants(ranked), ranked, strict=True))
         self.keys = {self._key(s.change) for s in subsets}
-        first = min(ends, key=lambda end: _ranking_key(end[0]))
-        return [first, self._select_forward(first[1], first[0])]
+        best_result = min(results, key=lambda pair: _ranking_key(pair[0]))
+        return [best_result, self._select_forward(best_result[1], best_result[0])]
 
     def _select_forward(self, candidate: FittedVariant, validated: Trial | None = None) -> tuple[Trial, FittedVariant]:
         """Add one term, free order or offset at a time while the prediction improves; return the best result."""
         best = validated or self.validate_variants([candidate])[0]
-        best_at, idle = candidate, 0
+        best_variant, unsuccessful_steps = candidate, 0
         self.keys.add(self._key(candidate.change))
-        while idle < MAX_IDLE_STEPS:
-            larger = self._untried_changes(self.inside.larger(candidate.change.variant))
+        while unsuccessful_steps < MAX_IDLE_STEPS:
+            larger = self._untried_changes(self.nested.larger(candidate.change.variant))
             changes = self._fit_changes(candidate, larger)[:VALIDATED_CHANGES]
             if not changes:
                 break
             trials = self.validate_variants(changes, limit=_max_relevant_score(best))
             self.keys |= {self._key(s.change) for s in changes}
-            place = min(range(len(trials)), key=lambda k: (_ranking_key(trials[k]), k))
-            candidate = changes[place]
-            if _is_better(trials[place], best):
-                best, best_at, idle = trials[place], candidate, 0
+            best_index = min(range(len(trials)), key=lambda k: (_ranking_key(trials[k]), k))
+            candidate = changes[best_index]
+            if _is_better(trials[best_index], best):
+                best, best_variant, unsuccessful_steps = trials[best_index], candidate, 0
             else:
-                idle += 1
-        return best, best_at
+                unsuccessful_steps += 1
+        return best, best_variant
 
     def _eliminate_from_full(
         self, low: FittedVariant, values: Sequence[Mapping[str, float]]
@@ -393,22 +397,25 @@ class StepwiseSelection:
         `values` are additional estimates, by name, of which each gives an initial guess. The result is None if the full
         structure has fewer than two terms more than `low`, or cannot be fitted.
         """
-        full = self.inside.richest(low.change.variant)
-        if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
+        full_variant = self.nested.richest(low.change.variant)
+        if len(full_variant.coefficients) - len(low.change.variant.coefficients) < 2:
             return None
-        structure = self.inside.build(full)
-        known_values = (low.joint.values_by_name, *values)
-        starts = [initial_guesses(structure, known, full.integer_order_values())[0] for known in known_values]
+        structure = self.nested.build(full_variant)
+        values_by_root = (low.joint.values_by_name, *values)
+        starts = [
+            initial_guesses(structure, root_values, full_variant.integer_order_values())[0]
+            for root_values in values_by_root
+        ]
         (joint,) = self.work.map_candidates(lambda s: self.work.fit_candidate(s, starts, refine=False), [structure])
         if isinstance(joint, FtlmError):
             return None
-        at = FittedVariant(Change(describe_structure(structure), full), joint, 0.0)
+        at = FittedVariant(Change(describe_structure(structure), full_variant), joint, 0.0)
         (best,) = self.validate_variants([at])
         best_at = at
         while True:
             variant = at.change.variant
             smaller = [
-                c for c in self.inside.smaller(variant) if len(c.variant.coefficients) < len(variant.coefficients)
+                c for c in self.nested.smaller(variant) if len(c.variant.coefficients) < len(variant.coefficients)
             ]
             fits = self._fit_changes(at, smaller)
             if not fits:
@@ -431,16 +438,18 @@ class StepwiseSelection:
         `margin`.
         """
 
-        def one(candidate: FittedVariant) -> Trial:
+        def validate(candidate: FittedVariant) -> Trial:
             structure = self._build(candidate.change)
             return self.work.validate(describe_structure(structure), structure, candidate.joint)
 
-        least = [validation_score_bound(f.joint, self.work.folds) for f in candidates]
-        first = next((k for k, level in enumerate(least) if k > 0 and level > limit), len(candidates))
-        trials = self.work.map_candidates(one, candidates[:first])
+        bounds = [validation_score_bound(f.joint, self.work.folds) for f in candidates]
+        first_skipped = next((k for k, bound in enumerate(bounds) if k > 0 and bound > limit), len(candidates))
+        trials = self.work.map_candidates(validate, candidates[:first_skipped])
         best = min(trials, key=_ranking_key, default=None)
-        if best is not None and (best.unstable or any(level <= best.score + margin for level in least[first:])):
-            trials += self.work.map_candidates(one, candidates[first:])
+        if best is not None and (
+            best.unstable or any(bound <= best.score + margin for bound in bounds[first_skipped:])
+        ):
+            trials += self.work.map_candidates(validate, candidates[first_skipped:])
         self.work.trials += trials
         return trials
 
@@ -453,8 +462,8 @@ class StepwiseSelection:
         starts: list[Start] = []
         for change in changes:
             structure = self._build(change)
-            whole = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
-            starts.append((structure, initial_guesses(structure, values, whole)))
+            integer_orders = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
+            starts.append((structure, initial_guesses(structure, values, integer_orders)))
         selection = prescreen(self.work.folds.runs, starts, VALIDATED_CHANGES, self.work)
         joints = self.work.map_candidates(lambda k: self.work.fit_candidate(*starts[k], refine=False), selection)
         return self._by_criterion([(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
@@ -468,20 +477,20 @@ class StepwiseSelection:
         if not fits:
             return []
         inflation = min(residual_variance_inflation(j) for _, j in fits)
-        every = [FittedVariant(c, j, fit_criterion(j, inflation)) for c, j in fits]
-        return sorted(every, key=lambda f: f.bic)
+        fitted = [FittedVariant(c, j, fit_criterion(j, inflation)) for c, j in fits]
+        return sorted(fitted, key=lambda f: f.bic)
 
     def _eliminate_backward(self, best: Trial, at: FittedVariant) -> None:
         """Eliminate one term, free order or offset at a time while the prediction does not get worse."""
         while True:
-            smaller = self._untried_changes(self.inside.smaller(at.change.variant))
+            smaller = self._untried_changes(self.nested.smaller(at.change.variant))
             changes = [c for c in smaller if _is_adjacent_integer(c, at)]
-            steps = self._fit_changes(at, changes)
+            smaller_variants = self._fit_changes(at, changes)
             self.keys |= {self._key(c) for c in changes}
-            trials = self.validate_variants(steps[:VALIDATED_CHANGES], limit=_max_relevant_score(best))
+            trials = self.validate_variants(smaller_variants[:VALIDATED_CHANGES], limit=_max_relevant_score(best))
             better = [
                 (t, s)
-                for t, s in zip(trials, steps, strict=False)
+                for t, s in zip(trials, smaller_variants, strict=False)
                 if _ranking_key(t) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT)
             ]
             if not better:
@@ -499,9 +508,9 @@ def _max_relevant_score(best: Trial) -> float:
     return math.inf if best.unstable else best.score + MAX_SCORE_TOLERANCE
 
 
-def _is_better(trial: Trial, than: Trial) -> bool:
+def _is_better(trial: Trial, reference: Trial) -> bool:
     """Whether a trial predicts significantly better than another."""
-    return _ranking_key(trial) < (than.unstable, than.score - MIN_SCORE_IMPROVEMENT)
+    return _ranking_key(trial) < (reference.unstable, reference.score - MIN_SCORE_IMPROVEMENT)
 
 
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
@@ -513,24 +522,26 @@ def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
 def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator) -> list[Trial]:
     """Return the trials of listed candidates, each fitted from automatic initial guesses."""
 
-    def one(item: tuple[str, Structure]) -> Trial:
+    def evaluate(item: tuple[str, Structure]) -> Trial:
         name, structure = item
-        return work.validate(name, structure, work.fit_candidate(structure, []), fine=True)
+        return work.validate(name, structure, work.fit_candidate(structure, []), is_final=True)
 
     items = list(candidates.items())
     # Stored results take no time, so they do not allow an estimate.
     if len(items) > TIME_ESTIMATE_CANDIDATES and not (work.store is not None and len(work.store)):
         start_time = work.clock()
-        work.trials += work.map_candidates(one, items[: work.threads])
-        took = work.clock() - start_time
-        rest = len(items) - work.threads
+        work.trials += work.map_candidates(evaluate, items[: work.threads])
+        elapsed = work.clock() - start_time
+        remaining_count = len(items) - work.threads
         warn_caller(
-            f"{len(items)} candidates: the first {work.threads} took {format_duration(took)}, so the other {rest} "
-            f"take about {format_duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C stops the "
+            f"{len(items)} candidates: the first {work.threads} took {format_duration(elapsed)}, so the other "
+            f"{remaining_count} "
+            f"take about {format_duration(elapsed * remaining_count / work.threads)} on {work.threads} threads; "
+            "Ctrl-C stops the "
             "selection, and one structure with a stepwise search of its terms needs far fewer fits"
         )
         items = items[work.threads :]
-    work.trials += work.map_candidates(one, items)
+    work.trials += work.map_candidates(evaluate, items)
     return work.trials
 
 

@@ -60,8 +60,8 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     DataError
         If there are fewer than two finite values.
     """
-    every = as_floats("values", values, gaps=True).ravel()
-    finite = every[np.isfinite(every)]
+    finite_values = as_floats("values", values, gaps=True).ravel()
+    finite = finite_values[np.isfinite(finite_values)]
     if finite.size < 2:
         raise DataError(f"a histogram needs two finite values at least, not {finite.size}; give a longer run")
     # Twice the number of bars of Sturges' rule. The range is symmetric about the mean and includes all outliers.
@@ -75,7 +75,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     width = edges[1] - edges[0]
     at = np.linspace(edges[0], edges[-1], 121)
     curve = finite.size * width * _normal(at, mean, deviation) if deviation > 0 else np.zeros(at.size)
-    nonfinite_count = every.size - finite.size
+    nonfinite_count = finite_values.size - finite.size
     text = f"{caption} {nonfinite_count} values are not finite and left out.".strip() if nonfinite_count else caption
     described = (
         f"Histogram of {finite.size} values: mean {number(mean, 3)}, standard deviation {number(deviation, 3)}, from "
@@ -158,8 +158,8 @@ class BarChart(Figure):
     def axis_limits(self) -> tuple[float, float]:
         """Lower and upper limit of the value axis."""
         finite = np.concatenate([v[np.isfinite(v)] for _, v in self.tables])
-        end = self.high if self.high is not None else float(np.max(finite, initial=self.low))
-        return self.low, end if end > self.low else self.low + 1.0
+        upper = self.high if self.high is not None else float(np.max(finite, initial=self.low))
+        return self.low, upper if upper > self.low else self.low + 1.0
 
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
@@ -168,8 +168,8 @@ class BarChart(Figure):
             f"{thing}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
             for k, thing in enumerate(names)
         )
-        shown = [truncate_text(n, 16 if narrow else MAX_BAR_NAME_CHARACTERS) for n in names]
-        left, value = 10 + max(map(text_width, shown)), 52.0
+        shortened_names = [truncate_text(n, 16 if narrow else MAX_BAR_NAME_CHARACTERS) for n in names]
+        left, value = 10 + max(map(text_width, shortened_names)), 52.0
         top = 8.0 + 18.0 * (len(tables) > 1)
         w, step = width - left - value, BAR_HEIGHT_PX * len(tables) + 8
         low, high = self.axis_limits
@@ -177,19 +177,19 @@ class BarChart(Figure):
         plot = PlotArea(left, top, w, step * len(names), (low, high, 0.0, 1.0))
         grid, axis = plot.grid(x_ticks, None)
         bars, texts = [], []
-        for i, name in enumerate(shown):
+        for i, name in enumerate(shortened_names):
             texts.append(svg_text(left - 6, top + step * i + BAR_HEIGHT_PX * len(tables) / 2 + 6, name, "end"))
             for k, (_, values) in enumerate(tables):
                 v, y = float(values[i]), top + step * i + BAR_HEIGHT_PX * k + 2
-                inside = min(max(v, low), high) if math.isfinite(v) else low
-                length = w * (inside - low) / (high - low)
+                clipped = min(max(v, low), high) if math.isfinite(v) else low
+                length = w * (clipped - low) / (high - low)
                 bars.append(_shade(k + 1, left, y, max(length, 0.0), BAR_HEIGHT_PX - 3, fill_opacity="0.85"))
                 text = number(v, 4) if math.isfinite(v) else "–"
                 texts.append(svg_text(left + length + 5, y + BAR_HEIGHT_PX - 5, text, "start"))
-        place = left
+        x_value = left
         for k, (name, _) in enumerate(tables if len(tables) > 1 else ()):
-            texts += [_shade(k + 1, place, 3, 14, 10), svg_text(place + 19, 12, name, "start")]
-            place += 19 + text_width(name) + 16
+            texts += [_shade(k + 1, x_value, 3, 14, 10), svg_text(x_value + 19, 12, name, "start")]
+            x_value += 19 + text_width(name) + 16
         bottom = top + plot.height
         pairs = zip(x_ticks.values, x_ticks.labels, strict=True)
         texts += [svg_text(float(plot.x_pixels(v)), bottom + 15, label, "middle") for v, label in pairs]
@@ -200,8 +200,8 @@ class BarChart(Figure):
 
 def _shade(style: int, x: float, y: float, width: float, height: float, **attributes: str) -> Markup:
     """Return a filled rectangle with upper left corner (x, y) [px] as SVG markup, in the color of a line style."""
-    place = {"x": x, "y": y, "width": width, "height": height}
-    return element("rect", class_=f"shade{style}", **place, fill=LINE_STYLES[style][0], **attributes)
+    geometry = {"x": x, "y": y, "width": width, "height": height}
+    return element("rect", class_=f"shade{style}", **geometry, fill=LINE_STYLES[style][0], **attributes)
 
 
 #: Maximum height of the complex plane, half the width of a cross, and radius of a dot [px].
@@ -246,12 +246,12 @@ class PlaneChart(Figure):
     caption: str = ""
 
     def __post_init__(self) -> None:
-        bad = ~np.isfinite(self.values)
-        if np.any(bad):
-            raise DataError(f"point {int(np.argmax(bad))} of {bad.size} is not finite; leave it out")
+        is_invalid = ~np.isfinite(self.values)
+        if np.any(is_invalid):
+            raise DataError(f"point {int(np.argmax(is_invalid))} of {is_invalid.size} is not finite; leave it out")
         if not 0 < self.sector < math.pi:
             raise DataError(f"sector = {self.sector!r} is not an angle; give one between 0 and pi")
-        if self.curve is not None and not bad.size:
+        if self.curve is not None and not is_invalid.size:
             raise DataError("there is no measured value to draw; give at least one")
 
     @cached_property
@@ -269,8 +269,8 @@ class PlaneChart(Figure):
     def plot_corners(self) -> tuple[complex, complex]:
         """Lower left and upper right corner of the plotted region, which may cut off parts of the curve."""
         if self.line is None:
-            far = float(np.max(np.abs(self.values), initial=0.0)) or 1.0
-            return complex(-far, -far) * PLANE_MARGIN_FACTOR, complex(far, far) * PLANE_MARGIN_FACTOR
+            largest = float(np.max(np.abs(self.values), initial=0.0)) or 1.0
+            return complex(-largest, -largest) * PLANE_MARGIN_FACTOR, complex(largest, largest) * PLANE_MARGIN_FACTOR
         real, imag = self.values.real, self.values.imag
         low, high = complex(real.min(), imag.min()), complex(real.max(), imag.max())
         pad = LOCUS_MARGIN_SHARE * (max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0)
@@ -289,10 +289,10 @@ class PlaneChart(Figure):
         low, high = self.plot_corners
         y_ticks = ticks(low.imag, high.imag, 5)
         left, top = max(30.0, 10 + max(map(text_width, y_ticks.labels))), 26.0 if self.line is None else 48.0
-        w, spread = width - left - 14.0, high - low
+        w, extent = width - left - 14.0, high - low
         # Equal scale [px per unit] on both axes.
-        scale = min(w / spread.real, PLANE_HEIGHT_PX / spread.imag)
-        h = max(scale * spread.imag, 90.0)
+        scale = min(w / extent.real, PLANE_HEIGHT_PX / extent.imag)
+        h = max(scale * extent.imag, 90.0)
         corner = (low + high) / 2 - complex(w, h) / scale / 2
         frame = corner.real, corner.real + w / scale, corner.imag, corner.imag + h / scale
         x_ticks, y_ticks = ticks(*frame[:2], 4 if narrow else 8), ticks(*frame[2:], max(2, round(h / 48)))
@@ -306,8 +306,8 @@ class PlaneChart(Figure):
         if self.line is not None:
             texts += [stroke_path(1, [(left, 12.0), (left + 20, 12.0)]), svg_text(left + 26, 16, "model", "start")]
             texts += [_dot(left + 90, 12.0), svg_text(left + 100, 16, "measured", "start")]
-        inside = element("svg", [through, *curves], **box, viewBox=view)
-        parts = [*plot.grid(x_ticks, y_ticks), inside, text_group(texts)]
+        clipped_group = element("svg", [through, *curves], **box, viewBox=view)
+        parts = [*plot.grid(x_ticks, y_ticks), clipped_group, text_group(texts)]
         return svg(width, round(top + h + 44), self.title, self._describe(), parts, narrow=narrow)
 
     def _describe(self) -> str:
@@ -315,9 +315,9 @@ class PlaneChart(Figure):
         if self.line is not None:
             range_text = f"from {_complex_text(values[0])} to {_complex_text(values[-1])}"
             return f"Locus in the complex plane. {values.size} measured points {range_text}, and the model's curve."
-        inside = int(np.sum(np.abs(np.angle(values)) < self.sector))
-        listed = ", ".join(map(_complex_text, values.tolist()))
-        return f"{values.size} points in the plane: {listed or 'none'}. {inside} in the shaded sector."
+        unstable_count = int(np.sum(np.abs(np.angle(values)) < self.sector))
+        poles_text = ", ".join(map(_complex_text, values.tolist()))
+        return f"{values.size} points in the plane: {poles_text or 'none'}. {unstable_count} in the shaded sector."
 
     def _crosses(self, plot: PlotArea) -> list[Markup]:
         outline = self.sector_outline((plot.frame[1] + plot.frame[3]) / 2)
@@ -423,8 +423,8 @@ class Landscape(Figure):
         ]
         if self.score != "score":
             parts.append(f"Score: {self.score}.")
-        if left_out := int(np.sum(~np.isfinite(self.scores))):
-            parts.append(f"Grey: {left_out} pairs that are not candidates or whose simulation diverges.")
+        if omitted_count := int(np.sum(~np.isfinite(self.scores))):
+            parts.append(f"Grey: {omitted_count} pairs that are not candidates or whose simulation diverges.")
         return " ".join(parts)
 
     def draw(self, *, narrow: bool) -> Markup:
@@ -432,61 +432,61 @@ class Landscape(Figure):
         score_range = float(np.nanmin(self.valid_scores)), float(np.nanmax(self.valid_scores))
         best_score, worst_score = map(number, score_range)
         described = f"Heat map of {self.score}. Best {best_score} at {self._best_orders()}; worst {worst_score}."
-        best = self.best
+        best_indices = self.best
         width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
         rows, columns = self.scores.shape
-        x_marks, y_marks = ([f"{v:g}" for v in axis] for axis in (self.x, self.y))
-        longest = max(map(len, x_marks))
-        left, top, below = max(46.0, LETTER_WIDTH_PX * max(map(len, y_marks)) + 12), 26.0, 84.0
+        x_labels, y_labels = ([f"{v:g}" for v in axis] for axis in (self.x, self.y))
+        longest = max(map(len, x_labels))
+        left, top, bottom_margin = max(46.0, LETTER_WIDTH_PX * max(map(len, y_labels)) + 12), 26.0, 84.0
         w, h = width - left - max(14.0, LETTER_WIDTH_PX * longest / 2), min(max(rows * 6.0, 140.0), 300.0)
         cell_w, cell_h, bottom = w / columns, h / rows, top + h
         out = []
         for i, row in enumerate(_color_indices(self.scores, *score_range).tolist()):
             j = 0
             # Adjacent cells of a row with equal color are drawn as one rectangle.
-            for step, alike in groupby(row):
-                count, colour = len(list(alike)), HEAT_COLORS[step] if step >= 0 else NO_VALUE
-                place = left + j * cell_w, bottom - (i + 1) * cell_h
-                out.append(_rectangle(*place, count * cell_w, f"{cell_h + 0.3:.1f}", colour))
+            for step, equal_cells in groupby(row):
+                count, color = len(list(equal_cells)), HEAT_COLORS[step] if step >= 0 else NO_VALUE
+                corner = left + j * cell_w, bottom - (i + 1) * cell_h
+                out.append(_rectangle(*corner, count * cell_w, f"{cell_h + 0.3:.1f}", color))
                 j += count
-        centre = left + (best[1] + 0.5) * cell_w, bottom - (best[0] + 0.5) * cell_h
-        for colour, thickness in (("#fff", 4), ("#d1480a", 2)):
-            x, y = centre
-            out.append(element("circle", cx=x, cy=y, r=7, fill="none", stroke=colour, stroke_width=thickness))
+        marker_center = left + (best_indices[1] + 0.5) * cell_w, bottom - (best_indices[0] + 0.5) * cell_h
+        for color, thickness in (("#fff", 4), ("#d1480a", 2)):
+            x, y = marker_center
+            out.append(element("circle", cx=x, cy=y, r=7, fill="none", stroke=color, stroke_width=thickness))
         fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER_WIDTH_PX * longest + 14))))
         x_name, y_name = self.names
         size = 20.0 if narrow else 26.0
         column_labels, row_labels = _label_indices(columns, fit), _label_indices(rows, min(rows, 7))
         texts = [
-            *(svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in column_labels),
-            *(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end") for k in row_labels),
+            *(svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_labels[k], "middle") for k in column_labels),
+            *(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_labels[k], "end") for k in row_labels),
             svg_text(4, top - 12, f"order {symbol(y_name)}", "start"),
             svg_text(left + w, bottom + 34, f"order {symbol(x_name)}", "end"),
             svg_text(left, bottom + 76, f"score {number(score_range[0], 3)}", "start"),
             svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(score_range[1], 3), "end"),
         ]
         out.append(text_group(texts))
-        out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT_COLORS)]
-        return svg(width, round(bottom + below), self.title, described, out, narrow=narrow)
+        out += [_rectangle(left + k * size, bottom + 48, size, "12", color) for k, color in enumerate(HEAT_COLORS)]
+        return svg(width, round(bottom + bottom_margin), self.title, described, out, narrow=narrow)
 
 
 def _color_indices(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
     """Return the index into HEAT_COLORS of each score, on a logarithmic scale; -1 for pairs without a score."""
-    first, span = math.log(low), math.log(high) - math.log(low)
+    log_low, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):
-        place = (np.log(scores) - first) / (span if span > 0 else 1.0)
-    steps = np.clip(np.nan_to_num(place * len(HEAT_COLORS)), 0, len(HEAT_COLORS) - 1)
-    return np.where(np.isfinite(place), steps, -1).astype(np.intp)
+        position = (np.log(scores) - log_low) / (span if span > 0 else 1.0)
+    indices = np.clip(np.nan_to_num(position * len(HEAT_COLORS)), 0, len(HEAT_COLORS) - 1)
+    return np.where(np.isfinite(position), indices, -1).astype(np.intp)
 
 
-def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Markup:
+def _rectangle(x: float, y: float, width: float, height: str, color: str) -> Markup:
     """Return a heat-map cell as SVG markup, slightly enlarged to hide gaps."""
-    return element("rect", x=x, y=y, width=width + 0.3, height=height, fill=colour)
+    return element("rect", x=x, y=y, width=width + 0.3, height=height, fill=color)
 
 
-def _label_indices(count: int, most: int) -> list[int]:
-    """Return at most `most` equally spaced indices from 0 to count - 1. Cells with these indices get a label."""
-    return list(range(0, count, max(1, math.ceil((count - 1) / max(most - 1, 1)))))
+def _label_indices(count: int, maximum: int) -> list[int]:
+    """Return at most `maximum` equally spaced indices from 0 to count - 1. Cells with these indices get a label."""
+    return list(range(0, count, max(1, math.ceil((count - 1) / max(maximum - 1, 1)))))
 
 
 #: Colors from correlation -1 to 1: blue, light gray, vermilion. Black text is readable on the colors in the middle.
@@ -567,32 +567,32 @@ class CorrelationMap(Figure):
         for i in range(count):
             for j in range(count):
                 value = float(matrix[i, j])
-                known = np.isfinite(value)
+                is_known = np.isfinite(value)
                 step = (
                     int(np.clip(round((value + 1) / 2 * (len(CORRELATION_COLORS) - 1)), 0, len(CORRELATION_COLORS) - 1))
-                    if known
+                    if is_known
                     else -1
                 )
                 x, y = left + j * cell, top + i * cell
-                colour = CORRELATION_COLORS[step] if known else NO_VALUE
-                out.append(element("rect", x=x, y=y, width=cell - 1, height=cell - 1, fill=colour))
+                color = CORRELATION_COLORS[step] if is_known else NO_VALUE
+                out.append(element("rect", x=x, y=y, width=cell - 1, height=cell - 1, fill=color))
                 if cell >= MIN_LABELED_CELL_PX and i != j:
-                    ink = "#fff" if step in DARK_COLOR_INDICES or not known else "#15181c"
-                    text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if known else "–"
+                    ink = "#fff" if step in DARK_COLOR_INDICES or not is_known else "#15181c"
+                    text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if is_known else "–"
                     center = x + cell / 2 - 0.5, y + cell / 2 + 4
                     texts.append(svg_text(*center, text, "middle", fill=ink, font_size="11"))
-        marks = []
+        labels_drawn = []
         for k, label in enumerate(labels):
-            marks.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
+            labels_drawn.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
             x = left + (k + 0.5) * cell
-            turn = f"translate({x + 4:.1f} {top - 6:.1f}) rotate(-90)"
-            upright = element("text", [label], x=0, y=0, transform=turn)
-            marks.append(upright if rotated else svg_text(x, top - 6, label, "middle"))
+            rotation = f"translate({x + 4:.1f} {top - 6:.1f}) rotate(-90)"
+            upright = element("text", [label], x=0, y=0, transform=rotation)
+            labels_drawn.append(upright if rotated else svg_text(x, top - 6, label, "middle"))
         foot = top + count * cell + 12
         size = 18.0 if narrow else 22.0
-        for k, colour in enumerate(CORRELATION_COLORS):
-            marks.append(element("rect", x=left + k * size, y=foot, width=size, height=10.0, fill=colour))
-        for share, text, anchor in ((0.0, "−1", "start"), (0.5, "0", "middle"), (1.0, "1", "end")):
-            marks.append(svg_text(left + share * size * len(CORRELATION_COLORS), foot + 24, text, anchor))
-        parts = [*out, text_group([*marks, *texts])]
+        for k, color in enumerate(CORRELATION_COLORS):
+            labels_drawn.append(element("rect", x=left + k * size, y=foot, width=size, height=10.0, fill=color))
+        for fraction, text, anchor in ((0.0, "−1", "start"), (0.5, "0", "middle"), (1.0, "1", "end")):
+            labels_drawn.append(svg_text(left + fraction * size * len(CORRELATION_COLORS), foot + 24, text, anchor))
+        parts = [*out, text_group([*labels_drawn, *texts])]
         return svg(width, round(foot + 32), self.title, self._describe(), parts, narrow=narrow)

@@ -57,8 +57,8 @@ class Figure(ABC):
         return self.caption
 
     def _repr_html_(self) -> str:
-        words = typeset(self.title), typeset(self.note)
-        return str(Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, *words))
+        texts = typeset(self.title), typeset(self.note)
+        return str(Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, *texts))
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,10 @@ def svg(
     width: int, height: int, title: str, described: str, parts: Iterable[Markup], *, narrow: bool, **attributes: str
 ) -> Markup:
     """Return an SVG drawing of the given size [px] and parts; `described` is the description for screen readers."""
-    every = [element("title", [title]), element("desc", [described]), *parts]
+    all_parts = [element("title", [title]), element("desc", [described]), *parts]
     look: dict[str, str] = {"class_": f"chart {'narrow' if narrow else 'wide'}", "role": "img"}
     view = f"0 0 {width} {height}"
-    return element("svg", every, **look, viewBox=view, width=width, height=height, **attributes)
+    return element("svg", all_parts, **look, viewBox=view, width=width, height=height, **attributes)
 
 
 def svg_text(x: float, y: float, text: str, anchor: str, **attributes: str) -> Markup:
@@ -188,8 +188,8 @@ class PlotArea:
         """
         down = np.clip(self.y_pixels(y) - self.top, -self.height, 2 * self.height)
         xs, ys = (
-            np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
-            for places in (self.x_pixels(x) - self.left, down)
+            np.rint(coordinates * TENTHS_PER_PIXEL).astype(np.int64).tolist()
+            for coordinates in (self.x_pixels(x) - self.left, down)
         )
         return xs, ys
 
@@ -213,45 +213,45 @@ class PlotArea:
         across, upward = axes
         bottom = self.top + self.height
         pairs = zip(upward.values, upward.labels, strict=True)
-        marks = [svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end") for v, label in pairs]
+        tick_labels = [svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end") for v, label in pairs]
         pairs = zip(across.values, across.labels, strict=True)
         for v, label in pairs:
             x = float(self.x_pixels(v))
             # A centered label at the right end would exceed the drawing, so it is right-aligned there.
             fits = x + text_width(label) / 2 <= width - 4
-            marks.append(svg_text(x if fits else width, bottom + 16, label, "middle" if fits else "end"))
+            tick_labels.append(svg_text(x if fits else width, bottom + 16, label, "middle" if fits else "end"))
         x_text, y_text = (
             truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
             for label, axis in zip(names, axes, strict=True)
         )
         return [
-            element("g", marks, class_="ticks"),
+            element("g", tick_labels, class_="ticks"),
             svg_text(4, self.top - 12, y_text, "start"),
             svg_text(self.left + self.width, bottom + 34, x_text, "end"),
         ]
 
 
-def ticks(low: float, high: float, most: int = 6) -> Ticks:
+def ticks(low: float, high: float, maximum: int = 6) -> Ticks:
     """Return the ticks of an axis, at multiples of 1, 2 or 5 times a power of ten within an interval.
 
     Parameters
     ----------
     low, high
         Ends of the interval, low < high.
-    most
+    maximum
         Approximate number of ticks; at least two are returned.
     """
-    raw = (high - low) / max(most, 1)
-    exponent = math.floor(math.log10(raw))
-    size = next((s for s in (1, 2, 5) if s * 10.0**exponent >= raw * (1 - 1e-9)), 10)
-    if size == 10:
-        size, exponent = 1, exponent + 1
-    step = size * 10.0**exponent
+    raw_step = (high - low) / max(maximum, 1)
+    exponent = math.floor(math.log10(raw_step))
+    mantissa = next((s for s in (1, 2, 5) if s * 10.0**exponent >= raw_step * (1 - 1e-9)), 10)
+    if mantissa == 10:
+        mantissa, exponent = 1, exponent + 1
+    step = mantissa * 10.0**exponent
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    if last - first < 1 and most < 20:
-        return ticks(low, high, most + 1)
+    if last - first < 1 and maximum < 20:
+        return ticks(low, high, maximum + 1)
     # Integer multiples of a power of ten avoid rounding, such as 0.30000000000000004 for 0.3.
-    multiples = [k * size for k in range(first, last + 1)]
+    multiples = [k * mantissa for k in range(first, last + 1)]
     values = [float(m * 10**exponent) if exponent >= 0 else m / 10**-exponent for m in multiples]
     largest = max(abs(v) for v in values)
     shift = 0 if 1e-3 <= largest < 1e5 else 3 * math.floor(math.log10(largest) / 3)
@@ -260,29 +260,29 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
     return Ticks(values, labels, f"×10{str(shift).translate(SUPERSCRIPT_DIGITS)}" if shift else "", shift)
 
 
-def log_ticks(low: float, high: float, most: int) -> Ticks:
+def log_ticks(low: float, high: float, maximum: int) -> Ticks:
     """Return the ticks of a logarithmic axis from 10**low to 10**high, with decimal logarithms as tick values.
 
     The ticks are powers of ten, a 1-2-5 series if there would be fewer than three powers, or linear ticks for a short
-    interval. The number of powers is at most about `most`.
+    interval. The number of powers is at most about `maximum`.
     """
-    every = max(1, math.ceil((high - low) / most))
-    first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
-    powers = [k * every for k in range(first, last + 1)]
+    stride = max(1, math.ceil((high - low) / maximum))
+    first, last = math.ceil(low / stride - 1e-9), math.floor(high / stride + 1e-9)
+    powers = [k * stride for k in range(first, last + 1)]
     if len(powers) >= 3:
         labels = [f"{10.0**p:g}" if -3 <= p <= 4 else f"10{str(p).translate(SUPERSCRIPT_DIGITS)}" for p in powers]
         return Ticks([float(p) for p in powers], labels)
-    fine = [(s, p) for p in range(math.floor(low), math.ceil(high) + 1) for s in (1, 2, 5)]
-    inside = [(s, p) for s, p in fine if low <= math.log10(s) + p <= high]
-    if len(inside) >= 2:
-        labels = [f"{s * 10.0**p:g}".replace("-", "−") for s, p in inside]
-        return Ticks([math.log10(s) + p for s, p in inside], labels)
-    scale_ticks = ticks(10.0**low, 10.0**high, most)
+    all_ticks = [(s, p) for p in range(math.floor(low), math.ceil(high) + 1) for s in (1, 2, 5)]
+    visible_ticks = [(s, p) for s, p in all_ticks if low <= math.log10(s) + p <= high]
+    if len(visible_ticks) >= 2:
+        labels = [f"{s * 10.0**p:g}".replace("-", "−") for s, p in visible_ticks]
+        return Ticks([math.log10(s) + p for s, p in visible_ticks], labels)
+    scale_ticks = ticks(10.0**low, 10.0**high, maximum)
     pairs = [(math.log10(v), label) for v, label in zip(scale_ticks.values, scale_ticks.labels, strict=True) if v > 0]
     return Ticks([v for v, _ in pairs], [label for _, label in pairs], scale_ticks.factor)
 
 
-def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
+def decimate(y: ArrayLike, maximum: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     """Return indices of the points that are sufficient to draw a line.
 
     These are the ends of intervals of constant value or, if there are too many of these, the extreme values of blocks.
@@ -291,24 +291,24 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     ----------
     y
         Values of the line; nonfinite values are omitted.
-    most
+    maximum
         Maximum number of indices, at least 4.
 
     Returns
     -------
     ndarray of int
-        Ascending indices. All finite values are included if there are at most ``most``.
+        Ascending indices. All finite values are included if there are at most ``maximum``.
     """
     values = as_floats("y", y, gaps=True)
     finite = np.flatnonzero(np.isfinite(values))
-    if finite.size <= most:
+    if finite.size <= maximum:
         return finite
     # Points inside a constant interval are on the line between its ends. Staircases keep their shape without them.
     changes = values[1:] != values[:-1]
-    ends = np.flatnonzero(np.isfinite(values) & (np.append(True, changes) | np.append(changes, True)))
-    if ends.size <= most:
-        return ends
-    edges = np.linspace(0, finite.size, max(1, (most - 2) // 2) + 1).astype(np.intp)
+    segment_ends = np.flatnonzero(np.isfinite(values) & (np.append(True, changes) | np.append(changes, True)))
+    if segment_ends.size <= maximum:
+        return segment_ends
+    edges = np.linspace(0, finite.size, max(1, (maximum - 2) // 2) + 1).astype(np.intp)
     # Sorting by (block, value) places the extreme values of every block at its ends.
     stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
     order = np.lexsort((values[finite], stretch))
@@ -327,8 +327,8 @@ def limits(values: list[Floats], margin: float) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = float(np.min(finite)), float(np.max(finite))
     if high - low <= max(1e-12 * max(abs(low), abs(high)), MIN_DIFFERENCE):
-        spread = 0.1 * abs(low) if abs(low) > MIN_DIFFERENCE else 1.0
-        return low - spread, high + spread
+        half_range = 0.1 * abs(low) if abs(low) > MIN_DIFFERENCE else 1.0
+        return low - half_range, high + half_range
     return low - margin * (high - low), high + margin * (high - low)
 
 

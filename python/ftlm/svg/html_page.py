@@ -87,8 +87,8 @@ class Table:
 
         `rows` are the rows by heading, and `options` are further arguments of the class.
         """
-        starts = accumulate((len(each) for each in rows.values()), initial=0)
-        flat = [row for each in rows.values() for row in each]
+        starts = accumulate((len(group_rows) for group_rows in rows.values()), initial=0)
+        flat = [row for group_rows in rows.values() for row in group_rows]
         return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
 
     @property
@@ -142,8 +142,10 @@ class Table:
     def to_html(self) -> Markup:
         """Return the table as HTML, in a container that scrolls horizontally on narrow screens."""
         pairs = zip(self.is_numeric, self.starts_group, strict=True)
-        words = [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
-        classes = [Markup(' class="{}"').format(w) if w else "" for w in words]
+        class_names = [
+            " ".join(w for w, is_set in (("n", numeric), ("g", group)) if is_set) for numeric, group in pairs
+        ]
+        classes = [Markup(' class="{}"').format(w) if w else "" for w in class_names]
         kind = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
         kind += " stacked" if self.is_stacked else ""
         template = templates("ftlm.svg").get_template("table.html.j2")

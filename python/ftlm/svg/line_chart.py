@@ -48,7 +48,11 @@ READOUT_LEVELS = 1e5
 
 
 def slider_readout(
-    x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = SLIDER_POSITIONS
+    x: Floats,
+    lines: Sequence[tuple[str, int, Floats]],
+    x_label: str,
+    y_label: str,
+    position_count: int = SLIDER_POSITIONS,
 ) -> str:
     """Return the values of all lines at the slider positions of a chart, as JSON text for the page script.
 
@@ -60,7 +64,7 @@ def slider_readout(
         (name, index in LINE_STYLES, values of shape (N,)) of each line; NaN marks a missing value.
     x_label, y_label
         Axis labels; each may end with a unit in brackets.
-    places
+    position_count
         Approximate maximum number of positions.
 
     Returns
@@ -72,21 +76,21 @@ def slider_readout(
     rows_present = np.flatnonzero(np.isfinite(x))
     if not rows_present.size or not lines:
         return ""
-    rows = rows_present[:: max(1, math.ceil(rows_present.size / min(places, SLIDER_POSITIONS)))]
-    begin = None
+    rows = rows_present[:: max(1, math.ceil(rows_present.size / min(position_count, SLIDER_POSITIONS)))]
+    start = None
     if len(lines) > 1:
         differences = np.abs(lines[0][2][rows_present] - lines[1][2][rows_present])
         if np.isfinite(differences).any():
-            begin = rows_present[int(np.nanargmax(differences))]
-    rows = np.unique(np.append(rows, [rows_present[-1], *([] if begin is None else [begin])]))
+            start = rows_present[int(np.nanargmax(differences))]
+    rows = np.unique(np.append(rows, [rows_present[-1], *([] if start is None else [start])]))
     name, unit = _split_unit(x_label)
     data = {
         "name": name,
         "unit": unit,
         "y": _split_unit(y_label)[1],
         "at": _scaled_integers(x[rows]),
-        "begin": 0 if begin is None else int(np.searchsorted(rows, begin)),
-        "apart": begin is not None,
+        "begin": 0 if start is None else int(np.searchsorted(rows, start)),
+        "apart": start is not None,
         "lines": [{"name": n, "style": s, "at": _scaled_integers(y[rows])} for n, s, y in lines],
     }
     return json.dumps(data, separators=(",", ":"), allow_nan=False)
@@ -106,8 +110,8 @@ def _scaled_integers(values: Floats) -> list[object]:
     low, high = float(finite.min()), float(finite.max())
     largest = max(abs(low), abs(high))
     # The integers have at most about twelve digits, which a browser represents exactly.
-    fine = max((high / READOUT_LEVELS - low / READOUT_LEVELS), largest * 1e-12, 1e-290)
-    power = math.floor(math.log10(fine))
+    resolution = max((high / READOUT_LEVELS - low / READOUT_LEVELS), largest * 1e-12, 1e-290)
+    power = math.floor(math.log10(resolution))
     scaled = values / 10.0**power
     return [power, [None if math.isnan(v) else round(v) for v in scaled.tolist()]]
 
@@ -229,16 +233,20 @@ class LineChart(Figure):
             y = as_floats(f"line {name!r}", values, gaps=True).copy()
             if y.ndim != 1 or y.shape != x.shape:
                 raise DataError(f"line {name!r} has shape {y.shape}, x {x.shape}; give arrays of one length")
-            bad = ~(np.isfinite(y) & np.isfinite(x)) | (np.abs(y) > MAX_DRAWN_VALUE)
-            if np.any(bad) and name not in self.dots:
-                first = x_values[int(np.argmax(bad))]
-                where = f" (first at {self.x_label} = {first:.4g})" if np.isfinite(first) else ""
-                notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
-            y[bad] = np.nan
+            is_invalid = ~(np.isfinite(y) & np.isfinite(x)) | (np.abs(y) > MAX_DRAWN_VALUE)
+            if np.any(is_invalid) and name not in self.dots:
+                first_x = x_values[int(np.argmax(is_invalid))]
+                location = f" (first at {self.x_label} = {first_x:.4g})" if np.isfinite(first_x) else ""
+                notes.append(
+                    f"{name}: {np.sum(is_invalid)} of {y.size} values are not finite{location} and leave a gap."
+                )
+            y[is_invalid] = np.nan
             if self.log_y:
-                below = ~bad & (y <= 0)
-                if np.any(below):
-                    notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
+                is_nonpositive = ~is_invalid & (y <= 0)
+                if np.any(is_nonpositive):
+                    notes.append(
+                        f"{name}: {np.sum(is_nonpositive)} values of 0 or less have no place on a logarithmic axis."
+                    )
                 y = _logarithms(y)
             edges = None if band is None else (self._edge(name, band[0], x), self._edge(name, band[1], x))
             drawn.append(_Line(name, style, *self._corners(x, y), name in self.dots, edges))
@@ -280,19 +288,19 @@ class LineChart(Figure):
     def _y_limits(self) -> tuple[float, float, list[tuple[str, float]]]:
         """Limits (low, high) of the vertical axis, and (name, extreme value) of each line that exceeds them."""
         lines = self.content[0]
-        every = [line.y[np.isfinite(line.y)] for line in lines]
+        finite_values = [line.y[np.isfinite(line.y)] for line in lines]
         # Bands extend the axis, and are not reported if they exceed it.
         bands = [] if self.stems else [e[np.isfinite(e)] for line in lines if line.band for e in line.band]
-        low, high = limits([*every, *bands], 0.05)
-        neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
+        low, high = limits([*finite_values, *bands], 0.05)
+        neutral = [y for y, line in zip(finite_values, lines, strict=True) if line.style == 0 and y.size]
         if not neutral:
             return low, high, []
         # The measured lines limit the axis: with a diverging simulation they would appear flat.
         bottom, top = limits(neutral, 0.0)
-        reach = MAX_STRAY_HEIGHTS * (top - bottom)
-        floor, ceiling = bottom - reach, top + reach
+        max_distance = MAX_STRAY_HEIGHTS * (top - bottom)
+        floor, ceiling = bottom - max_distance, top + max_distance
         exceeding = []
-        for y, line in zip(every, lines, strict=True):
+        for y, line in zip(finite_values, lines, strict=True):
             if y.size and (np.min(y) < floor or np.max(y) > ceiling):
                 middle = (bottom + top) / 2
                 exceeding.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
@@ -302,8 +310,8 @@ class LineChart(Figure):
     def note(self) -> str:
         """Caption, followed by sentences on values that are not drawn and on lines that exceed the axis."""
         exceeding = [
-            f"{name} leaves the axis (to {number(10.0**far if self.log_y else far, 3)})."
-            for name, far in self._y_limits[2]
+            f"{name} leaves the axis (to {number(10.0**exceeding_text if self.log_y else exceeding_text, 3)})."
+            for name, exceeding_text in self._y_limits[2]
         ]
         return " ".join(part for part in (self.caption, *self.content[1], *exceeding) if part)
 
@@ -341,8 +349,8 @@ class LineChart(Figure):
         if self.slider and not (narrow or self.log_x or self.log_y):
             # The slider has fewer positions on a page with many charts, whose lines have fewer points.
             values = [(line.name, line.style, line.y) for line in lines]
-            places = max(2, self.points // 2)
-            data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, places)
+            position_count = max(2, self.points // 2)
+            data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, position_count)
         described = self.description or self._describe()
         return svg(width, height, self.title, described, parts, narrow=narrow, **data)
 
@@ -362,8 +370,8 @@ class LineChart(Figure):
             edges, heights = self.bars
             xs, ys = plot.tenths(edges, np.append(heights, 0.0))
             shade: dict[str, str] = {"fill": LINE_STYLES[2][0], "fill_opacity": ".55"}
-            for x, end, y in zip(xs[:-1], xs[1:], ys[:-1], strict=True):
-                size = {"width": max(end - x - 8, 4), "height": zero - y}
+            for x, next_x, y in zip(xs[:-1], xs[1:], ys[:-1], strict=True):
+                size = {"width": max(next_x - x - 8, 4), "height": zero - y}
                 out.append(element("rect", class_="shade2", x=x, y=y, **size, **shade))
         for line in self.content[0]:
             if d := _outline(line, plot, points):
@@ -382,8 +390,8 @@ class LineChart(Figure):
 
 def line_styles(names: Iterable[str]) -> list[int]:
     """Return the index in LINE_STYLES for each line name: 0 for a neutral prefix, otherwise 1, 2, … in sequence."""
-    others = cycle(range(1, len(LINE_STYLES)))
-    return [0 if name.startswith(NEUTRAL_PREFIXES) else next(others) for name in names]
+    other_styles = cycle(range(1, len(LINE_STYLES)))
+    return [0 if name.startswith(NEUTRAL_PREFIXES) else next(other_styles) for name in names]
 
 
 def _logarithms(values: Floats) -> Floats:
@@ -396,16 +404,16 @@ def _describe_line(line: _Line, log_y: bool) -> str:
     finite = line.y[np.isfinite(line.y)]
     if finite.size == 0:
         return f"{line.name}: no value that can be drawn."
-    ends = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
-    low, high, last = (number(10.0**v if log_y else v, 4) for v in ends)
+    extremes = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
+    low, high, last = (number(10.0**v if log_y else v, 4) for v in extremes)
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
 def _zoomable(plot: PlotArea, x_ticks: Ticks, y_ticks: Ticks) -> dict[str, str]:
     """Return SVG attributes for the zoom script: axis limits, plot area [px], and powers of ten of the tick labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
-    place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
-    return {"data_frame": frame, "data_plot": place, "data_powers": f"{x_ticks.power} {y_ticks.power}"}
+    plot_box = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
+    return {"data_frame": frame, "data_plot": plot_box, "data_powers": f"{x_ticks.power} {y_ticks.power}"}
 
 
 def _outline(line: _Line, plot: PlotArea, points: int) -> str:
@@ -442,16 +450,16 @@ def _stroke(line: _Line) -> dict[str, str]:
     return stroke | ({"stroke_dasharray": dashes} if dashes else {})
 
 
-def path_data(places: Iterable[tuple[float, float]]) -> str:
+def path_data(points: Iterable[tuple[float, float]]) -> str:
     """Return the SVG path data of the polyline through points (x, y) [px]."""
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
 
 
-def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
+def stroke_path(style: int, points: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
     """Return the polyline through points (x, y) [px] as SVG markup, in the color of a line style."""
     stroke = {"class_": f"line{style}", "fill": "none", "stroke": LINE_STYLES[style][0], "stroke_width": f"{width}"}
     dash = {"stroke_dasharray": dashes} if dashes else {}
-    return element("path", **stroke, **dash, d=path_data(places))
+    return element("path", **stroke, **dash, d=path_data(points))
 
 
 def _path(line: _Line, plot: PlotArea, points: int) -> str:
@@ -466,16 +474,16 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
     starts = np.diff(np.cumsum(~np.isfinite(line.y))[rows], prepend=-1) != 0
     # A line of zero length (h0) shows a single point between two gaps as a dot.
     parts = [
-        f"M{x} {y}h0" if start else f"l{x - x_before} {y - above}"
-        for x, y, x_before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
+        f"M{x} {y}h0" if start else f"l{x - x_before} {y - y_before}"
+        for x, y, x_before, y_before, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
     ]
     return "".join(parts).replace(" -", "-")
 
 
 def _line_sample(line: _Line, x: float, y: float, length: int) -> Markup:
     """Return a short sample of a line as SVG markup for its label: `length` [px] from (x, y), or a dot."""
-    at, reach = (x + length / 2, 0) if line.dots else (x, length)
-    return element("path", **_stroke(line), d=f"M{at:.1f} {y:.1f}h{reach}")
+    at, extension = (x + length / 2, 0) if line.dots else (x, length)
+    return element("path", **_stroke(line), d=f"M{at:.1f} {y:.1f}h{extension}")
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
@@ -484,35 +492,35 @@ def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
     Overlapping labels are moved apart.
     """
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
-    ends = []
+    endpoints = []
     for line in lines:
         finite = line.y[np.isfinite(line.y)]
-        ends.append(float(np.clip(plot.y_pixels(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
+        endpoints.append(float(np.clip(plot.y_pixels(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
     # Lines that end at about the same height keep their sequence.
-    order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE_HEIGHT_PX), i))
-    places = [ends[i] for i in order]
-    for k in range(1, len(places)):
-        places[k] = max(places[k], places[k - 1] + LINE_HEIGHT_PX)
-    if places[-1] > bottom:
-        places[-1] = bottom
-        for k in range(len(places) - 2, -1, -1):
-            places[k] = min(places[k], places[k + 1] - LINE_HEIGHT_PX)
-    out = []
-    for i, y in zip(order, places, strict=True):
-        out.append(_line_sample(lines[i], x + 8, y, 16))
-        out.append(svg_text(x + 28, y + 4, truncate_text(lines[i].name, MAX_LABEL_CHARACTERS), "start"))
-    return out
+    order = sorted(range(len(lines)), key=lambda i: (round(endpoints[i] / LINE_HEIGHT_PX), i))
+    sorted_endpoints = [endpoints[i] for i in order]
+    for k in range(1, len(sorted_endpoints)):
+        sorted_endpoints[k] = max(sorted_endpoints[k], sorted_endpoints[k - 1] + LINE_HEIGHT_PX)
+    if sorted_endpoints[-1] > bottom:
+        sorted_endpoints[-1] = bottom
+        for k in range(len(sorted_endpoints) - 2, -1, -1):
+            sorted_endpoints[k] = min(sorted_endpoints[k], sorted_endpoints[k + 1] - LINE_HEIGHT_PX)
+    labels = []
+    for i, y in zip(order, sorted_endpoints, strict=True):
+        labels.append(_line_sample(lines[i], x + 8, y, 16))
+        labels.append(svg_text(x + 28, y + 4, truncate_text(lines[i].name, MAX_LABEL_CHARACTERS), "start"))
+    return labels
 
 
 def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
     """Return (line, x position [px], row index) of every legend entry above a narrow chart."""
     entries, x, row = [], 4.0, 0
     for line in lines:
-        needed = 26 + text_width(truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS)) + 14
-        if x > 4 and x + needed > width:
+        entry_width = 26 + text_width(truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS)) + 14
+        if x > 4 and x + entry_width > width:
             x, row = 4.0, row + 1
         entries.append((line, x, row))
-        x += needed
+        x += entry_width
     return entries
 
 

@@ -213,10 +213,10 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as a dictionary for JSON."""
-        parts = ("run", "equation_error", "output_error")
+        keys = ("run", "equation_error", "output_error")
         return {
             **attributes(self, ("m", "output_error", "equation_error")),
-            "runs": [dict(zip(parts, json_value(part), strict=True)) for part in self.per_run],
+            "runs": [dict(zip(keys, json_value(run_comparison), strict=True)) for run_comparison in self.per_run],
             **attributes(self, ["offsets"] if self.offsets else []),
             **attributes(self, ("findings", "warnings")),
         }
@@ -293,8 +293,8 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     ModelError
         If a run is too short for `m` pulses.
     """
-    several, m = _check_arguments(model, runs, m)
-    return compare_samples(model, several, simulate_runs(model, several), m=m)
+    run_list, m = _check_arguments(model, runs, m)
+    return compare_samples(model, run_list, simulate_runs(model, run_list), m=m)
 
 
 def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
@@ -318,9 +318,9 @@ def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
     ]
     return replace(
         free[0],
-        outputs=np.concatenate([piece.outputs for piece in free], axis=1),
-        refinement=max(piece.refinement for piece in free),
-        change=np.max([piece.change for piece in free], axis=0),
+        outputs=np.concatenate([samples.outputs for samples in free], axis=1),
+        refinement=max(samples.refinement for samples in free),
+        change=np.max([samples.change for samples in free], axis=0),
     )
 
 
@@ -329,19 +329,19 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
 
     The equation error is computed on `m` block pulses per run.
     """
-    full = records(runs, model.structure, m)
-    parts = []
-    for run, sampled, rec in zip(runs, free, full, strict=True):
+    block_pulses = records(runs, model.structure, m)
+    run_signals = []
+    for run, sampled, rec in zip(runs, free, block_pulses, strict=True):
         outputs = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
-        parts.append(_run_signals(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
+        run_signals.append(_run_signals(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
-    result = _pooled_comparison(model, runs, parts, m, times, sampled=True)
+    result = _pooled_comparison(model, runs, run_signals, m, times, sampled=True)
     findings = list(result.findings)
     if unconverged_runs := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
         findings.append(make_finding("sampling_coarse", run=", ".join(unconverged_runs)))
-    if moving := runs_in_motion(model, runs):
-        findings.append(make_finding("simulated_from_rest", run=", ".join(moving)))
+    if names_in_motion := runs_in_motion(model, runs):
+        findings.append(make_finding("simulated_from_rest", run=", ".join(names_in_motion)))
     return replace(result, findings=tuple(findings))
 
 
@@ -356,15 +356,17 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
     A mean averages neighboring samples. These errors therefore understate noise, and overstate model errors if an
     oscillation has few pulses per period.
     """
-    several, m = _check_arguments(model, runs, m)
-    check_no_missing(several, "figures of pulse means")
-    pairs = zip(comparison_records(several, model, m), records(several, model.structure, m), strict=True)
-    parts = []
-    for free, full in pairs:
+    run_list, m = _check_arguments(model, runs, m)
+    check_no_missing(run_list, "figures of pulse means")
+    pairs = zip(comparison_records(run_list, model, m), records(run_list, model.structure, m), strict=True)
+    run_signals = []
+    for free, block_pulses in pairs:
         responses, initial = simulate_record(model, free)
-        parts.append(_run_signals(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
-    middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
-    return _pooled_comparison(model, several, parts, m, middles, sampled=False)
+        run_signals.append(
+            _run_signals(model, block_pulses, responses, {o: free.of(o) for o in model.outputs}, initial)
+        )
+    midpoint_times = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in run_signals]
+    return _pooled_comparison(model, run_list, run_signals, m, midpoint_times, sampled=False)
 
 
 def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
@@ -374,18 +376,18 @@ def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> 
     a run is too short for the number of pulses.
     """
     check_model(model)
-    several = as_runs(runs)
-    carried = min(run.length for run in several) - 1
-    length = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
-    m = check_m(length, several, power_of_two=False)
-    for run in several:
+    run_list = as_runs(runs)
+    max_m = min(run.length for run in run_list) - 1
+    length = min(model.m or default_m(run_list, power_of_two=False), max_m) if m is None else m
+    m = check_m(length, run_list, power_of_two=False)
+    for run in run_list:
         run.require_outputs([o for o in model.outputs if o in run])
-    return several, m
+    return run_list, m
 
 
-def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
-    """Return one line of text for each output without an equation error; `why` maps these outputs to reasons."""
-    return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
+def describe_missing_equation_errors(reasons: Mapping[str, str]) -> list[str]:
+    """Return one line of text for each output without an equation error; `reasons` maps these outputs to reasons."""
+    return [f"{name} has no equation error: {reason}" for name, reason in reasons.items()]
 
 
 def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
@@ -398,19 +400,21 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
     because their powers of t make a constant unidentifiable.
     """
     out: dict[str, dict[str, float]] = {}
-    for item in model.equations:
-        if LEVEL_EXPONENT in initial[item.output]:
-            out[item.output] = {"level": initial[item.output][LEVEL_EXPONENT]}
+    for equation in model.equations:
+        if LEVEL_EXPONENT in initial[equation.output]:
+            out[equation.output] = {"level": initial[equation.output][LEVEL_EXPONENT]}
             continue
-        alone = initial_exponents(item, "caputo", model.structure.offset)
-        exponent_set = {round(e, 9) for e in initial[item.output] if e > -1}
-        if not exponent_set or (isinstance(model.structure.initial, str) and not exponent_set <= set(alone)):
-            out[item.output] = {}
+        exponents_without_offset = initial_exponents(equation, "caputo", model.structure.offset)
+        exponent_set = {round(e, 9) for e in initial[equation.output] if e > -1}
+        if not exponent_set or (
+            isinstance(model.structure.initial, str) and not exponent_set <= set(exponents_without_offset)
+        ):
+            out[equation.output] = {}
             continue
-        exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
-        out[item.output] = {
+        exponents, values = map(np.array, zip(*initial[equation.output].items(), strict=True))
+        out[equation.output] = {
             name: float(values[np.argmin(np.abs(exponents - power))]) * math.gamma(power + 1.0)
-            for name, power in offset_exponents(item.order.constant, model.structure.offset).items()
+            for name, power in offset_exponents(equation.order.constant, model.structure.offset).items()
         }
     return out
 
@@ -460,7 +464,7 @@ class _RunSignals:
 
 def _run_signals(
     model: Model,
-    full: Record,
+    block_pulses: Record,
     simulated: dict[str, Floats],
     outputs: dict[str, Floats],
     initial: dict[str, dict[float, float]],
@@ -469,29 +473,36 @@ def _run_signals(
 ) -> _RunSignals:
     """Return the signals of one run from which its error metrics are computed.
 
-    `full` is the block-pulse record for the equation error. In it, the sensor filter is applied to signals that were
-    not measured through it. An output with missing samples (`gaps`) has no equation error, because interpolated samples
-    are not measurements.
+    `block_pulses` is the block-pulse record for the equation error. In it, the sensor filter is applied to signals that
+    were not measured through it. An output with missing samples (`gaps`) has no equation error, because interpolated
+    samples are not measurements.
     """
-    (step, means, sensor), inputs, powers = full.core(), list(full.inputs), full.start
+    (step, means, sensor), inputs, powers = block_pulses.core(), list(block_pulses.inputs), block_pulses.start
     core = step, np.nan_to_num(means) if model.structure.has_nonlinear_terms else means, sensor
     equation_residuals = {
-        e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
+        e.output: _core.equation_error(core, equation_tuple(e, block_pulses.signals), inputs, powers)
         for e in model.equations
         # An equation with friction has no equation error, because noise determines the sign of a measured velocity
         # at rest. An output with gaps or with an undefined non-linear term has none either.
-        if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
+        if e.output not in gaps
+        and e.friction is None
+        and all(np.isfinite(block_pulses.of(t.column)).all() for t in e.terms)
     }
     return _RunSignals(
-        full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, equation_residuals
+        block_pulses.step,
+        initial,
+        simulated,
+        outputs,
+        {o: block_pulses.of(o) for o in model.outputs},
+        equation_residuals,
     )
 
 
 def _pooled_comparison(
-    model: Model, runs: Sequence[Run], parts: Sequence[_RunSignals], m: int, times: list[Floats], *, sampled: bool
+    model: Model, runs: Sequence[Run], run_signals: Sequence[_RunSignals], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
     """Return a comparison with the errors of each run, and with the errors pooled over all runs."""
-    equation_error, output_error = _pooled_errors(parts)
+    equation_error, output_error = _pooled_errors(run_signals)
     # Single runs may have equation errors although the pooled one is undefined.
     friction_outputs = {e.output for e in model.equations if e.friction is not None}
     gaps = {name for run in runs for name in run.missing_samples}
@@ -500,18 +511,18 @@ def _pooled_comparison(
         for o, f in equation_error.items()
         if f is UNKNOWN_METRICS
     }
-    offsets = tuple(offset_values(model, p.initial) for p in parts)
+    offsets = tuple(offset_values(model, p.initial) for p in run_signals)
     if model.structure.offset == "none":
         offsets = tuple({o: values for o, values in run.items() if values} for run in offsets)
     return Comparison(
         output_error,
         equation_error,
-        [(run.name, *_pooled_errors([p])) for run, p in zip(runs, parts, strict=True)],
-        {o: [p.simulated[o] for p in parts] for o in model.outputs},
-        {o: [p.measured[o] for p in parts] for o in model.outputs},
-        [p.step for p in parts],
+        [(run.name, *_pooled_errors([p])) for run, p in zip(runs, run_signals, strict=True)],
+        {o: [p.simulated[o] for p in run_signals] for o in model.outputs},
+        {o: [p.measured[o] for p in run_signals] for o in model.outputs},
+        [p.step for p in run_signals],
         m,
-        [p.initial for p in parts],
+        [p.initial for p in run_signals],
         tuple(near_identity_findings(model.structure, equation_error, output_error)),
         times,
         sampled,
@@ -520,17 +531,17 @@ def _pooled_comparison(
     )
 
 
-def _pooled_errors(parts: Sequence[_RunSignals]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
+def _pooled_errors(run_signals: Sequence[_RunSignals]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
     """Return (equation error, output error), each as metrics by output, pooled over runs."""
-    outputs = parts[0].measured
+    outputs = run_signals[0].measured
     equation = {
-        o: pooled_metrics([p.equation_signals[o] for p in parts], [p.equation_errors[o] for p in parts])
-        if all(o in p.equation_errors for p in parts)
+        o: pooled_metrics([p.equation_signals[o] for p in run_signals], [p.equation_errors[o] for p in run_signals])
+        if all(o in p.equation_errors for p in run_signals)
         else UNKNOWN_METRICS
         for o in outputs
     }
     free = {
-        o: pooled_metrics([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts])
+        o: pooled_metrics([p.measured[o] for p in run_signals], [p.measured[o] - p.simulated[o] for p in run_signals])
         for o in outputs
     }
     return equation, free
@@ -545,24 +556,24 @@ def near_identity_findings(
     The equation error is then small for a wrong model as well, but the output error is not.
     """
     findings = []
-    for item in structure.equations:
-        name, alpha = item.output, item.order.constant
+    for single_equation in structure.equations:
+        name, alpha = single_equation.output, single_equation.order.constant
         equation, output = equation_error[name], output_error[name]
-        close = [
+        close_orders = [
             t.order.constant
-            for t in item.terms
+            for t in single_equation.terms
             if t.column == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
         ]
         # Negated so that NaN counts as bad. An undefined equation error is no evidence against the model.
-        unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
-        worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not unknown
+        is_undefined = math.isnan(equation.nr) and math.isfinite(output.nr)
+        is_worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not is_undefined
         has_poor_fit = not output.nr <= MAX_NORMALIZED_RESIDUAL
-        if close and worse:
-            listed = ", ".join(f"{order:g}" for order in close)
-            listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
-            numbers = {"orders": listed, "alpha": alpha, "nr": output.nr, "equation_nr": equation.nr}
-            findings.append(make_finding("equation_says_identity", output=name, **numbers))
-        elif worse and has_poor_fit:
+        if close_orders and is_worse:
+            orders_text = ", ".join(f"{order:g}" for order in close_orders)
+            orders_text = f"orders {orders_text} are" if len(close_orders) > 1 else f"order {orders_text} is"
+            details = {"orders": orders_text, "alpha": alpha, "nr": output.nr, "equation_nr": equation.nr}
+            findings.append(make_finding("equation_says_identity", output=name, **details))
+        elif is_worse and has_poor_fit:
             findings.append(
                 make_finding("simulation_worse_than_equation_error", output=name, nr=output.nr, equation_nr=equation.nr)
             )
@@ -571,24 +582,24 @@ def near_identity_findings(
     return findings
 
 
-def validation_findings(own: Comparison, validation: Comparison) -> list[Finding]:
+def validation_findings(estimation: Comparison, validation: Comparison) -> list[Finding]:
     """Return findings on validation samples that are also estimation samples, and on outputs with a far lower fit.
 
-    `own` is the comparison of the model with its estimation runs.
+    `estimation` is the comparison of the model with its estimation runs.
     """
     findings = []
-    for k, (name, _, _) in enumerate(own.per_run):
-        for j, (other, _, _) in enumerate(validation.per_run):
-            first_lags, tested = (
-                np.stack([c.measured[o][i] for o in own.measured]) for c, i in ((own, k), (validation, j))
+    for k, (name, _, _) in enumerate(estimation.per_run):
+        for j, (validation_run, _, _) in enumerate(validation.per_run):
+            first_lags, validation_lags = (
+                np.stack([c.measured[o][i] for o in estimation.measured]) for c, i in ((estimation, k), (validation, j))
             )
-            shared = common_rows(first_lags, tested)
-            if shared == tested.shape[1] == first_lags.shape[1]:
-                findings.append(make_finding("estimation_run_repeated", run=other, other=name))
-            elif shared:
-                numbers = {"count": shared, "rows": tested.shape[1]}
-                findings.append(make_finding("estimation_rows_repeated", run=other, other=name, **numbers))
-    return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
+            shared_rows = common_rows(first_lags, validation_lags)
+            if shared_rows == validation_lags.shape[1] == first_lags.shape[1]:
+                findings.append(make_finding("estimation_run_repeated", run=validation_run, other=name))
+            elif shared_rows:
+                details = {"count": shared_rows, "rows": validation_lags.shape[1]}
+                findings.append(make_finding("estimation_rows_repeated", run=validation_run, other=name, **details))
+    return findings + validation_fit_findings({n: f.fit for n, f in estimation.output_error.items()}, validation)
 
 
 #: Number of successive samples that are compared to align two recordings, and minimum number of common samples.
@@ -596,25 +607,25 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
 ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
 
 
-def common_rows(one: Floats, other: Floats) -> int:
+def common_rows(first_series: Floats, second_series: Floats) -> int:
     """Return the number of samples that two excerpts of one recording share; 0 if they share none.
 
     Both arrays have shape (outputs, samples). They share samples if the later excerpt starts within the earlier one,
     and both are equal where they overlap.
     """
-    if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
-        return int(one.shape[1])
-    for earlier, later in ((one, other), (other, one)):
-        first = next(iter(np.flatnonzero(np.any(np.diff(later) != 0.0, axis=0))), 0)
-        head = later[:, first : first + ALIGNMENT_ROWS]
-        if head.shape[1] < ALIGNMENT_ROWS or earlier.shape[1] < MIN_COMMON_ROWS:
+    if first_series.shape == second_series.shape and np.array_equal(first_series, second_series, equal_nan=True):
+        return int(first_series.shape[1])
+    for delayed, reference in ((first_series, second_series), (second_series, first_series)):
+        first_change = next(iter(np.flatnonzero(np.any(np.diff(reference) != 0.0, axis=0))), 0)
+        head = reference[:, first_change : first_change + ALIGNMENT_ROWS]
+        if head.shape[1] < ALIGNMENT_ROWS or delayed.shape[1] < MIN_COMMON_ROWS:
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(earlier, ALIGNMENT_ROWS, axis=1)
-        for start in np.flatnonzero(np.all(windows == head[:, None, :], axis=(0, 2))) - first:
-            count = min(earlier.shape[1] - start, later.shape[1])
+        windows = np.lib.stride_tricks.sliding_window_view(delayed, ALIGNMENT_ROWS, axis=1)
+        for start in np.flatnonzero(np.all(windows == head[:, None, :], axis=(0, 2))) - first_change:
+            count = min(delayed.shape[1] - start, reference.shape[1])
             if start < 0 or count < MIN_COMMON_ROWS:
                 continue
-            if np.array_equal(earlier[:, start : start + count], later[:, :count], equal_nan=True):
+            if np.array_equal(delayed[:, start : start + count], reference[:, :count], equal_nan=True):
                 return int(count)
     return 0
 
@@ -622,15 +633,15 @@ def common_rows(one: Floats, other: Floats) -> int:
 def validation_fit_findings(estimation_fits: Mapping[str, float], validation: Comparison) -> list[Finding]:
     """Return a finding for each validation run and output with a fit `MAX_FIT_DROP_POINTS` below the estimation fit."""
     findings = []
-    for other, _, figures in validation.per_run:
+    for validation_run, _, figures in validation.per_run:
         for output, f in figures.items():
             # Negated so that a NaN fit counts as a drop.
             if (
                 np.isfinite(estimation_fits.get(output, np.nan))
                 and not f.fit >= estimation_fits[output] - MAX_FIT_DROP_POINTS
             ):
-                numbers = {"before": estimation_fits[output], "after": f.fit, "where": ""}
-                findings.append(make_finding("fit_falls", run=other, output=output, **numbers))
+                details = {"before": estimation_fits[output], "after": f.fit, "where": ""}
+                findings.append(make_finding("fit_falls", run=validation_run, output=output, **details))
     return findings
 
 
@@ -674,14 +685,19 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
             add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
         for name, equation, output in runs:
             add(f"{label}: {name}", equation, output)
-    reasons = [f"{words}." for words in describe_missing_equation_errors(missing_reasons)]
-    own = 1 + len(_METRIC_LABELS)
-    if missing_reasons and all(cell is None for row in rows for cell in row[1:own]):
+    reasons = [f"{text}." for text in describe_missing_equation_errors(missing_reasons)]
+    column_count = 1 + len(_METRIC_LABELS)
+    if missing_reasons and all(cell is None for row in rows for cell in row[1:column_count]):
         # Four empty columns would push the others off a narrow screen.
-        shown_rows: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
-        single = (("", 1), ("output error (simulation)", 4))
+        shown_rows: list[list[Cell]] = [[row[0], *row[column_count:]] for row in rows]
+        single_heading = (("", 1), ("output error (simulation)", 4))
         return Table(
-            title, ("output", *_METRIC_LABELS), shown_rows, groups=single, headings=headings, note=" ".join(reasons)
+            title,
+            ("output", *_METRIC_LABELS),
+            shown_rows,
+            groups=single_heading,
+            headings=headings,
+            note=" ".join(reasons),
         )
     note = (
         "The equation error uses the measured output on the right-hand side; only the simulation shows how well the "
@@ -717,10 +733,10 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
     if not rows:
         return None
     rows += [
-        [name, symbol_html(output), f"offset: {what}", value]
+        [name, symbol_html(output), f"offset: {label}", value]
         for (name, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False)
         for output, values in offsets.items()
-        for what, value in values.items()
+        for label, value in values.items()
     ]
     note = "They describe how that record starts and are never carried to another."
     if comparison.offsets:

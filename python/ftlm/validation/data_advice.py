@@ -120,22 +120,22 @@ def advise(run: Run, structure: Structure | None = None) -> Advice:
 
 def _findings(run: Run, structure: Structure | None) -> Iterator[Finding]:
     run = run.with_interpolated_gaps()
-    moving = [n for n in run.signals if np.ptp(run[n]) > 0]
+    varying_signals = [n for n in run.signals if np.ptp(run[n]) > 0]
     for name in run.signals:
-        if name not in moving:
+        if name not in varying_signals:
             yield _constant(run, name)
-    yield from _duplicate_channels(run, moving)
-    inputs = [n for n in run.inputs if n in moving]
-    outputs = [n for n in run.outputs if n in moving]
+    yield from _duplicate_channels(run, varying_signals)
+    inputs = [n for n in run.inputs if n in varying_signals]
+    outputs = [n for n in run.outputs if n in varying_signals]
     for name in outputs:
         yield from find_dead_channel(run, name)
-    usual = []
+    typical_findings = []
     for name in outputs:
         wraps = list(_wraps(run, name))
         yield from wraps
         # A signal that wraps jumps across its range: tests for saturation, spikes and drift would be meaningless.
         if not wraps:
-            usual.append(name)
+            typical_findings.append(name)
             yield from _saturation(run, name)
             yield from _spikes(run, name)
     for name in inputs:
@@ -144,8 +144,8 @@ def _findings(run: Run, structure: Structure | None) -> Iterator[Finding]:
     yield from _excitation(run, inputs)
     if structure is not None:
         yield from check_excitation(run, structure)
-    yield from _feedback(run, inputs, usual)
-    yield from _drift(run, inputs, usual)
+    yield from _feedback(run, inputs, typical_findings)
+    yield from _drift(run, inputs, typical_findings)
     for name in outputs:
         yield from _offset(run, name)
 
@@ -163,10 +163,10 @@ def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray
 
 
 def _duplicate_channels(run: Run, names: list[str]) -> Iterator[Finding]:
-    for one, other in itertools.combinations(names, 2):
-        if np.array_equal(run[one], run[other]):
-            role = {"input" if other in run.inputs else "output": other}
-            yield make_finding("twin", run=run.name, **role, other=one)
+    for first, second in itertools.combinations(names, 2):
+        if np.array_equal(run[first], run[second]):
+            role = {"input" if second in run.inputs else "output": second}
+            yield make_finding("twin", run=run.name, **role, other=first)
 
 
 def _constant(run: Run, name: str) -> Finding:
@@ -190,32 +190,40 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     if float(np.mean(is_unchanged)) > 0.3 and np.median(lengths) > 1:
         return
     at = int(np.argmax(lengths))
-    first, rows = int(starts[at]), int(lengths[at]) + 1
+    start, rows = int(starts[at]), int(lengths[at]) + 1
     if rows < max(MIN_DEAD_SAMPLES, DEAD_SHARE * run.length):
         return
     # Clipping at an extreme is reported as saturation; rest at any level before the first input, and under no input,
     # is legitimate.
-    if _entered_steeply(y, first, rows):
+    if _entered_steeply(y, start, rows):
         return
     # The output may be at rest while an input already changes, because it responds after a dead time.
-    late = max(1, int(DEAD_TIME_SHARE * rows))
-    first_values = [run[n][first : first + rows - late] for n in run.inputs]
-    ends = [run[n][first + rows - late : first + rows + 1] for n in run.inputs]
+    tail = max(1, int(DEAD_TIME_SHARE * rows))
+    first_values = [run[n][start : start + rows - tail] for n in run.inputs]
+    tail_samples = [run[n][start + rows - tail : start + rows + 1] for n in run.inputs]
     is_moving = any(
-        np.any(change_after != row_before[0]) for row_before, change_after in zip(first_values, ends, strict=True)
+        np.any(change_after != row_before[0])
+        for row_before, change_after in zip(first_values, tail_samples, strict=True)
     )
     without_input = not any(values[0] for values in first_values)
-    if all(np.ptp(values) == 0 for values in first_values) and (without_input or (first == 0 and is_moving)):
+    if all(np.ptp(values) == 0 for values in first_values) and (without_input or (start == 0 and is_moving)):
         return
-    begin, end = first * run.step, (first + rows) * run.step
+    start_time, end_time = start * run.step, (start + rows) * run.step
     change_after = (
-        f"use {parameter('window', (float(f'{end:.4g}'), None))}"
-        if first < run.length // 20
+        f"use {parameter('window', (float(f'{end_time:.4g}'), None))}"
+        if start < run.length // 20
         else "check the sensor, or cut it away"
     )
-    level = _with_unit(run, name, float(y[first]))
+    level = _with_unit(run, name, float(y[start]))
     yield make_finding(
-        "channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=change_after
+        "channel_off",
+        run=run.name,
+        output=name,
+        level=level,
+        begin=start_time,
+        end=end_time,
+        rows=rows,
+        after=change_after,
     )
 
 
@@ -225,15 +233,15 @@ def _smallest_change(y: Floats) -> float:
     return float(changes.min()) if changes.size else 0.0
 
 
-def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
+def _entered_steeply(y: Floats, start: int, rows: int) -> bool:
     """Whether an interval of equal values is an extreme of a signal that is steep just before and after it."""
-    moving = np.abs(np.diff(y))
-    typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
+    increments = np.abs(np.diff(y))
+    typical = float(np.median(increments[increments > 0])) if np.any(increments > 0) else 0.0
     # A slow turning point that ends with an input step is steep on one side only.
-    step_before = abs(y[first - 1] - y[first - 2]) if first >= 2 else math.inf
-    end = first + rows
-    step_after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
-    at_extreme = y[first] in (y.min(), y.max())
+    step_before = abs(y[start - 1] - y[start - 2]) if start >= 2 else math.inf
+    stop = start + rows
+    step_after = abs(y[stop + 1] - y[stop]) if stop + 1 < y.size else math.inf
+    at_extreme = y[start] in (y.min(), y.max())
     return bool(
         at_extreme and rows < y.size and min(step_before, step_after) > max(4 * _smallest_change(y), 0.2 * typical)
     )
@@ -246,33 +254,33 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
         return  # A signal of few levels is at its extremes by design.
     noise, least_change = estimate_noise(y), _smallest_change(y)
     code, role = ("saturation_input", "input") if name in run.inputs else ("saturation", "output")
-    for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
+    for extreme, extreme_name in ((levels[0], "lowest"), (levels[-1], "highest")):
         starts, lengths = _true_intervals(y == extreme)
         long = lengths >= MIN_CLIPPED_SAMPLES
         if noise < 2 * least_change:
             # If quantization exceeds the noise, only an interval that is entered steeply counts as clipped.
-            steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
-            clipped = int(np.sum(lengths[long][np.array(steep, dtype=bool)]))
+            is_steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
+            clipped = int(np.sum(lengths[long][np.array(is_steep, dtype=bool)]))
         else:
             clipped = int(np.sum(lengths[long]))
         if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_SHARE * y.size):
             level = _with_unit(run, name, float(extreme))
-            numbers = {"extreme": word, "level": level, "rows": clipped, "share": 100 * clipped / y.size}
-            yield make_finding(code, run=run.name, **{role: name}, **numbers)
+            details = {"extreme": extreme_name, "level": level, "rows": clipped, "share": 100 * clipped / y.size}
+            yield make_finding(code, run=run.name, **{role: name}, **details)
 
 
 def _spikes(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     if y.size < 5:
         return
-    up, down = np.diff(y)[:-1], np.diff(y)[1:]
-    reach = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
-    height = np.minimum(np.abs(up), np.abs(down))
-    limit = max(SPIKE_SIGMAS * estimate_noise(y), SPIKE_SHARE * reach)
-    out = (up * down < 0) & (height > limit)
+    rises, falls = np.diff(y)[:-1], np.diff(y)[1:]
+    range_width = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
+    height = np.minimum(np.abs(rises), np.abs(falls))
+    limit = max(SPIKE_SIGMAS * estimate_noise(y), SPIKE_SHARE * range_width)
+    out = (rises * falls < 0) & (height > limit)
     # A fast signal may turn that sharply everywhere; a spike is isolated between quiet neighbors.
-    near = np.abs(y[2:] - y[:-2])
-    out &= near < 0.5 * height
+    neighbor_differences = np.abs(y[2:] - y[:-2])
+    out &= neighbor_differences < 0.5 * height
     for n in run.inputs:
         jump = np.abs(np.diff(run[n]))
         # A pulse of one sample in an input may cause a pulse in a fast output.
@@ -281,7 +289,7 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
     rows = np.flatnonzero(out) + 1
     if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
         return
-    worst = rows[int(np.argmax(height[rows - 1]))]
+    highest_row = rows[int(np.argmax(height[rows - 1]))]
     yield make_finding(
         "spikes",
         run=run.name,
@@ -290,16 +298,16 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
         plural="s" if rows.size > 1 else "",
         first=int(rows[0]),
         time=float(rows[0]) * run.step,
-        height=_with_unit(run, name, float(height[worst - 1])),
-        worst=int(worst),
+        height=_with_unit(run, name, float(height[highest_row - 1])),
+        worst=int(highest_row),
     )
 
 
 def _wraps(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
-    steps = np.diff(y)
-    reach, typical = float(np.ptp(y)), float(np.median(np.abs(steps)))
-    jumps = np.flatnonzero((np.abs(steps) > WRAP_SHARE * reach) & (np.abs(steps) > 10 * typical))
+    increments = np.diff(y)
+    range_width, typical = float(np.ptp(y)), float(np.median(np.abs(increments)))
+    jumps = np.flatnonzero((np.abs(increments) > WRAP_SHARE * range_width) & (np.abs(increments) > 10 * typical))
     rows = []
     for at in jumps.tolist():
         if at < WRAP_SLOPE or at + WRAP_SLOPE + 1 >= y.size:
@@ -310,21 +318,26 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
             # A measured current follows its command, which jumps.
             continue
         # Both slopes oppose the jump: the quantity continued while its counter restarted.
-        slope_is_small = max(abs(slope_before), abs(slope_after)) < 0.5 * abs(steps[at])
-        if slope_is_small and slope_before * steps[at] < 0 and slope_after * steps[at] < 0:
+        slope_is_small = max(abs(slope_before), abs(slope_after)) < 0.5 * abs(increments[at])
+        if slope_is_small and slope_before * increments[at] < 0 and slope_after * increments[at] < 0:
             rows.append(at + 1)
     if not rows:
         return
-    size = float(np.median(np.abs(steps[np.array(rows) - 1])))
-    turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
-    numbers = {"size": _with_unit(run, name, size), "turn": turn, "times": plural(len(rows), "time"), "first": rows[0]}
-    yield make_finding("wrap", run=run.name, output=name, **numbers)
+    jump = float(np.median(np.abs(increments[np.array(rows) - 1])))
+    turn_text = " (a turn)" if run.units.get(name) == "rad" and abs(jump / (2 * math.pi) - 1) < 0.1 else ""
+    details = {
+        "size": _with_unit(run, name, jump),
+        "turn": turn_text,
+        "times": plural(len(rows), "time"),
+        "first": rows[0],
+    }
+    yield make_finding("wrap", run=run.name, output=name, **details)
 
 
 def _jumps_near(u: Floats, at: int) -> bool:
     """Whether an input jumps by more than the fraction `WRAP_SHARE` of its range within one sample of index `at`."""
-    near = np.abs(np.diff(u[at - 1 : at + 3]))
-    return bool(np.any(near > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
+    nearby_increments = np.abs(np.diff(u[at - 1 : at + 3]))
+    return bool(np.any(nearby_increments > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
@@ -332,12 +345,12 @@ def spectral_lines(u: Floats) -> tuple[int, int]:
     x = u - np.mean(u)
     phase = 2 * np.pi * np.arange(x.size) / x.size
     window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
-    size = np.abs(np.fft.rfft(x * window))
-    size[:2] = 0  # The window spreads the mean over these bins.
-    strong = size > SPECTRAL_LINE_THRESHOLD * size.max()
+    magnitude = np.abs(np.fft.rfft(x * window))
+    magnitude[:2] = 0  # The window spreads the mean over these bins.
+    strong = magnitude > SPECTRAL_LINE_THRESHOLD * magnitude.max()
     # A single line fills LINE_BINS bins. A broader interval counts as the number of lines that fit into it.
     _, lengths = _true_intervals(strong)
-    return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
+    return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(magnitude))
 
 
 def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
@@ -347,10 +360,10 @@ def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
             omega = 2 * math.pi * at / (run.length * run.step)
             yield make_finding("one_sine", run=run.name, input=name, omega=omega)
     for i, name in enumerate(inputs):
-        for other in inputs[:i]:
-            r = float(np.corrcoef(run[name], run[other])[0, 1])
+        for other_input in inputs[:i]:
+            r = float(np.corrcoef(run[name], run[other_input])[0, 1])
             if abs(r) > MAX_INPUT_CORRELATION:
-                yield make_finding("inputs_collinear", run=run.name, input=name, other=other, correlation=r)
+                yield make_finding("inputs_collinear", run=run.name, input=name, other=other_input, correlation=r)
 
 
 def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
@@ -361,26 +374,31 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
     input lines.
     """
     run = run.with_interpolated_gaps()
-    for item in structure.equations:
-        if item.friction is not None or item.nonlinear_terms:
+    for equation in structure.equations:
+        if equation.friction is not None or equation.nonlinear_terms:
             continue
-        inputs = [s for s in item.signals if s in run.inputs]
+        inputs = [s for s in equation.signals if s in run.inputs]
         # With measured coupling the other measured outputs are inputs of this equation.
         if structure.coupling == "measured":
-            inputs += [s for s in item.signals if s != item.output and s in run.outputs]
+            inputs += [s for s in equation.signals if s != equation.output and s in run.outputs]
         else:
             inputs = [s for s in structure.signals if s in run.inputs]
         if not inputs:
             # A free response has no input.
             continue
-        moving = [n for n in inputs if np.ptp(run[n]) > 0]
-        line_count = sum(2 * spectral_lines(run[n])[0] for n in moving)
+        varying_inputs = [n for n in inputs if np.ptp(run[n]) > 0]
+        line_count = sum(2 * spectral_lines(run[n])[0] for n in varying_inputs)
         line_count += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
-        free = len(item.order_names) + len(item.coefficient_names)
+        free = len(equation.order_names) + len(equation.coefficient_names)
         if free > line_count:
-            listed = ", ".join(inputs)
+            inputs_text = ", ".join(inputs)
             yield make_finding(
-                "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(line_count)
+                "excitation_short",
+                run=run.name,
+                output=equation.output,
+                free=free,
+                listed=inputs_text,
+                known=int(line_count),
             )
 
 
@@ -393,8 +411,8 @@ def _insufficient_duration(run: Run, outputs: list[str]) -> Iterator[Finding]:
         swing = float(np.std(y))
         level = np.zeros(y.size)
         level[y > np.mean(y) + 0.2 * swing], level[y < np.mean(y) - 0.2 * swing] = 1.0, -1.0
-        sides = level[level != 0]
-        crossings = int(np.sum(np.diff(sides) != 0))
+        nonzero_levels = level[level != 0]
+        crossings = int(np.sum(np.diff(nonzero_levels) != 0))
         tail = y[-y.size // 5 :]
         if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
             yield make_finding(
@@ -418,12 +436,12 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         return
     step = run.duration / m
     means = {n: pulse_means(run[n] - run[n][0], m, hold=run.intersample.get(n) == "zoh") for n in (*inputs, *outputs)}
-    first = {n: pulse_means(np.full(run.length, float(run[n][0])), m, hold=True) for n in inputs}
+    initial_levels = {n: pulse_means(np.full(run.length, float(run[n][0])), m, hold=True) for n in inputs}
     times = np.geomspace(2 * step, run.duration / 8, DRIFT_LAGS)
     series = [_core.filter_series([(1.0, 0.0)], [(float(t), 1.0), (1.0, 0.0)], m, step) for t in times]
-    regressors = [_core.series_multiply(s, means[n] + first[n], m) for n in inputs for s in series]
-    regressors += [means[n] + first[n] for n in inputs]
-    regressors += [np.cumsum(means[n] + first[n]) for n in inputs]
+    regressors = [_core.series_multiply(s, means[n] + initial_levels[n], m) for n in inputs for s in series]
+    regressors += [means[n] + initial_levels[n] for n in inputs]
+    regressors += [np.cumsum(means[n] + initial_levels[n]) for n in inputs]
     t = np.linspace(-0.5, 0.5, m)
     for name in outputs:
         y = means[name]
@@ -433,17 +451,17 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         basis = basis[scale > 0] / scale[scale > 0][:, None]
         # The part of trend and output that the regressors explain does not count as drift, so it is removed.
         q = orthonormal(basis.T, 1e-8)
-        y_left, t_left = y - q @ (q.T @ y), t - q @ (q.T @ t)
-        if float(t_left @ t_left) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
+        y_residual, t_residual = y - q @ (q.T @ y), t - q @ (q.T @ t)
+        if float(t_residual @ t_residual) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
             continue
-        slope = float(t_left @ y_left) / float(t_left @ t_left)
-        remainder = y_left - slope * t_left
-        blocks = np.array_split(remainder * t_left, DRIFT_BLOCKS)
-        spread = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_left @ t_left)
-        size = float(np.std(y))
-        if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:
-            numbers = {"slope": _with_unit(run, name, slope), "share": 100 * abs(slope) / size}
-            yield make_finding("drift", run=run.name, output=name, **numbers)
+        slope = float(t_residual @ y_residual) / float(t_residual @ t_residual)
+        remainder = y_residual - slope * t_residual
+        blocks = np.array_split(remainder * t_residual, DRIFT_BLOCKS)
+        slope_error = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_residual @ t_residual)
+        deviation = float(np.std(y))
+        if abs(slope) > DRIFT_SHARE * deviation and abs(slope) > DRIFT_SIGMAS * slope_error:
+            details = {"slope": _with_unit(run, name, slope), "share": 100 * abs(slope) / deviation}
+            yield make_finding("drift", run=run.name, output=name, **details)
 
 
 def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
@@ -454,16 +472,18 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Findi
     rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     signals = {name: run[name][:rows] for name in (*inputs, *outputs)}
     for u in inputs:
-        others = [[signals[n]] for n in inputs if n != u]
-        tests = {y: feedback_test([signals[y]], [signals[u]], others) for y in outputs}
+        other_inputs = [[signals[n]] for n in inputs if n != u]
+        tests = {y: feedback_test([signals[y]], [signals[u]], other_inputs) for y in outputs}
         strongest = max(tests, key=lambda y: tests[y].ratio, default="")
-        answered = max((y for y in tests if tests[y].has_feedback), key=lambda y: tests[y].ratio, default="")
-        if answered:
-            yield make_finding("loop_in_data", run=run.name, input=u, output=answered, ratio=tests[answered].ratio)
+        feedback_output = max((y for y in tests if tests[y].has_feedback), key=lambda y: tests[y].ratio, default="")
+        if feedback_output:
+            yield make_finding(
+                "loop_in_data", run=run.name, input=u, output=feedback_output, ratio=tests[feedback_output].ratio
+            )
         elif strongest and tests[strongest].ratio > MIN_UNDECIDED_RATIO:
             test = tests[strongest]
-            numbers = {"ratio": test.ratio, "reason": test.reason}
-            yield make_finding("feedback_inconclusive", run=run.name, input=u, output=strongest, **numbers)
+            details = {"ratio": test.ratio, "reason": test.reason}
+            yield make_finding("feedback_inconclusive", run=run.name, input=u, output=strongest, **details)
 
 
 @dataclass(frozen=True)
@@ -538,8 +558,8 @@ class Inspection:
 
     def __str__(self) -> str:
         width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2
-        heads = ("first", "low", "high", "mean", "sd", "noise", "quantum")
-        table: list[tuple[str, tuple[str, ...]]] = [(f"{'signal':<{width}}{'role':<8}{'unit':<8}", heads)]
+        headings = ("first", "low", "high", "mean", "sd", "noise", "quantum")
+        table: list[tuple[str, tuple[str, ...]]] = [(f"{'signal':<{width}}{'role':<8}{'unit':<8}", headings)]
         for s in self.signals:
             figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise)
             cells = (*(f"{v:.4g}" for v in figures), f"{s.quantum:.4g}" if s.quantum else "-")
@@ -549,9 +569,12 @@ class Inspection:
             f"carries up to {self.rows - 1} block pulses"
         )
         # Columns for which a narrow terminal has no room follow in a second table.
-        room = max((columns() - width - 16) // 11, 1)
-        for start in range(0, len(heads), room):
-            lines += [lead + "".join(f"{cell:>11}" for cell in cells[start : start + room]) for lead, cells in table]
+        columns_per_line = max((columns() - width - 16) // 11, 1)
+        for start in range(0, len(headings), columns_per_line):
+            lines += [
+                row_start + "".join(f"{cell:>11}" for cell in cells[start : start + columns_per_line])
+                for row_start, cells in table
+            ]
         minor = (LEVEL_FACT, LEVEL_NOTE)
         return "\n".join(lines + [f"{'note' if f.level in minor else 'warning'}: {f.sentence}" for f in self.findings])
 
@@ -581,8 +604,8 @@ def data_notes(run: Run) -> list[Finding]:
     """Return notes, as findings, on how a run was read and processed, and on whether the rig stopped it."""
     notes = []
     for note in run.warnings:
-        parts = {"text": note.fact, "otherwise": note.otherwise} if isinstance(note, Note) else {"text": note}
-        notes.append(make_finding("data_note", run=run.name, **parts))
+        texts = {"text": note.fact, "otherwise": note.otherwise} if isinstance(note, Note) else {"text": note}
+        notes.append(make_finding("data_note", run=run.name, **texts))
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):
         return notes

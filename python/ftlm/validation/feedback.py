@@ -123,7 +123,7 @@ class FeedbackTest:
 
 
 def feedback_test(
-    residuals: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]] = ()
+    residuals: Sequence[Floats], signal: Sequence[Floats], other_inputs: Sequence[Sequence[Floats]] = ()
 ) -> FeedbackTest:
     """Test whether an input depends on past outputs: feedback in Granger's sense (doi:10.2307/1912791).
 
@@ -140,14 +140,14 @@ def feedback_test(
         Residuals of the output, or the output itself, one array per run; NaN marks a missing sample.
     signal
         Input, one array per run.
-    others
+    other_inputs
         Other inputs, each with one array per run. Their past and present values are regressors of the input.
     """
     runs = [k for k, u in enumerate(signal) if u.size >= MIN_FEEDBACK_ROWS]
     longest = sum(signal[k].size for k in runs)
     if not runs:
-        least = max((u.size for u in signal), default=0)
-        return FeedbackTest("undecided", f"runs of {least} rows; {MIN_FEEDBACK_ROWS} are needed")
+        min_size = max((u.size for u in signal), default=0)
+        return FeedbackTest("undecided", f"runs of {min_size} rows; {MIN_FEEDBACK_ROWS} are needed")
     inputs = [signal[k] for k in runs]
     if all(np.ptp(u) == 0 for u in inputs):
         return FeedbackTest("undecided", "the input is constant")
@@ -175,20 +175,20 @@ def feedback_test(
         )
         aligned_residuals = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
         input_values = [u[c] for u, c in zip(inputs, changes, strict=True)]
-        beside = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in others]
+        other_at_changes = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in other_inputs]
     else:
         aligned_residuals, input_values = [_fill_missing(residuals[k]) for k in runs], inputs
-        beside = [[other[k] for k in runs] for other in others]
-    room = MAX_FEEDBACK_ROWS
+        other_at_changes = [[other[k] for k in runs] for other in other_inputs]
+    row_budget = MAX_FEEDBACK_ROWS
     sizes = []
     for u in input_values:
-        sizes.append(min(u.size, room))
-        room -= sizes[-1]
+        sizes.append(min(u.size, row_budget))
+        row_budget -= sizes[-1]
     rows_used = [k for k, rows in enumerate(sizes) if rows >= (MIN_FEEDBACK_ROWS if dense else MIN_CHANGES // 2)]
     test = _Innovations(
         [aligned_residuals[k][: sizes[k]] for k in rows_used],
         [input_values[k][: sizes[k]] for k in rows_used],
-        [[other[k][: sizes[k]] for k in rows_used] for other in beside],
+        [[other[k][: sizes[k]] for k in rows_used] for other in other_at_changes],
         shift=int(dense),
     ).test()
     if not test.has_feedback:
@@ -199,8 +199,8 @@ def feedback_test(
         if dense:
             response_rows[: response.size] = response
         else:
-            ends = [*changes[k][1 : response.size], size][: response.size]
-            for_rows = np.diff([changes[k][0], *ends])
+            boundaries = [*changes[k][1 : response.size], size][: response.size]
+            for_rows = np.diff([changes[k][0], *boundaries])
             series = np.repeat(response, for_rows)
             response_rows[changes[k][0] : changes[k][0] + series.size] = series
     return replace(test, response=tuple(responses))
@@ -231,60 +231,60 @@ def _is_periodic(u: Floats) -> bool:
     count = x.size
     power = np.abs(np.fft.rfft(x, 2 * count)) ** 2
     correlation = np.fft.irfft(power)[:count] / np.arange(count, 0, -1)
-    first = 8
-    periods = np.argsort(-correlation[first : count // 2 + 1])[:3] + first
+    start = 8
+    periods = np.argsort(-correlation[start : count // 2 + 1])[:3] + start
     return any(np.max(np.abs(u[p:] - u[:-p])) <= 1e-6 * np.ptp(u) for p in periods.tolist())
 
 
-def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
-    """Return a matrix of lagged samples: rows are samples from ``start`` on, columns are lags ``first`` to ``last``."""
-    windows = sliding_window_view(x, last - first + 1)
-    return windows[start - last : x.size - last][:, ::-1]
+def _lags(x: Floats, first_lag: int, last_lag: int, start: int) -> Floats:
+    """Return a matrix of lagged samples: rows from ``start`` on, columns with lags ``first_lag`` to ``last_lag``."""
+    windows = sliding_window_view(x, last_lag - first_lag + 1)
+    return windows[start - last_lag : x.size - last_lag][:, ::-1]
 
 
 def _line_regressors(u: Floats) -> list[Floats]:
     """Return cosines and sines at the spectral lines of an input, as regressors beside its lagged samples."""
     count = u.size
-    size = 1 << math.ceil(math.log2(8 * count))
+    transform_size = 1 << math.ceil(math.log2(8 * count))
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
     columns: list[Floats] = []
     for _ in range(min(MAX_LINES, count // 60)):
         # Differences are used, because the slow part of a random walk would resemble a line.
-        power = np.abs(np.fft.rfft(np.diff(x) * window, size)) ** 2
+        power = np.abs(np.fft.rfft(np.diff(x) * window, transform_size)) ** 2
         power[:16] = 0
         at = int(np.argmax(power))
-        near = power[max(0, at - LINE_NEIGHBORS) : at + LINE_NEIGHBORS + 1]
-        if power[at] <= 0 or power[at] < LINE_RATIO * np.median(near):
+        neighborhood = power[max(0, at - LINE_NEIGHBORS) : at + LINE_NEIGHBORS + 1]
+        if power[at] <= 0 or power[at] < LINE_RATIO * np.median(neighborhood):
             break
-        place = float(at)
+        peak = float(at)
         if 0 < at < power.size - 1:
-            low, middle, high = np.log(power[at - 1 : at + 2] + 1e-300).tolist()
-            bend = low - 2 * middle + high
-            place += 0.5 * (low - high) / bend if bend else 0.0
-        omega = 2 * math.pi * place / size
+            low, center, high = np.log(power[at - 1 : at + 2] + 1e-300).tolist()
+            curvature = low - 2 * center + high
+            peak += 0.5 * (low - high) / curvature if curvature else 0.0
+        omega = 2 * math.pi * peak / transform_size
         columns += [np.cos(omega * time), np.sin(omega * time)]
         basis = np.column_stack([np.ones(count), *columns])
         x = _project_out(basis, u)
     return columns
 
 
-def _ridge_gram(weighted: Floats, past: Floats) -> Floats:
-    """Return the normal matrix ``weighted.T @ past`` of a weighted regression on `past`, plus a small ridge."""
-    gram: Floats = weighted.T @ past
+def _ridge_gram(weighted: Floats, regressors: Floats) -> Floats:
+    """Return the normal matrix ``weighted.T @ past`` of a weighted regression on `regressors`, plus a small ridge."""
+    gram: Floats = weighted.T @ regressors
     gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
     return gram
 
 
-def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
-    """Return the residuals of a weighted ridge regression of `targets` on the columns of `past`.
+def _project_out(regressors: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
+    """Return the residuals of a weighted ridge regression of `targets` on the columns of `regressors`.
 
     The ridge is small, and one refinement step corrects it.
     """
-    weighted = past if weights is None else past * weights[:, None]
-    gram = _ridge_gram(weighted, past)
+    weighted = regressors if weights is None else regressors * weights[:, None]
+    gram = _ridge_gram(weighted, regressors)
     factor = np.linalg.cholesky(gram)
     for _ in range(2):
-        targets = targets - past @ np.linalg.solve(factor.T, np.linalg.solve(factor, weighted.T @ targets))
+        targets = targets - regressors @ np.linalg.solve(factor.T, np.linalg.solve(factor, weighted.T @ targets))
     return targets
 
 
@@ -292,20 +292,22 @@ def _score_ratio(innovation: Floats, columns: Floats) -> float:
     """Return the self-normalized score statistic of an innovation and regressors, divided by its critical value."""
     score = columns.T @ innovation
     products = columns * innovation[:, None]
-    spread = products.T @ products
-    spread[np.diag_indices_from(spread)] += 1e-9 * np.trace(spread) / len(spread)
+    score_covariance = products.T @ products
+    score_covariance[np.diag_indices_from(score_covariance)] += (
+        1e-9 * np.trace(score_covariance) / len(score_covariance)
+    )
     limit = chi_squared(columns.shape[1], FEEDBACK_LEVEL / (2 + len(INNOVATION_COUNTS)))
-    return float(score @ np.linalg.solve(spread, score)) / limit
+    return float(score @ np.linalg.solve(score_covariance, score)) / limit
 
 
 def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Floats]:
     """Return the largest :func:`_score_ratio` over sets of regressors, and the normalized columns of the set."""
-    sizes = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(sizes > 0, sizes, 1.0)
+    norms = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(norms > 0, norms, 1.0)
     sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
-    ratios = [_score_ratio(innovation, own) for own in sets]
-    best = int(np.argmax(ratios))
-    return ratios[best], sets[best]
+    ratios = [_score_ratio(innovation, columns_of_set) for columns_of_set in sets]
+    best_index = int(np.argmax(ratios))
+    return ratios[best_index], sets[best_index]
 
 
 def _local_autocorrelation(w: Floats) -> float:
@@ -320,27 +322,29 @@ def _local_autocorrelation(w: Floats) -> float:
     return float(np.mean(LOCAL_ROWS * r * r)) / (1 + max(0.5, 4 * math.sqrt(2 / (LOCAL_LAGS * count))))
 
 
-def _local_explained_fraction(w: Floats, past: Floats) -> float:
-    """Return the fraction of `w` that `past` explains in short blocks, divided by its limit for independent series."""
+def _local_explained_fraction(w: Floats, regressors: Floats) -> float:
+    """Return the fraction of `w` that `regressors` explain in short blocks, over its limit for independent series."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
-    x = past[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, -1)
+    x = regressors[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, -1)
     x = x - x.mean(axis=1, keepdims=True)
     y = w[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, 1)
     y = y - y.mean(axis=1, keepdims=True)
-    u, sizes, _ = np.linalg.svd(x, full_matrices=False)
-    projection = np.where(sizes[:, :, None] > 1e-9 * sizes[:, :1, None], u.transpose(0, 2, 1) @ y, 0.0)
-    total = np.sum(y * y, axis=(1, 2))
-    shares = np.sum(projection * projection, axis=(1, 2)) / np.where(total > 0, total, np.inf)
-    return float(np.mean(LOCAL_ROWS * shares / x.shape[2])) / (1 + 3.5 / math.sqrt(count))
+    u, singular_values, _ = np.linalg.svd(x, full_matrices=False)
+    projection = np.where(
+        singular_values[:, :, None] > 1e-9 * singular_values[:, :1, None], u.transpose(0, 2, 1) @ y, 0.0
+    )
+    power = np.sum(y * y, axis=(1, 2))
+    fractions = np.sum(projection * projection, axis=(1, 2)) / np.where(power > 0, power, np.inf)
+    return float(np.mean(LOCAL_ROWS * fractions / x.shape[2])) / (1 + 3.5 / math.sqrt(count))
 
 
 class _Innovations:
     """Innovations of an input and of an output over several runs, with the feedback test on them."""
 
     def __init__(
-        self, residuals: list[Floats], input_values: list[Floats], others: list[list[Floats]], *, shift: int
+        self, residuals: list[Floats], input_values: list[Floats], other_inputs: list[list[Floats]], *, shift: int
     ) -> None:
         shortest = min(u.size for u in input_values)
         self.shift = shift
@@ -351,19 +355,21 @@ class _Innovations:
         self.deviation = deviation
         inputs = [(u - u.mean()) / deviation for u in input_values]
         outputs = self._clip_outliers(residuals)
-        sizes = [u.size - self.start for u in input_values]
-        ends = np.cumsum(sizes).tolist()
+        lengths = [u.size - self.start for u in input_values]
+        stops = np.cumsum(lengths).tolist()
         #: (start, stop) of each run in the stacked rows.
-        self.places = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-        past = [np.concatenate([_lags(u, 1, self.input_lags, self.start) for u in inputs])]
-        beside = []
-        for other in others:
-            size = math.sqrt(float(np.mean(np.concatenate([(v - v.mean()) ** 2 for v in other]))))
-            if size > 0:
-                reach = min(self.input_lags, MAX_OTHER_LAGS)
-                beside.append(np.concatenate([_lags((v - v.mean()) / size, 0, reach, self.start) for v in other]))
+        self.row_ranges = [(stop - length, stop) for stop, length in zip(stops, lengths, strict=True)]
+        input_lags_of_runs = [np.concatenate([_lags(u, 1, self.input_lags, self.start) for u in inputs])]
+        other_lags = []
+        for other_input in other_inputs:
+            length = math.sqrt(float(np.mean(np.concatenate([(v - v.mean()) ** 2 for v in other_input]))))
+            if length > 0:
+                lag_count = min(self.input_lags, MAX_OTHER_LAGS)
+                other_lags.append(
+                    np.concatenate([_lags((v - v.mean()) / length, 0, lag_count, self.start) for v in other_input])
+                )
         lines = [[np.ones(u.size), *_line_regressors(u)] for u in inputs]
-        self.past = np.column_stack([*past, *beside, *self._block_diagonal(lines)])
+        self.past = np.column_stack([*input_lags_of_runs, *other_lags, *self._block_diagonal(lines)])
         self.inputs = self._stack_rows(inputs)
         self.weights = np.ones(self.inputs.size)
         w = _project_out(self.past, self.inputs)
@@ -373,27 +379,33 @@ class _Innovations:
             w = _project_out(self.past, self.inputs, self.weights)
         self.innovation, self.scale = w, robust_deviation(w)
         levels = self._block_diagonal([[np.ones(u.size)] for u in inputs])
-        own = [np.concatenate([_lags(e, 1, output_lags, self.start) for e in outputs])]
-        driven = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
+        output_lags_of_runs = [np.concatenate([_lags(e, 1, output_lags, self.start) for e in outputs])]
+        driving_lags = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
         self.residuals = self._stack_rows(outputs)
-        answer = _project_out(np.column_stack([*own, *driven, *beside, *levels]), self.residuals)
-        earlier = [columns[:, 1:] for columns in driven]
-        self.present = _project_out(np.column_stack([*own, *earlier, *beside, *levels]), self.residuals)
-        self.noise = robust_deviation(answer)
-        self.output_innovation = np.clip(answer / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
+        projected = _project_out(
+            np.column_stack([*output_lags_of_runs, *driving_lags, *other_lags, *levels]), self.residuals
+        )
+        strictly_past = [columns[:, 1:] for columns in driving_lags]
+        self.same_row_output = _project_out(
+            np.column_stack([*output_lags_of_runs, *strictly_past, *other_lags, *levels]), self.residuals
+        )
+        self.noise = robust_deviation(projected)
+        self.output_innovation = np.clip(projected / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
         memory = SLOW_FORGETTING * (1 - SLOW_FORGETTING) ** np.arange(SLOW_MEMORY_ROWS)
-        self.slow = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
+        self.slow_regressors = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
 
     def _clip_outliers(self, residuals: list[Floats]) -> list[Floats]:
         """Return residuals, centered and divided by their standard deviation, with far outliers clipped.
 
         Outliers only reduce the power of the test.
         """
-        every = np.concatenate([e - e.mean() for e in residuals])
-        size = float(np.std(every)) or 1.0
-        middle = float(np.median(every)) / size
-        reach = RESIDUAL_CLIP * max(robust_deviation(every / size - middle), 1e-12)
-        return [np.clip((e - e.mean()) / size, middle - reach, middle + reach) for e in residuals]
+        pooled = np.concatenate([e - e.mean() for e in residuals])
+        deviation = float(np.std(pooled)) or 1.0
+        median_value = float(np.median(pooled)) / deviation
+        clip_width = RESIDUAL_CLIP * max(robust_deviation(pooled / deviation - median_value), 1e-12)
+        return [
+            np.clip((e - e.mean()) / deviation, median_value - clip_width, median_value + clip_width) for e in residuals
+        ]
 
     def _stack_rows(self, series: Sequence[Floats]) -> Floats:
         return np.concatenate([x[self.start :] for x in series])
@@ -401,25 +413,27 @@ class _Innovations:
     def _block_diagonal(self, columns: Sequence[Sequence[Floats]]) -> list[Floats]:
         """Return columns that are nonzero in one run each, so that every run has its own coefficients."""
         out = []
-        for (first, last), own in zip(self.places, columns, strict=True):
-            for column in own:
-                whole = np.zeros(self.places[-1][1])
-                whole[first:last] = column[self.start :]
-                out.append(whole)
+        for (start, stop), block in zip(self.row_ranges, columns, strict=True):
+            for column in block:
+                padded_column = np.zeros(self.row_ranges[-1][1])
+                padded_column[start:stop] = column[self.start :]
+                out.append(padded_column)
         return out
 
     def _rows(self, offset: int) -> NDArray[np.intp]:
         """Return the indices of the stacked rows whose regressors, delayed by `offset` more samples, lie in one run."""
         skip = max(INNOVATION_COUNTS) + 2 + offset
-        return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
+        return np.concatenate([np.arange(min(start + skip, stop), stop) for start, stop in self.row_ranges])
 
     def _regressors(self, rows: NDArray[np.intp], offset: int) -> Floats:
         """Return the regressors at `rows`: past residuals, their differences, their low-pass part, and innovations."""
         lag = self.shift + offset
         back: Callable[[Floats, int], Floats] = lambda x, k: x[rows - k - offset]  # noqa: E731
         innovations = [back(self.output_innovation, k + self.shift) for k in range(max(INNOVATION_COUNTS))]
-        now = self.residuals[rows - lag]
-        return np.column_stack([now, now - self.residuals[rows - lag - 1], self.slow[rows - lag], *innovations])
+        current = self.residuals[rows - lag]
+        return np.column_stack(
+            [current, current - self.residuals[rows - lag - 1], self.slow_regressors[rows - lag], *innovations]
+        )
 
     def _ratio(self, offset: int, clipped: Floats) -> tuple[float, Floats, NDArray[np.intp]]:
         """Return the largest ratio of a score statistic to its critical value, with its regressors and rows.
@@ -436,26 +450,29 @@ class _Innovations:
         count = self.inputs.size
         clipped = np.clip(self.innovation / max(self.scale, 1e-300), -INPUT_CLIP, INPUT_CLIP)
         clipped = clipped - clipped.mean()
-        if robust_deviation(self.present) < QUIET_SHARE:
+        if robust_deviation(self.same_row_output) < QUIET_SHARE:
             return FeedbackTest("none", "the output has no noise that could come back", rows=count)
         signed = self._same_sample_ratio(clipped)
-        now = abs(signed)
-        at_once = f"it is correlated with the output of the same row (ratio {now:.2g}): a controller, or a feedthrough"
+        same_row_ratio = abs(signed)
+        same_row_text = (
+            f"it is correlated with the output of the same row (ratio {same_row_ratio:.2g}): a controller, or a "
+            "feedthrough"
+        )
         if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
-            if now > 1:
-                return FeedbackTest("undecided", at_once, rows=count, same_row=signed)
+            if same_row_ratio > 1:
+                return FeedbackTest("undecided", same_row_text, rows=count, same_row=signed)
             return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
         fit = columns @ minimum_norm_solution(columns, target, 1e-12)
-        share = float(1 - np.sum((target - fit) ** 2) / np.sum(target**2))
+        power_fraction = float(1 - np.sum((target - fit) ** 2) / np.sum(target**2))
 
         def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
             response = self._response(columns, rows) if state == "found" else ()
-            return FeedbackTest(state, reason, ratio, share, count, same_row=signed, response=response)
+            return FeedbackTest(state, reason, ratio, power_fraction, count, same_row=signed, response=response)
 
         # Without feedback, past outputs cannot explain most of the innovation of a rough input.
-        if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
+        if power_fraction >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
             return result("found")
         objection = ""
         if _local_autocorrelation(clipped) > 1:
@@ -464,20 +481,22 @@ class _Innovations:
             objection = "its innovations depend on its past in parts of the run, as those of a sweep"
         if objection and ratio <= PLACEBO_RATIO_IN_DOUBT:
             return result("undecided", objection)
-        if ratio <= 1 or count * share * self.scale**2 < MIN_FEEDBACK_POWER:
-            if now > 1:
-                return result("undecided", at_once)
+        if ratio <= 1 or count * power_fraction * self.scale**2 < MIN_FEEDBACK_POWER:
+            if same_row_ratio > 1:
+                return result("undecided", same_row_text)
             return result("none", "" if ratio <= 1 else "too little to matter")
         if self._ratio_with_noisy_input(rows) <= 1:
             return result("undecided", "a closed loop, or noise in the measured input")
         # A loop acts during the whole run. Independent signals are correlated by chance on one part only.
-        gains = np.array([part.sum() for part in np.array_split(fit * target, STEADY_PARTS)])
+        gains = np.array([gain_part.sum() for gain_part in np.array_split(fit * target, STEADY_PARTS)])
         if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
             return result("undecided", "only one part of the run shows it")
-        first = max(INNOVATION_COUNTS) + self.input_lags
-        last = min(end - begin for begin, end in self.places) // 3
-        far = np.unique(np.linspace(first, last, PLACEBO_COUNT).astype(int)).tolist() if last > first else []
-        placebo = max((self._ratio(k, clipped)[0] for k in far), default=1.0)
+        min_lag = max(INNOVATION_COUNTS) + self.input_lags
+        max_lag = min(stop - start for start, stop in self.row_ranges) // 3
+        placebo_lags = (
+            np.unique(np.linspace(min_lag, max_lag, PLACEBO_COUNT).astype(int)).tolist() if max_lag > min_lag else []
+        )
+        placebo = max((self._ratio(k, clipped)[0] for k in placebo_lags), default=1.0)
         if ratio < (PLACEBO_RATIO_IN_DOUBT * max(placebo, 1.0) if objection else PLACEBO_RATIO * placebo):
             return result("undecided", objection or f"outputs far in the past explain as much (ratio {placebo:.2g})")
         return result("found")
@@ -488,9 +507,9 @@ class _Innovations:
         This statistic detects integral control, under which the past input already contains the past outputs. These
         outputs therefore do not improve the prediction of the input.
         """
-        size = max(robust_deviation(self.present), 1e-300)
-        present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
-        column = _project_out(self.past, present[:, None], self.weights)
+        deviation = max(robust_deviation(self.same_row_output), 1e-300)
+        clipped_output = np.clip(self.same_row_output / deviation, -OUTPUT_CLIP, OUTPUT_CLIP)
+        column = _project_out(self.past, clipped_output[:, None], self.weights)
         ratio = _score_ratio(clipped, column / max(float(np.linalg.norm(column)), 1e-300))
         return math.copysign(ratio, float(clipped @ column[:, 0]))
 
@@ -501,27 +520,30 @@ class _Innovations:
         past output contains information on the true past input that the measured input lacks. This can look like
         feedback.
         """
-        past, y = self.past[rows], self.inputs[rows]
-        weighted = past * self.weights[rows][:, None]
-        gram = weighted.T @ past
-        tiny = 1e-12 * float(np.trace(gram))
-        own, rest = np.arange(self.input_lags), np.arange(self.input_lags, past.shape[1])
-        cross, inner = gram[np.ix_(own, rest)], gram[np.ix_(rest, rest)] + tiny * np.eye(rest.size)
-        alone = gram[np.ix_(own, own)] - cross @ np.linalg.solve(inner, cross.T)
-        top = max(float(np.linalg.eigvalsh(alone)[0]), 0.0)
+        regressors, y = self.past[rows], self.inputs[rows]
+        weighted = regressors * self.weights[rows][:, None]
+        gram = weighted.T @ regressors
+        ridge = 1e-12 * float(np.trace(gram))
+        input_indices, other_indices = np.arange(self.input_lags), np.arange(self.input_lags, regressors.shape[1])
+        cross, other_gram = (
+            gram[np.ix_(input_indices, other_indices)],
+            gram[np.ix_(other_indices, other_indices)] + ridge * np.eye(other_indices.size),
+        )
+        partial_gram = gram[np.ix_(input_indices, input_indices)] - cross @ np.linalg.solve(other_gram, cross.T)
+        largest_noise = max(float(np.linalg.eigvalsh(partial_gram)[0]), 0.0)
         columns = self._regressors(rows, 0)
         at, from_columns = weighted.T @ y, weighted.T @ columns
-        least = math.inf
-        for share in INPUT_NOISE_SHARES:
-            less = gram + tiny * np.eye(len(gram))
-            less[own, own] -= share * top
-            inverse = np.linalg.inv(less)
-            w = y - past @ (inverse @ at)
+        lowest_ratio = math.inf
+        for fraction in INPUT_NOISE_SHARES:
+            reduced_gram = gram + ridge * np.eye(len(gram))
+            reduced_gram[input_indices, input_indices] -= fraction * largest_noise
+            inverse = np.linalg.inv(reduced_gram)
+            w = y - regressors @ (inverse @ at)
             w = np.clip(w / max(robust_deviation(w), 1e-300), -INPUT_CLIP, INPUT_CLIP)
             w = w - w.mean()
-            remainder = columns - past @ (inverse @ from_columns)
-            least = min(least, _largest_score_ratio(w, remainder)[0])
-        return least
+            remainder = columns - regressors @ (inverse @ from_columns)
+            lowest_ratio = min(lowest_ratio, _largest_score_ratio(w, remainder)[0])
+        return lowest_ratio
 
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
         """Return the part of the input that the feedback explains, one array per run.
@@ -529,20 +551,20 @@ class _Innovations:
         The explained innovations pass through the autoregression of the input on its own past. The part of the input
         that is correlated with the residual of the same sample also counts as feedback.
         """
-        now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
-        columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])
+        projected = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
+        columns = np.column_stack([columns, projected / max(float(np.linalg.norm(projected)), 1e-300)])
         innovations = np.zeros(self.inputs.size)
         innovations[rows] = columns @ minimum_norm_solution(columns, self.innovation[rows], 1e-12)
         weighted = self.past * self.weights[:, None]
         law = np.linalg.solve(_ridge_gram(weighted, self.past), weighted.T @ self.inputs)[: self.input_lags]
         out = []
-        for first, last in self.places:
-            x = np.concatenate([np.zeros(self.start), innovations[first:last]])
+        for start, stop in self.row_ranges:
+            x = np.concatenate([np.zeros(self.start), innovations[start:stop]])
             divisor = np.zeros(x.size)
             divisor[0] = 1.0
             divisor[1 : 1 + law.size] = -law[: x.size - 1]
-            whole = _core.series_divide(x, divisor)
+            filtered = _core.series_divide(x, divisor)
             # An unstable filter would make the result larger than the input.
-            size = float(np.std(whole)) if np.all(np.isfinite(whole)) else math.inf
-            out.append(self.deviation * (whole if size <= 1.0 else x))
+            deviation = float(np.std(filtered)) if np.all(np.isfinite(filtered)) else math.inf
+            out.append(self.deviation * (filtered if deviation <= 1.0 else x))
         return tuple(out)

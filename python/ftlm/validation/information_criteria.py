@@ -90,8 +90,8 @@ def normal_log_likelihood(noise: Iterable[tuple[float, float]]) -> float:
     likelihood = 0.0
     for count, rms in noise:
         # A residual of exactly 0 has an infinite likelihood.
-        level = 2 * math.log(rms) if 0 < rms < math.inf else math.copysign(math.inf, rms - 1)
-        likelihood -= 0.5 * count * (math.log(2 * math.pi) + 1 + level)
+        log_variance = 2 * math.log(rms) if 0 < rms < math.inf else math.copysign(math.inf, rms - 1)
+        likelihood -= 0.5 * count * (math.log(2 * math.pi) + 1 + log_variance)
     return likelihood
 
 

@@ -339,12 +339,12 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     :class:`ftlm.FeedbackTest`.
     """
     check_model(model)
-    several = as_runs(runs)
+    run_list = as_runs(runs)
     count = check_integer("lags", lags, 1)
-    check_run_lengths(several, count)
-    for run in several:
+    check_run_lengths(run_list, count)
+    for run in run_list:
         run.require_outputs([o for o in model.outputs if o in run])
-    return run_residual_tests(model, several, simulate_runs(model, several), lags=count)
+    return run_residual_tests(model, run_list, simulate_runs(model, run_list), lags=count)
 
 
 def check_run_lengths(runs: Runs, lags: int) -> None:
@@ -380,33 +380,38 @@ def run_residual_tests(
             residuals_by_output = measured_samples(model, run, sampled.refinement) - sampled.outputs
         for name, series in zip(model.outputs, residuals_by_output, strict=True):
             residuals[name].append(np.ascontiguousarray(series[1:-1]))
-    read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
-    inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
+    input_names = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
+    inputs = list(dict.fromkeys([*runs[0].inputs, *input_names]))
     signals = {
         n: [np.ascontiguousarray(interpolate_gaps(compared_values(run, model.structure, n))[1:-1]) for run in runs]
         for n in inputs
     }
     outputs = {}
-    for item in model.equations:
-        name = item.output
+    for equation in model.equations:
+        name = equation.output
         measurements = [compared_values(run, model.structure, name) for run in runs]
         deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measurements])))
         gaps = [np.isnan(y[1:-1]) for y in measurements]
-        direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
-        commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
+        direct = {
+            s
+            for t in equation.terms
+            for s in t.signals
+            if t.order.constant >= equation.order.constant - ORDER_TOLERANCE
+        }
+        commands = {s: s in direct for s in equation.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
         signs: list[Floats] = []
-        if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
+        if equation.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
-            motion = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
+            motion = [np.gradient(f.outputs[row]) if equation.order.constant > 1.0 else f.outputs[row] for f in free]
             signs = _signs_of_motion(motion)
-            slope = math.inf if item.order.constant > 1.0 else sign_tanh_slope(motion)
+            slope = math.inf if equation.order.constant > 1.0 else sign_tanh_slope(motion)
             outputs[name] = _test_direction(outputs[name], signs, lags, slope)
         if sensitivities is not None and outputs[name].is_correlated:
-            own = sensitivities().get(name, [])
-            outputs[name] = _test_beyond_parameters(outputs[name], own, signals, signs, lags)
-    steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
-    return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
+            output_sensitivities = sensitivities().get(name, [])
+            outputs[name] = _test_beyond_parameters(outputs[name], output_sensitivities, signals, signs, lags)
+    step_sizes, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
+    return Residuals(outputs, tuple(run.name for run in runs), step_sizes, max(s.refinement for s in free), terms)
 
 
 def _test_output(
@@ -425,29 +430,29 @@ def _test_output(
     deviation of the output. ``commands`` states for each input of the equation whether the model has direct feedthrough
     from it.
     """
-    everything = np.concatenate([e[~gap] for e, gap in zip(series, gaps, strict=True)])
+    pooled = np.concatenate([e[~gap] for e, gap in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
-        rms = float(np.sqrt(np.mean(everything**2)))
+        rms = float(np.sqrt(np.mean(pooled**2)))
     nr = rms / deviation if deviation > 0 else math.inf
     if not math.isfinite(rms):
         failure, across = _failed_test(np.arange(lags + 1)), _failed_test(np.arange(-lags, lags + 1))
         return OutputResiduals(series, math.inf, math.inf, failure, dict.fromkeys(signals, across))
     series = [np.where(gap, np.nan, e) for e, gap in zip(series, gaps, strict=True)]
-    white_test = _whiteness(series, everything.size, lags)
-    moving = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
+    white_test = _whiteness(series, pooled.size, lags)
+    varying_inputs = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
     loops = {
-        name: feedback_test(series, moving[name], [v for n, v in moving.items() if n != name])
+        name: feedback_test(series, varying_inputs[name], [v for n, v in varying_inputs.items() if n != name])
         for name in commands
-        if name in moving
+        if name in varying_inputs
     }
     inputs = {}
     for name, values in signals.items():
         noise = NoiseModel.fit(series, values, lags)
-        inputs[name] = _independence(series, values, noise, lags, first=0)
+        inputs[name] = _independence(series, values, noise, lags, first_lag=0)
         if inputs[name].failed and not commands.get(name, True):
             # A correlation at lag 0 alone is feedback or feedthrough within the sample, not missing dynamics.
-            later = _independence(series, values, noise, lags, first=1)
-            inputs[name] = later if later.passed else inputs[name]
+            delayed_test = _independence(series, values, noise, lags, first_lag=1)
+            inputs[name] = delayed_test if delayed_test.passed else inputs[name]
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
@@ -466,7 +471,7 @@ def _test_direction(output: OutputResiduals, signs: list[Floats], lags: int, slo
     """
     if not signs:
         return output
-    test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
+    test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first_lag=0)
     return replace(output, direction=test, sign_slope=slope)
 
 
@@ -487,8 +492,8 @@ def _test_beyond_parameters(
     def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
         noise = NoiseModel.fit(output.residuals, signal, lags)
         residuals = noise.subtract(output.residuals, sensitivities)
-        again = _independence(residuals, signal, noise, lags, first=test.first)
-        return again if again.passed else test
+        repeated_test = _independence(residuals, signal, noise, lags, first_lag=test.first)
+        return repeated_test if repeated_test.passed else test
 
     inputs = {name: repeat(test, signals[name]) if test.failed else test for name, test in output.inputs.items()}
     direction = output.direction
@@ -505,9 +510,9 @@ def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     """Return the whiteness test of `count` residuals; the variance of the noise may change within a run."""
     limit = chi_squared_99(lags)
-    own, statistic = autocorrelations(series, lags)[0], portmanteau(series, lags)
+    correlations, statistic = autocorrelations(series, lags)[0], portmanteau(series, lags)
     band = NORMAL_99 / math.sqrt(count)
-    return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
+    return CorrelationTest(np.arange(lags + 1), correlations, band, statistic, limit, passed=statistic <= limit)
 
 
 @dataclass(frozen=True)
@@ -545,8 +550,8 @@ class NoiseModel:
 
     def whiten(self, series: list[Floats]) -> list[Floats]:
         """Return series filtered by the whitening filter, starting at the sample of the first innovation."""
-        lead = self.start - (self.filter.size - 1)
-        return [np.ascontiguousarray(row[lead:]) for row in whiten_series(series, self.filter)]
+        padding = self.start - (self.filter.size - 1)
+        return [np.ascontiguousarray(row[padding:]) for row in whiten_series(series, self.filter)]
 
     def subtract(self, series: list[Floats], directions: Sequence[Floats]) -> list[Floats]:
         """Return series minus their generalized least-squares projection onto directions.
@@ -566,26 +571,32 @@ class NoiseModel:
 
 
 def _independence(
-    series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first: int
+    series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first_lag: int
 ) -> CorrelationTest:
-    """Return the test of the cross-correlations at all lags >= ``first`` against a simultaneous 99 % band."""
-    around = np.arange(-lags, lags + 1)
+    """Return the test of the cross-correlations at all lags >= ``first_lag`` against a simultaneous 99 % band."""
+    all_lags = np.arange(-lags, lags + 1)
     if is_constant(signal):
-        return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
+        return CorrelationTest(
+            all_lags, np.zeros(all_lags.size), math.nan, 0.0, math.nan, passed=False, conclusive=False
+        )
     # Whitening the noise makes chance correlations with a slow input small.
-    white, through = noise.whiten(series), noise.whiten(signal)
-    cross, _, _ = _core.correlation(white, through, lags)
-    _, variance, _ = _core.correlation(noise.innovations, through, lags)
+    whitened, filtered_signal = noise.whiten(series), noise.whiten(signal)
+    cross, _, _ = _core.correlation(whitened, filtered_signal, lags)
+    _, variance, _ = _core.correlation(noise.innovations, filtered_signal, lags)
     # Noise that grows with the input widens the band, as colored noise does.
-    variance = max(variance, _product_variance(noise.innovations, through, lags))
-    power, driven = (sum(dot(row, row) for row in rows) for rows in (white, noise.innovations))
-    share = noise.inflation * driven / power if power > 0.0 else 1.0
-    spread = math.sqrt(variance * min(share, noise.inflation))
-    largest = float(np.max(np.abs(cross[lags + first :])))
-    limit = NormalDist().inv_cdf(1 - (1 - (1 - SIGNIFICANCE_LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
-    decided = limit < 1.0
-    passed = decided and largest <= limit
-    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
+    variance = max(variance, _product_variance(noise.innovations, filtered_signal, lags))
+    power, innovation_power = (sum(dot(row, row) for row in rows) for rows in (whitened, noise.innovations))
+    variance_ratio = noise.inflation * innovation_power / power if power > 0.0 else 1.0
+    standard_error = math.sqrt(variance * min(variance_ratio, noise.inflation))
+    largest = float(np.max(np.abs(cross[lags + first_lag :])))
+    limit = (
+        NormalDist().inv_cdf(1 - (1 - (1 - SIGNIFICANCE_LEVEL) ** (1 / (lags + 1 - first_lag))) / 2) * standard_error
+    )
+    is_conclusive = limit < 1.0
+    is_passed = is_conclusive and largest <= limit
+    return CorrelationTest(
+        all_lags, cross, NORMAL_99 * standard_error, largest, limit, is_passed, is_conclusive, first_lag
+    )
 
 
 def is_independent(series: list[Floats], signals: Sequence[list[Floats]], lags: int = DEFAULT_LAGS) -> bool:
@@ -595,15 +606,15 @@ def is_independent(series: list[Floats], signals: Sequence[list[Floats]], lags: 
     """
     if min(e.size for e in series) < 2 * lags + 1:
         return False
-    return all(_independence(series, s, NoiseModel.fit(series, s, lags), lags, first=0).passed for s in signals)
+    return all(_independence(series, s, NoiseModel.fit(series, s, lags), lags, first_lag=0).passed for s in signals)
 
 
-def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
+def _product_variance(whitened: list[Floats], signal: list[Floats], lags: int) -> float:
     """Return the variance of a cross-correlation: the normalized mean product of the squared signals at lags >= 0."""
-    powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
-    total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
-    each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
-    return float(np.mean(each)) / total if total > 0 else 0.0
+    powers = [(e * e, v * v) for e, v in zip(whitened, (v - v.mean() for v in signal), strict=True)]
+    squared_means = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
+    products_by_lag = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
+    return float(np.mean(products_by_lag)) / squared_means if squared_means > 0 else 0.0
 
 
 def sign_tanh_slope(velocities: Sequence[Floats]) -> float:
@@ -629,28 +640,30 @@ def failed_tests(tests: Residuals) -> list[Finding]:
         if not math.isfinite(output.rms):
             findings.append(make_finding("out_of_range", output=name))
             continue
-        white = output.whiteness
-        if not white.passed and not output.follows_direction:
-            numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
+        whiteness = output.whiteness
+        if not whiteness.passed and not output.follows_direction:
+            details = {"statistic": whiteness.statistic, "lags": int(whiteness.lags[-1]), "limit": whiteness.limit}
             code = "output_not_white"
             if output.is_undecided or output.is_noise:
-                code, numbers = "color_undecided" if output.is_undecided else "noise_coloured", {}
-            findings.append(make_finding(code, output=name, **numbers))
+                code, details = "color_undecided" if output.is_undecided else "noise_coloured", {}
+            findings.append(make_finding(code, output=name, **details))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
                 code = "residual_test_input_constant" if math.isnan(test.limit) else "residual_test_inconclusive"
                 findings.append(make_finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
-                numbers = {"value": value, "lag": lag, "limit": test.limit}
-                findings.append(make_finding("residuals_follow_input", output=name, input=signal, **numbers))
+                details = {"value": value, "lag": lag, "limit": test.limit}
+                findings.append(make_finding("residuals_follow_input", output=name, input=signal, **details))
             elif test.first:
-                at_once = test.values[test.lags == 0]
-                findings.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
+                value_at_lag_0 = test.values[test.lags == 0]
+                findings.append(
+                    make_finding("moves_within_row", output=name, input=signal, value=float(value_at_lag_0[0]))
+                )
         if output.follows_direction and output.direction is not None:
-            numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
+            details = {"value": output.direction.largest[1], "limit": output.direction.limit}
             term = friction_term(name, "fc", output.sign_slope)
-            findings.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
+            findings.append(make_finding("residuals_follow_direction", output=name, term=term, **details))
         findings += [feedback_finding(name, signal, output) for signal in output.feedback]
     return findings
 
@@ -658,15 +671,15 @@ def failed_tests(tests: Residuals) -> list[Finding]:
 def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
     """Return a finding on detected feedback, with its effect on the estimates."""
     test = output.feedback_tests[signal]
-    numbers = {"ratio": test.ratio, "share": 100 * test.share}
+    details = {"ratio": test.ratio, "share": 100 * test.share}
     if test.bias is None:
         # Without a joint fit the bias is not known. Feedback of white noise hardly biases output-error estimates.
         code = "loop_harmless" if output.whiteness.passed else "loop_found"
         effect = " slightly" if output.whiteness.passed else ""
-        return make_finding(code, output=name, input=signal, effect=effect, **numbers)
+        return make_finding(code, output=name, input=signal, effect=effect, **details)
     effect = f" by up to {test.bias:.2g} of their standard errors"
     return make_finding(
-        "loop_found" if test.bias > 1 else "loop_harmless", output=name, input=signal, effect=effect, **numbers
+        "loop_found" if test.bias > 1 else "loop_harmless", output=name, input=signal, effect=effect, **details
     )
 
 
@@ -681,7 +694,7 @@ def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
     for name, output in tests.outputs.items():
         test_rows = [(Markup("whiteness"), output.whiteness)]
         test_rows += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
-        rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in test_rows]
+        rows += [[symbol_html(name), label, t.statistic, t.limit, t.verdict] for label, t in test_rows]
     note = (
         "Whiteness: statistic over all lags. Independence: largest correlation at lags >= 0 after residual and input "
         "pass the filter that whitens the residual. A true model fails each test in 1 % of cases. Undecided: the test "
