@@ -16,7 +16,7 @@ import pytest
 import ftlm
 from ftlm import report
 from ftlm.estimation.linear import trace_chart
-from ftlm.order_search.result import search_summary, search_top
+from ftlm.order_search.result import MAX_REPORT_ROWS, search_summary, search_top
 from ftlm.order_search.search import landscape
 from ftlm.plot.comparison_charts import compared_bars, error_chart, residual_charts, residual_series
 from ftlm.plot.model_charts import bode_charts, pole_charts
@@ -491,8 +491,8 @@ def test_search_tables_account_for_every_candidate(identified):
     name, _, candidates, kept, *left_out = summary.rows[0]
     assert "stage" in name
     assert candidates == search.candidates == kept + sum(left_out)
-    top = search_top("stage", search, rows=5)
-    assert len(top.rows) == min(5, len(search.table))
+    top = search_top("stage", search)
+    assert len(top.rows) == min(MAX_REPORT_ROWS, len(search.table))
     assert top.rows[0][1] == search.score
     assert top.rows[0][2:] == [*search.orders.values(), *search.coefficients.values()]
 

@@ -927,7 +927,7 @@ flush, to_csv, describe = recording._Recorder.flush, Run.to_csv, recording.descr
 
 
 def flushed(self):
-    if self.done >= 32:
+    if self.row_count >= 32:
         os.kill(os.getpid(), first)
     flush(self)
 

@@ -30,7 +30,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Ratio:
-    """Transfer function: numerator `numerator` and denominator `denominator` with real powers of s, and a delay [s]."""
+    """Transfer function: `numerator` and `denominator` with real powers of s, and a delay [s]."""
 
     numerator: Polynomial
     denominator: Polynomial
@@ -193,8 +193,8 @@ def series(first: Model, second: Model) -> Model:
 def combine(operator: str, left: Model | float, right: Model | float, what: str | None = None) -> Model:
     """Return the product, sum, difference or quotient of two models, or of a model and a number, as one model.
 
-    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``; messages name the operator, or `what`. In a product, `right`
-    acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
+    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``. Messages name `what`, by default the operator. In a product,
+    `right` acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
     :meth:`ftlm.Model.parallel` and :meth:`ftlm.Model.inverse`.
     """
     (a, output, _), (b, _, signal) = (

@@ -472,7 +472,7 @@ MAX_DELAY_SHARE = 0.1
 
 @cache
 def _suggested_kinds() -> list[dict[str, str]]:
-    """Return the suggested kinds of structures, with name, purpose ("why") and equation, from their file."""
+    """Return the suggested kinds of structures, with name, purpose ("why") and equation."""
     kinds: list[dict[str, str]] = msgspec.toml.decode(read_resource("suggested_structures.toml", "ftlm.app"))[
         "structures"
     ]

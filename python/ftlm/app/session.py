@@ -36,7 +36,7 @@ MAX_CONCURRENT_OPENS = 2
 MAX_NAME_BYTES = 200
 #: Characters that are not allowed in file names on Windows.
 _RESERVED_CHARACTERS = ':*?"<>|' if os.name == "nt" else ""
-#: States of a model.
+#: States of the fit of a model.
 STATE_WAITING, STATE_RUNNING, STATE_MADE = "waiting", "running", "made"
 STATE_FAILED, STATE_STOPPED = "failed", "stopped"
 

@@ -61,7 +61,7 @@ def make_model(
 ) -> Model:
     """Return a model of a structure with fixed orders and coefficients, which records its method and runs.
 
-    `m` is the number of block pulses. `estimate_details` adds entries to the field `estimate_details` of the model.
+    `m` is the number of block pulses. `estimate_details` adds entries to the field `about` of the model.
     """
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     step_sizes = {run.step for run in task.runs}

@@ -196,7 +196,7 @@ def _fit_response(
     *,
     single_start: bool,
 ) -> FrequencyIdentification:
-    """Fit a response problem from automatic guesses and the user's guess; with `single_start`, only from the latter.
+    """Fit a response problem from automatic guesses and from `start`; with `single_start`, from `start` alone.
 
     Raise DataError if there are no more measured values than parameters. Raise ConvergenceError if no initial guess has
     a finite response.
@@ -487,7 +487,7 @@ def _optimum_and_cost(problem: ResponseProblem, values: Floats) -> tuple[Floats,
 
 
 def _fit_again(problem: ResponseProblem, first_problem: ResponseProblem, optimum: ResponseFit) -> ResponseFit:
-    """Fit `problem`, starting from `optimum`, the optimum of a problem `first_problem` that has the same parameters."""
+    """Return the fit of `problem` from `optimum`, the optimum of `first_problem`, which has the same parameters."""
     return _fit(problem, problem.in_problem_units(first_problem.in_seconds(optimum.values)))
 
 

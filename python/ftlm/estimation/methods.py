@@ -131,7 +131,7 @@ def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
 
 
 def whiten(run: Run, noise_filter: Floats) -> Run:
-    """Return a run with signals filtered by A(q), coefficients `noise_filter`; its first outputs are missing."""
+    """Return a run whose signals are filtered by the FIR `noise_filter`; the first output samples are missing."""
     filter_order = noise_filter.size - 1
 
     def whitened_samples(values: Floats) -> Floats:

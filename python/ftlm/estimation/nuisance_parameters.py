@@ -641,7 +641,7 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
 
 
 def _fit_needs_history(caputo_fit: JointFit, history_fit: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether a fit with few initial terms has significantly larger residuals than one with many."""
+    """Whether residuals of `caputo_fit` are significantly larger than those of `history_fit`."""
     caputo_residuals, history_residuals = _pooled_residuals(caputo_fit), _pooled_residuals(history_fit)
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
     return needs_history(

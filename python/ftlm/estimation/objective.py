@@ -230,8 +230,8 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
 def propagated_errors(slopes: Floats, covariance: Floats) -> Floats:
     """Return standard errors of functions of the parameters, to first order.
 
-    `slopes` are the derivatives (functions, parameters), and `covariance` is the covariance. The error is infinite if a
-    function depends on a parameter of infinite variance.
+    `slopes` are the derivatives (functions, parameters), and `covariance` is that of the parameters. The error is
+    infinite if a function depends on a parameter of infinite variance.
     """
     unidentifiable = np.isinf(np.diag(covariance))
     columns = slopes[:, ~unidentifiable]

@@ -401,7 +401,7 @@ def _cartesian_product(axis_values: Sequence[Sequence[float] | Floats]) -> Float
 
 
 def halton(count: int, dimension: int) -> Floats:
-    """Return the first `count` points of the Halton sequence in the unit cube of dimension `dimension`."""
+    """Return the first `count` points of the Halton sequence in the unit cube of `dimension` dimensions."""
     primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:dimension]
     out = np.zeros((count, dimension))
     for k, base in enumerate(primes):
@@ -582,7 +582,7 @@ def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, delay_f
     """Return the frequency response from the input of a record to a signal.
 
     For an output it is the measured response to the same input, interpolated from another record if necessary. For the
-    input itself it is the delay factor `delay_factor`, and for other signals 0.
+    input itself it is `delay_factor`, and for other signals 0.
     """
     outputs = problem.structure.outputs
     if name not in outputs:

@@ -168,7 +168,7 @@ def _combined_verdict(
     has_validation: bool,
     method: str = "",
 ) -> Verdict | None:
-    """Return the verdict from the findings `model_findings` of a fit and from comparisons with validation `runs`.
+    """Return the verdict from findings on a fit (`model_findings`) and comparisons with validation runs (`runs`).
 
     None if no finding is a warning. `method` is the name of the estimation method.
     """

@@ -42,7 +42,7 @@ NUMERIC_MATLAB_CLASSES = frozenset(
 
 
 class UnreadableError(Exception):
-    """Error for a file that cannot be read: reason `why`, and remedy `way_out`, which is "" for a damaged file."""
+    """Error for a file that cannot be read, with its `reason` and a remedy `way_out`; "" for a damaged file."""
 
     def __init__(self, reason: str, way_out: str = "") -> None:
         super().__init__(reason)

@@ -604,8 +604,8 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
 def _check_above(preceding: list[_Line], width: int, source: str, number_marks: tuple[bool, str | None]) -> None:
     """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped.
 
-    `number_marks` are whether the decimal mark is a comma, and the name of the thousands separator. `width` is the
-    number of cells per row of the table, for the message.
+    `number_marks` is (whether the decimal mark is a comma, name of the thousands separator). `width` is the number of
+    cells per row of the table, for the message.
     """
     comma, thousands_separator = number_marks
     rows = [

@@ -434,8 +434,8 @@ def _resolve_unit(
 ) -> str:
     """Return the unit of a column: the option of the user, else the unit in the file, else the first of `choices`.
 
-    `kind` is "magnitude" or "phase". In the last case, a note is added to `notes`. Raise DataError if the option is
-    unknown or contradicts the file.
+    `kind` is "magnitude" or "phase". If the unit is assumed, a note is added to `notes`. Raise DataError if the option
+    is unknown or contradicts the file.
     """
     if option is not None:
         if option not in choices:

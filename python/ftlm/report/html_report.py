@@ -699,7 +699,7 @@ def model_page(
 
 
 def _model_content(model: Model, validation_runs: Sequence[Run], validated: Sequence[Comparison]) -> Page:
-    """Return the page of a saved model with its comparisons with validation runs (`validation_runs`)."""
+    """Return the page of a saved model and of its comparisons (`validated`) with `validation_runs`."""
     estimate = model.estimate
     findings = [] if estimate is None else list(estimate.findings)
     for run, comparison in zip(validation_runs, validated, strict=True):

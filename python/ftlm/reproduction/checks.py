@@ -563,7 +563,7 @@ def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduc
     return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
 
 
-#: Checks of all claims in claims.toml, in its order, which is that of the page: the functions of the claims' names.
+#: Check function of each claim, by name, in the order of claims.toml and of the page.
 CLAIM_CHECKS: dict[str, Callable[[Reproduction], Evidence]] = {
     name: globals()[name] for name in read_texts("claims") if name != "rules"
 }

@@ -236,7 +236,7 @@ class Deflection:
 
     @property
     def parts(self) -> list[tuple[str, Deflection]]:
-        """Pairs (suffix of headings, cross-validation): with and, if present, without the other deflection's rate."""
+        """(heading suffix, cross-validation) with and, if available, without the other deflection's rate."""
         return [("", self)] + ([] if self.without_rate is None else [(f", {WITHOUT_RATE_LABEL}", self.without_rate)])
 
 
@@ -468,7 +468,7 @@ def fits_table(result: OrderCrossValidation) -> Table:
 
 
 def _fit_cell(fit: RunFit | None, run: str, other: str) -> Cell:
-    """Return the cell of the fit to one run on another, bold for a validation run; None without a fit."""
+    """Return the fit [%] on run `other` of a model fitted to `run` as a table cell, bold if the runs differ."""
     if fit is None:
         return None
     return percent(fit.fit(other)) if run == other else Markup("<strong>{}</strong>").format(percent(fit.fit(other)))

@@ -42,7 +42,7 @@ from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite,
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, compare_means, metrics
 
-#: Innovation lengths p of the paper, the smallest and the largest, and its number of block pulses.
+#: Innovation lengths p of the paper, their minimum and maximum, and the paper's number of block pulses.
 INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS
 FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 PULSE_COUNT = 2048

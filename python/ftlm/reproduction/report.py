@@ -87,8 +87,8 @@ def fit_chart(
 ) -> LineChart:
     """Return a chart of a measured (or reference) angle and its simulations by the models (label, comparison).
 
-    Simulated values far outside the range of the reference are omitted, and the caption reports this. `reference` is
-    the label of its line.
+    Simulated values far outside the range of this angle are omitted, and the caption reports this. `reference` is the
+    label of its line.
     """
     first = models[0][1]
     measured, time = first.measured[output][0], pulse_times(first)
@@ -236,7 +236,7 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
 def flow_chart() -> Figure:
     """Return the flow chart of the method (Figure 2 of the paper), with drawings for wide and for narrow screens."""
     wide, narrow = (read_resource(f"flow_chart_{screen}.svg", "ftlm.reproduction") for screen in ("wide", "narrow"))
-    return StaticFigure("Figure 2. From the physics to the identified model", Markup(wide), Markup(narrow))  # own files
+    return StaticFigure("Figure 2. From the physics to the identified model", Markup(wide), Markup(narrow))  # safe
 
 
 def make_table(

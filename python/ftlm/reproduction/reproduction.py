@@ -87,7 +87,7 @@ class Reproduction:
 
     @property
     def reference_label(self) -> str:
-        """Label of the runs in charts: the simulated arm or the measurement."""
+        """Label of the lines of the runs in charts: "simulated arm" or "measured"."""
         return "simulated arm" if self.simulated else "measured"
 
     @property
@@ -297,10 +297,10 @@ def reproduce(
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """Result of one job, or the sum of several: cases for verdicts on one arm and joint.
+    """Result of one job on one arm and joint, or the sum of several: cases for verdicts, and further results.
 
-    For the main arm or measured runs, it also has all results of the joint, simulations of the printed models,
-    recomputed tables by angle, and notes. For other arms, it has only the cases.
+    Only jobs on the main arm or on measured runs have further results: all results of the joint, simulations of the
+    printed models, recomputed tables by angle, and notes.
     """
 
     cases: Cases = field(default_factory=Cases)

@@ -88,7 +88,7 @@ def parameters_of(stage: int) -> StageParameters:
 
 
 def free_orders(stage: int) -> dict[str, float]:
-    """Return the free orders of one joint of the demonstration's arm; that of the deflection's equation is fixed."""
+    """Return the orders of one joint of the demonstration's arm, without the fixed order of the deflection."""
     return {n: v for n, v in parameters_of(stage).orders(stage).items() if n != f"alpha{2 * stage}"}
 
 

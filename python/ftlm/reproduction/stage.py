@@ -525,18 +525,18 @@ def cases_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of all steps, with those in which the full reproduction and the short demonstration differ."""
+    """Settings of all steps, which differ between the full reproduction and the short demonstration."""
 
     order_grid: OrderGrid
-    top: int | None = None  # rows of each order search, followed by an identification; None for a search alone
+    top: int | None = None  # table rows of an order search with identification; None for no identification
     trace_every: int = TRACE_EVERY  # recursion steps between two points of a convergence curve
-    rivals_increment: float | None = CONTEST_STEP  # minimum increment of the optimizer comparison; None for none
+    rivals_increment: float | None = CONTEST_STEP  # minimum order increment of the comparison; None for no comparison
     genetic: GeneticAlgorithm | None = None  # settings of the optimizer comparison; None for default settings
     threads: int | None = None
 
     @property
     def rivals_order_grid(self) -> OrderGrid | None:
-        """Order grid of the optimizer comparison; None without one."""
+        """Order grid of the optimizer comparison; None for no comparison."""
         if self.rivals_increment is None:
             return None
         return OrderGrid(increment=max(self.order_grid.increment, self.rivals_increment), alpha=RIVAL_ALPHA)
@@ -578,9 +578,9 @@ def simulated_cases(
 class StageWork:
     """Computation of all results of one joint (stage) of the arm.
 
-    `square` and `sine` are the runs of both joints for estimation and for validation; the latter may be None. `log` is
-    called with a line of text at each step. If `simulated`, the runs are simulated from rest, so that initial
-    conditions are known. `notes` collect texts on omitted or modified results.
+    `square` is the estimation run of both joints, and `sine` the validation run or None. `log` is called with a line of
+    text at each step. If `simulated` is True, the runs are simulated from rest, so that initial conditions are known.
+    `notes` collects texts on omitted or modified results.
     """
 
     number: StageNumber

@@ -49,7 +49,7 @@ class PartialRecording:
     ----------
     target
         Path of the final file, from which the path of this file is derived. With None nothing is written to disk.
-    name, step, about
+    name, step, details
         Name, sampling interval [s] and metadata of the run.
     extra_columns
         Names of additional inputs, which follow the columns of the rig.
@@ -563,8 +563,8 @@ class _Recorder:
     """Recorder that runs the commands of a source on a rig, and stores the samples in memory and in a file.
 
     `columns` are the indices of the rig's columns for the signals of `live`. `block` is the number of samples that are
-    written to the file together. `samples` are all recorded samples. `live_error` is the message of the error that
-    ended the recursive identification `live`, or None.
+    written to the file together. `sample_blocks` are arrays of all recorded samples. `live_error` is the message of the
+    error that ended the recursive identification `live`, or None.
     """
 
     partial: PartialRecording
@@ -574,9 +574,9 @@ class _Recorder:
     columns: list[int]
     block: int
     live_error: str | None = None
-    samples: list[Floats] = field(default_factory=list)
-    #: Number of entries of `samples` that were written to the file, and number of their samples.
-    blocks: int = 0
+    sample_blocks: list[Floats] = field(default_factory=list)
+    #: Number of arrays in `sample_blocks` that were written to the file, and total number of their rows.
+    written_blocks: int = 0
     row_count: int = 0
 
     def follow(self, rig: Rig) -> None:
@@ -589,7 +589,7 @@ class _Recorder:
                 finally:
                     rows = self.collect(rig)
                 rig.signals.deliver()
-                if sum(map(len, self.samples[self.blocks :])) >= self.block:
+                if sum(map(len, self.sample_blocks[self.written_blocks :])) >= self.block:
                     self.flush()
                 commands = self.source.next_commands(rows)
         finally:
@@ -600,12 +600,12 @@ class _Recorder:
 
         Signals are deferred during the call, so that no sample is lost.
         """
-        self.samples.append(rig.take())
-        return self.samples[-1]
+        self.sample_blocks.append(rig.take())
+        return self.sample_blocks[-1]
 
     def flush(self) -> None:
         """Pass stored samples that are not in the file yet to the file, to `live`, and to the progress callback."""
-        pending, self.blocks = self.samples[self.blocks :], len(self.samples)
+        pending, self.written_blocks = self.sample_blocks[self.written_blocks :], len(self.sample_blocks)
         rows = self._columns(pending, self.row_count)
         if not len(rows):
             return
@@ -630,9 +630,9 @@ class _Recorder:
         return np.hstack([rows, *extra_values])
 
     def finish(self, name: str, details: dict[str, Any], faults: list[str], step: float) -> Run | None:
-        """Return the recorded run with its name, `details` and faults; None if it has fewer than three samples."""
+        """Return the recorded run with `details` and `faults`; None if it has fewer than three samples."""
         extra_names = tuple(self.source.extra_signals)
-        rows = self._columns(self.samples, 0)
+        rows = self._columns(self.sample_blocks, 0)
         if len(rows) < 3:
             return None
         data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *extra_names))}

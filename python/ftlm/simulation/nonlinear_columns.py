@@ -106,9 +106,9 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
 def differentiate(means: Floats, order: float, step: float, *, local_smoothing: bool) -> Floats:
     """Return the fractional derivative of a signal from its m block-pulse means, to second order in the `step` [s].
 
-    The signal is assumed to be zero before its record. With the backward shift q, the Grünwald-Letnikov weights (1 -
-    q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of order/2 steps. With `local_smoothing`,
-    the means are smoothed first. The cost is O(m log m).
+    The signal is assumed to be zero before its record. With the backward shift q, the Grünwald-Letnikov weights
+    (1 - q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of order/2 steps. With
+    `local_smoothing`, the means are smoothed first. The cost is O(m log m).
     """
     values = smooth_locally(means) if local_smoothing else means
     m = values.size

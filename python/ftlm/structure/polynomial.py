@@ -1,11 +1,11 @@
-"""Sums of terms coefficient * s^power with real powers, as dictionaries of coefficients by power."""
+"""Polynomials in s with real powers, as dictionaries of coefficients by power."""
 
 from __future__ import annotations
 
 import itertools
 from typing import TypeAlias
 
-#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
+#: Polynomial in s with real powers, as a dictionary of coefficients by power.
 Polynomial: TypeAlias = dict[float, float]
 #: Difference below which two powers of s count as equal.
 POWER_TOLERANCE = 1e-9

@@ -230,8 +230,8 @@ class AutomaticSelection:
     def _fit(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm] = ()) -> list[FittedForm]:
         """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial.
 
-        A form with friction starts from the best of the similar `fits`, because automatic initial guesses of friction
-        cost much. All other forms start from automatic initial guesses.
+        A form with friction starts from the best of `fits` with the same order and kind of friction, because a fit of
+        friction from automatic initial guesses is slow. All other forms start from automatic guesses.
         """
         items = []
         for form in dict.fromkeys(forms):
@@ -390,10 +390,10 @@ class AutomaticSelection:
         return fits
 
     def _is_friction_likely(self, form: IntegerOrderForm) -> bool:
-        """Whether a friction force, known from a fit of the form without friction, is a significant further input.
+        """Whether friction, computed from the simulation without friction, is significant as an additional input.
 
-        The force opposes the simulated motion. It is significant if it lowers BIC and its coefficient has the sign of
-        friction. Both fits are linear, so that they cost much less than a fit with friction. Also True if a fit fails.
+        The input is significant if it lowers BIC and its coefficient has the sign of friction. Both fits, with and
+        without this input, are linear, so they are faster than a fit with friction. The result is True if a fit fails.
         """
         problem, linear = self.problem, replace(form, friction="none")
         try:

@@ -240,7 +240,7 @@ def _decimation(runs: Sequence[Run]) -> int:
 def score_subsets(base: BaseModel, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
     """Return the subsets of the columns of a base model, with their scores on validation data.
 
-    The coefficients of output terms are those on a grid that is refined around the best ones.
+    The coefficients of output terms are on a grid, which is refined around its best points.
     """
     problem = FreeProblem.of(base.structure)
     objective = Objective(problem, base.runs, [1.0], decimation=_decimation(base.runs))
@@ -370,8 +370,8 @@ class SubsetScorer:
     def score_subset(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> SubsetScore:
         """Return the score of a subset on validation runs.
 
-        It is fitted on the estimation runs of each fold, at the best grid point of the fold. `products` are
-        :attr:`Products.values`, and `pooled` are their sums over the estimation runs of each fold.
+        The subset is fitted on the estimation runs of each fold, at the best grid point of the fold. `products` are the
+        Gram matrices of :meth:`score_all`, and `pooled` are their sums over the estimation runs of each fold.
         """
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]
@@ -393,8 +393,8 @@ class SubsetScorer:
     def score_all(self, products: Floats) -> dict[tuple[int, ...], SubsetScore]:
         """Return the scores of all subsets from Gram matrices, shape (grid points, runs, columns + 1, columns + 1).
 
-        The matrices have the responses to the columns, and last the residual of the model without inputs. If there are
-        too many subsets, they are extended column by column from the best ones of each size, and the remaining ones are
+        A Gram matrix has the inner products of the responses to the columns and, last, of the residual without inputs.
+        If there are too many subsets, the best subsets of each size are extended column by column, and the others are
         not scored.
         """
         pooled = np.stack([products[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)

@@ -243,8 +243,8 @@ class Store:
     ) -> Result:
         """Return the result of a step from the file, or compute it and store it there.
 
-        `write` and `convert` convert a result to and from its stored form. A result for which `write` returns None is
-        not stored.
+        `write` returns the stored form of a result, and `convert` the result from its stored form. If `write` returns
+        None, the result is not stored.
         """
         key = _digest(request)
         with self._lock:

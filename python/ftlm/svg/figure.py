@@ -239,7 +239,7 @@ def ticks(low: float, high: float, maximum: int = 6) -> Ticks:
     low, high
         Ends of the interval, low < high.
     maximum
-        Approximate number of ticks; at least two are returned.
+        Approximate maximum number of ticks; at least two are returned.
     """
     raw_step = (high - low) / max(maximum, 1)
     exponent = math.floor(math.log10(raw_step))

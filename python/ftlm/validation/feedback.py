@@ -269,7 +269,7 @@ def _line_regressors(u: Floats) -> list[Floats]:
 
 
 def _ridge_gram(weighted: Floats, regressors: Floats) -> Floats:
-    """Return the normal matrix ``weighted.T @ past`` of a weighted regression on `regressors`, plus a small ridge."""
+    """Return the normal matrix ``weighted.T @ regressors`` of a weighted regression, plus a small ridge."""
     gram: Floats = weighted.T @ regressors
     gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
     return gram
@@ -323,7 +323,7 @@ def _local_autocorrelation(w: Floats) -> float:
 
 
 def _local_explained_fraction(w: Floats, regressors: Floats) -> float:
-    """Return the fraction of `w` that `regressors` explain in short blocks, over its limit for independent series."""
+    """Return the mean fraction of `w` that `regressors` explain in short blocks, divided by its limit by chance."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
