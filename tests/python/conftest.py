@@ -19,10 +19,10 @@ from ftlm.estimation.extensions import ExtensionTests
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
 
-#: What Windows lacks, and the files of tests that need it.
+#: What Windows lacks, and the imports of tests that have never run there.
 POSIX_ONLY = re.compile(
     r"fcntl|import (pty|resource)|os\.fork|os\.kill|SIG(KILL|INT|TERM|HUP)|mkfifo|preexec_fn|/(proc|dev)/|"
-    r"from test_(cli|store|rig_safety) "
+    r"from (test_cli|app_page|rig_bench|stored_searches) "
 )
 if os.name == "nt":
     collect_ignore = [

@@ -7,8 +7,9 @@ import ftlm
 from ftlm.order_search.result import search_summary
 from ftlm.order_search.search import rank_orders
 from ftlm.utils.formatting import number
+from small_lattice import EQUATION
+from stored_searches import bytes_of
 from stores import keep_share
-from test_store import EQUATION, bytes_of
 
 #: From this many candidates on boxes screen.
 BOXED = 1 << 25

@@ -14,7 +14,7 @@ from ftlm.rig import recording
 from ftlm.rig import rig as rig_module
 from ftlm.rig.quanser import QuanserBoard
 from quanser_stand_in import Board
-from test_rig_safety import Bench
+from rig_bench import Bench
 
 HOLD = (0.1, 0.05)
 
