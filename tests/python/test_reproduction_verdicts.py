@@ -315,7 +315,7 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         simulated_cases(1, "whole orders", [1], 0.0, preset, silent_progress())
     work = StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress())
     assert work.compare_optimizers() == {}
-    assert replace(preset, rivals_increment=0.01).rivals_order_grid.increment == step
+    assert replace(preset, rivals_increment=0.01).comparison_order_grid.increment == step
     assert given[0] == given[1] == (ftlm.OrderGrid(increment=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 

@@ -346,16 +346,16 @@ def _filter_output(
     `output` is the index of the output. `numerator` and `denominator` are the coefficients of the filter in descending
     powers, and have the same length.
     """
-    count, filter_states = denominator.size - 1, a.shape[0]
+    count, system_states = denominator.size - 1, a.shape[0]
     numerator, denominator = numerator / denominator[0], denominator / denominator[0]
     shift = np.eye(count, k=1)
     shift[:, :1] -= denominator[1:, None]
     fed = (numerator[1:] - denominator[1:] * numerator[0])[:, None]
-    a = np.block([[a, np.zeros((filter_states, count))], [fed @ c[output : output + 1], shift]])
+    a = np.block([[a, np.zeros((system_states, count))], [fed @ c[output : output + 1], shift]])
     b = np.vstack([b, fed @ d[output : output + 1]])
     c = np.hstack([c, np.zeros((c.shape[0], count))])
     c[output], d[output] = numerator[0] * c[output], numerator[0] * d[output]
-    c[output, filter_states : filter_states + 1] += 1.0
+    c[output, system_states : system_states + 1] += 1.0
     return a, b, c, d
 
 
@@ -526,7 +526,7 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
     scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
     fractions = []
     for i, row in enumerate(c):
-        tops = []
+        numerators = []
         for j in range(b.shape[1]):
             numerator = d[i, j] * np.array(denominator)
             numerator[1:] += [float(row @ p @ b[:, j]) for p in powers[:count]]
@@ -535,8 +535,8 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
                 markov_magnitudes = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
                 rows = [k for k, v in enumerate(markov_magnitudes) if v > MARKOV_TOLERANCE * row_scale * scale**k]
                 numerator[: 1 + (rows[0] if rows else count)] = 0.0
-            tops.append(numerator)
-        fractions.append((np.array(denominator), tops))
+            numerators.append(numerator)
+        fractions.append((np.array(denominator), numerators))
     return fractions
 
 

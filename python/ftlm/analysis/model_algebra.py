@@ -190,15 +190,15 @@ def series(first: Model, second: Model) -> Model:
     return Ratio(numerator, denominator, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
-def combine(operator: str, left: Model | float, right: Model | float, what: str | None = None) -> Model:
+def combine(operator: str, left: Model | float, right: Model | float, operation: str | None = None) -> Model:
     """Return the product, sum, difference or quotient of two models, or of a model and a number, as one model.
 
-    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``. Messages name `what`, by default the operator. In a product,
-    `right` acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
+    `operator` is ``"*"``, ``"+"``, ``"-"`` or ``"/"``. Messages name `operation`, by default the operator. In a
+    product, `right` acts first, as in python-control. Raise ModelError in the cases of :meth:`ftlm.Model.series`,
     :meth:`ftlm.Model.parallel` and :meth:`ftlm.Model.inverse`.
     """
     (a, output, _), (b, _, signal) = (
-        _operand(operand, what or f"the operator {operator}") for operand in (left, right)
+        _operand(operand, operation or f"the operator {operator}") for operand in (left, right)
     )
     if operator in "+-" and a.delay != b.delay:
         raise ModelError(

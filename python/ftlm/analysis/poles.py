@@ -484,19 +484,20 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     return tuple(sorted(result, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
 
-def _mode(w: complex, deviation: tuple[float, float, float] | None) -> Mode:
+def _mode(w: complex, deviations: tuple[float, float, float] | None) -> Mode:
     """Return the mode of a zero s of the characteristic function, given as w = ln s.
 
-    `deviation` contains the standard deviations of Re w, Im w and ln abs(Re s); None without a covariance.
+    `deviations` contains the standard deviations of Re w, Im w and ln abs(Re s); None without a covariance.
     """
     magnitude, angle = math.exp(w.real), w.imag
     # A poorly determined pole may be far from the real axis although its interval includes it, so the limit is fixed.
     half_width = min(
-        NORMAL_95 * (0.0 if deviation is None or not math.isfinite(deviation[1]) else deviation[1]), REAL_AXIS_ANGLE_RAD
+        NORMAL_95 * (0.0 if deviations is None or not math.isfinite(deviations[1]) else deviations[1]),
+        REAL_AXIS_ANGLE_RAD,
     )
     if angle >= math.pi - max(half_width, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
         sign = 1.0 if angle <= DISTINCT_ZERO_TOLERANCE else -1.0
-        error = None if deviation is None else deviation[0]
+        error = None if deviations is None else deviations[0]
         scaled = (None, None) if error is None else (magnitude * error, error / magnitude)
         return Mode(complex(sign * magnitude), magnitude, -sign, 1.0 / magnitude, False, scaled[0], None, scaled[1])
     decay_rate, damping = abs(magnitude * math.cos(angle)), -math.cos(angle)
@@ -504,9 +505,9 @@ def _mode(w: complex, deviation: tuple[float, float, float] | None) -> Mode:
         decay_rate, damping = 0.0, 0.0
     pole = magnitude * complex(math.cos(angle), math.sin(angle))
     constant = 1.0 / decay_rate if decay_rate > 0 else math.inf
-    if deviation is None:
+    if deviations is None:
         return Mode(pole, magnitude, damping, constant, True)
-    radial, frequency_deviation, damping_deviation = deviation
+    radial, frequency_deviation, damping_deviation = deviations
     return Mode(
         pole,
         magnitude,

@@ -402,17 +402,18 @@ def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 @contextlib.contextmanager
-def resumable(path: str | None, hint: str | None = None) -> Iterator[None]:
+def resumable(path: str | None, resume_command: str | None = None) -> Iterator[None]:
     """Context manager that prints on Ctrl-C how to resume from the checkpoint file `path`.
 
-    `hint` is the command to print; by default ``ftlm resume PATH``. Without a checkpoint file, Ctrl-C is not handled.
+    `resume_command` is the command to print; by default ``ftlm resume PATH``. Without a checkpoint file, Ctrl-C is not
+    handled.
     """
     try:
         yield
     except KeyboardInterrupt:
         if path is None or not Path(path).exists():
             raise
-        print(f"ftlm: interrupted; go on with: {hint or f'ftlm resume {path}'}", file=sys.stderr)
+        print(f"ftlm: interrupted; go on with: {resume_command or f'ftlm resume {path}'}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 

@@ -16,7 +16,7 @@ from ftlm.reproduction.cross_validation import cross_validate_orders, cross_vali
 from ftlm.reproduction.demo import demo_details, demo_page, demo_text, run_demo
 from ftlm.reproduction.report import reproduction_text
 from ftlm.reproduction.reproduction import ALWAYS_SAVED
-from ftlm.reproduction.workload import CONTEST_STEP
+from ftlm.reproduction.workload import COMPARISON_INCREMENT
 from ftlm.utils.files import check_folder
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_threads
@@ -85,7 +85,7 @@ def reproduce(
     seed: NonNegative = 1,
     arms: list[str] | None = None,
     records: Positive = 3,
-    rivals_increment: float = CONTEST_STEP,
+    rivals_increment: float = COMPARISON_INCREMENT,
     genetic: GeneticOptions,
     threads: int | None = None,
     force: bool = False,

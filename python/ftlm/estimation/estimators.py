@@ -80,9 +80,9 @@ def fit_with_instruments(
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         iterate, slopes, instruments = evaluation
         residuals = np.asarray(iterate.outcome["residuals"])
-        gradient_inverse = np.linalg.pinv(instruments @ slopes.T)
-        step = -gradient_inverse @ (instruments @ residuals)
-        errors = np.sqrt(np.diag(_covariance(data_objective, iterate, gradient_inverse @ instruments)))
+        jacobian_inverse = np.linalg.pinv(instruments @ slopes.T)
+        step = -jacobian_inverse @ (instruments @ residuals)
+        errors = np.sqrt(np.diag(_covariance(data_objective, iterate, jacobian_inverse @ instruments)))
         if np.all(np.abs(step) <= STEP_TOLERANCE_ERRORS * errors):
             converged = True
             break
@@ -109,7 +109,7 @@ def fit_with_instruments(
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)),
         covariance=covariance,
-        noise={o: current_norm / w for (o, current_norm), w in zip(levels.items(), weights, strict=True)},
+        noise={o: level / w for (o, level), w in zip(levels.items(), weights, strict=True)},
         cost=float(iterate.outcome["cost"]),
         residuals=data_objective.residuals(iterate),
         refinement=pulses_per_sample,
@@ -189,15 +189,15 @@ def estimate_output_error(
     intervals: Intervals = "auto",
     begin: Model | Mapping[str, float] | None = None,
     additional_values: Mapping[str, float] | None = None,
-    alone: bool = False,
+    single_start: bool = False,
     joint_fit: JointFit | None = None,
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
     `noise_free_runs` are the runs with each input replaced by the part that a reference explains. If given, they serve
     as instruments. `begin` is an additional initial guess. If it is a model, `additional_values` adds values of
-    parameters that the model lacks. If `alone` is True, no other initial guess is used. `joint_fit` is a joint fit of
-    the same task, if one was computed before.
+    parameters that the model lacks. If `single_start` is True, no other initial guess is used. `joint_fit` is a joint
+    fit of the same task, if one was computed before.
     """
     # An order with a single grid value is fixed.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -220,7 +220,7 @@ def estimate_output_error(
         progress=tracker.subtask(0.7, 0.9),
         loss=loss,
         guesses=additional_guesses,
-        single_start=alone,
+        single_start=single_start,
     )
     tracker.advance_to(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))

@@ -338,10 +338,10 @@ class OutputError:
                         "quadratic",
                         guess_or_start,
                         start_values,
-                        alone=single_start,
+                        single_start=single_start,
                     ),
                     lambda white, joint: estimate_output_error(
-                        white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, alone=True
+                        white, m, workers, None, None, self.loss, "quadratic", joint.values_by_name, single_start=True
                     ),
                 )
             else:

@@ -144,19 +144,19 @@ def second_optimum_findings(
     for optimum_values, likelihood_decrease, optimum_errors in sorted(optima, key=lambda optimum: optimum[1]):
         if likelihood_decrease > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
-        differences_text = [
+        difference_texts = [
             f"{n} = {other_value:.4g} for {value:.4g}"
             for n, value, other_value in zip(names, values.tolist(), optimum_values.tolist(), strict=True)
             if math.isfinite(errors[n])
             and abs(other_value - value) > SECOND_OPTIMUM_ERRORS * max(errors[n], optimum_errors[n])
         ]
-        if differences_text:
-            differences = ", ".join(text.partition(" = ")[0] for text in differences_text)
+        if difference_texts:
+            names_text = ", ".join(text.partition(" = ")[0] for text in difference_texts)
             return [
                 make_finding(
                     "second_optimum",
-                    parameter=differences,
-                    shown=", ".join(differences_text),
+                    parameter=names_text,
+                    shown=", ".join(difference_texts),
                     difference=max(likelihood_decrease, 0.0),
                 )
             ]
@@ -221,10 +221,10 @@ def _other_optima(objective: Objective, optimum: Floats, starts: Sequence[Floats
     try:
         _, cost, residuals = fit(optimum)
         for start in starts:
-            values, reference_cost, series = fit(start)
+            values, other_cost, series = fit(start)
             is_other = float(np.sum((series - residuals) ** 2)) > SAME_MODEL_POWER
-            if is_other and reference_cost - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
-                optima.append((values, reference_cost - cost))
+            if is_other and other_cost - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
+                optima.append((values, other_cost - cost))
     except FtlmError:
         # The path between the optima has no finite simulation.
         return []

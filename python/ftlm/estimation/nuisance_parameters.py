@@ -229,12 +229,12 @@ def offset_test(
     by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
     statistic = _core.prediction_ratio(nested_regressors, extended_regressors, residuals, by_output, DEFAULT_LAGS)
     offset_effect = basis_part @ components
-    deviations = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
+    output_deviations = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in objective.weights]
     output_blocks = [block for run_blocks in blocks for block in run_blocks]
     relative_size = max(
         math.sqrt(float(np.mean(offset_effect[a:b] ** 2))) / (w * s) if w * s > 0 else 0.0
-        for (a, b), w, s in zip(output_blocks, weights, deviations, strict=True)
+        for (a, b), w, s in zip(output_blocks, weights, output_deviations, strict=True)
     )
     return OffsetTest(statistic, count, float(components @ components) / residual_power, relative_size)
 
@@ -643,9 +643,13 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
 def _fit_needs_history(caputo_fit: JointFit, history_fit: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether residuals of `caputo_fit` are significantly larger than those of `history_fit`."""
     caputo_residuals, history_residuals = _pooled_residuals(caputo_fit), _pooled_residuals(history_fit)
-    sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
+    output_deviations = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
     return needs_history(
-        structure, caputo_residuals, history_residuals, sizes, (caputo_fit.initial_terms, history_fit.initial_terms)
+        structure,
+        caputo_residuals,
+        history_residuals,
+        output_deviations,
+        (caputo_fit.initial_terms, history_fit.initial_terms),
     )
 
 

@@ -227,13 +227,15 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
     return _core.covariance_of(jacobian, series, squares)
 
 
-def propagated_errors(slopes: Floats, covariance: Floats) -> Floats:
+def propagated_errors(slopes: Floats, parameter_covariance: Floats) -> Floats:
     """Return standard errors of functions of the parameters, to first order.
 
-    `slopes` are the derivatives (functions, parameters), and `covariance` is that of the parameters. The error is
-    infinite if a function depends on a parameter of infinite variance.
+    `slopes` are the derivatives (functions, parameters), and `parameter_covariance` is that of the parameters. The
+    error is infinite if a function depends on a parameter of infinite variance.
     """
-    unidentifiable = np.isinf(np.diag(covariance))
+    unidentifiable = np.isinf(np.diag(parameter_covariance))
     columns = slopes[:, ~unidentifiable]
-    variance = np.einsum("ij,jk,ik->i", columns, covariance[np.ix_(~unidentifiable, ~unidentifiable)], columns)
+    variance = np.einsum(
+        "ij,jk,ik->i", columns, parameter_covariance[np.ix_(~unidentifiable, ~unidentifiable)], columns
+    )
     return np.where((slopes[:, unidentifiable] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))

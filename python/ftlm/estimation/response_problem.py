@@ -484,12 +484,12 @@ def _equation_coefficients(
     alpha = _orders(problem, equation.order.constant, equation.order.weights, points)
     columns: dict[str, list[Complex]] = {n: [] for n in names}
     output_columns: dict[str, list[Complex]] = {}
-    targets, below = [], []
+    targets, powers_by_record = [], []
     for record in records:
         log = np.log(1j * record.frequency)
         delay_factor = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
         powers = np.exp(alpha[:, None] * log)
-        below.append(powers)
+        powers_by_record.append(powers)
         target = powers * record.response
         for term in equation.terms:
             signal = _signal(problem, record, term.signal, delay_factor)
@@ -503,36 +503,36 @@ def _equation_coefficients(
                 fixed_coefficient = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
                 target = target - fixed_coefficient * power * signal
                 if term.signal == equation.output:
-                    below[-1] = below[-1] - fixed_coefficient * power
+                    powers_by_record[-1] = powers_by_record[-1] - fixed_coefficient * power
         targets.append(target)
     weight = np.concatenate([r.weight for r in records])
-    target, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
+    target, powers = np.concatenate(targets, axis=1), np.concatenate(powers_by_record, axis=1)
     matrix = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
     denominator_parts = {n: np.concatenate(parts, axis=1) for n, parts in output_columns.items()}
     slowest = _slowest_output_term(problem, equation, points)
-    bottom = 1.0 + np.abs(powers) + 0j
+    denominator = 1.0 + np.abs(powers) + 0j
     coefficients = np.zeros((len(points), len(names)))
     cost = np.full(len(points), np.inf)
     with np.errstate(all="ignore"):
         for _ in range(REWEIGHTING_ITERATIONS):
-            scaled = weight / np.abs(bottom)
+            scaled = weight / np.abs(denominator)
             if matrix is not None:
                 coefficients = _least_squares(matrix * scaled[..., None], target * scaled)
                 if slowest is not None:
                     k, power = names.index(slowest[0]), slowest[1]
                     is_finite = np.isfinite(corners)
-                    high_terms = -(corners[is_finite] ** power[is_finite])
-                    remainder = target[is_finite] - matrix[is_finite][:, :, k] * high_terms[:, None]
+                    fixed_values = -(corners[is_finite] ** power[is_finite])
+                    remainder = target[is_finite] - matrix[is_finite][:, :, k] * fixed_values[:, None]
                     other_columns = np.delete(matrix[is_finite], k, axis=2)
                     other_coefficients = _least_squares(
                         other_columns * scaled[is_finite][..., None], remainder * scaled[is_finite]
                     )
-                    coefficients[is_finite] = np.insert(other_coefficients, k, high_terms, axis=1)
-            bottom = powers - sum(
+                    coefficients[is_finite] = np.insert(other_coefficients, k, fixed_values, axis=1)
+            denominator = powers - sum(
                 (coefficients[:, [names.index(n)]] * part for n, part in denominator_parts.items()), 0.0 * powers
             )
             misfit = target if matrix is None else target - np.einsum("bnp,bp->bn", matrix, coefficients)
-            cost = np.sum(np.abs(misfit / bottom * weight) ** 2, axis=1)
+            cost = np.sum(np.abs(misfit / denominator * weight) ** 2, axis=1)
     return coefficients, cost
 
 
@@ -559,9 +559,9 @@ def _least_squares(matrix: Complex, target: Complex) -> Floats:
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
     scaled = np.nan_to_num(matrix / unit[:, None, :])
     normal = np.einsum("bnp,bnq->bpq", scaled.conj(), scaled).real
-    gradient = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(target)).real
+    right_side = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(target)).real
     inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
-    solution: Floats = np.einsum("bpq,bq->bp", inverse, gradient) / unit
+    solution: Floats = np.einsum("bpq,bq->bp", inverse, right_side) / unit
     return solution
 
 

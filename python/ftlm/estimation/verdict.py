@@ -121,9 +121,9 @@ class Validation(Comparison):
         return str(verdict_html(self.verdict)) + super()._repr_html_()
 
 
-def verdict_html(verdict_shown: Verdict) -> Markup:
+def verdict_html(shown_verdict: Verdict) -> Markup:
     """Return a verdict as an HTML paragraph."""
-    return Markup("<p><strong>{}</strong>: {}.</p>").format(verdict_shown.level.capitalize(), verdict_shown.sentence)
+    return Markup("<p><strong>{}</strong>: {}.</p>").format(shown_verdict.level.capitalize(), shown_verdict.sentence)
 
 
 def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:

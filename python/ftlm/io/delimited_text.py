@@ -204,7 +204,7 @@ def parse_text(
     head, sample, remark = _first_lines(blocks, layout, comment_mark)
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that contains a record")
-    dialect = find_table(sample, layout, source, has_own_header=header is not None, sheet=sheet is not None)
+    dialect = find_table(sample, layout, source, is_ftlm_file=header is not None, sheet=sheet is not None)
     dialect = _dialect_with_empty_rows(dialect, head, sample, layout, sheet=sheet is not None)
     rows = _Rows(dialect, sheet is not None)
     for first, lines in itertools.chain(head, blocks):

@@ -296,7 +296,7 @@ class _Line:
 
 
 def find_table(
-    lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, has_own_header: bool, sheet: bool
+    lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, is_ftlm_file: bool, sheet: bool
 ) -> TableDialect:
     """Return the layout and position of the table in the first lines of a text.
 
@@ -308,7 +308,7 @@ def find_table(
         Options given by the user; the others are detected.
     source
         Name of the file in error messages.
-    has_own_header
+    is_ftlm_file
         Whether ftlm wrote the file, so that it has commas, decimal points and one line of names.
     sheet
         Whether the lines are rows of a sheet, with tabs between cells.
@@ -318,7 +318,7 @@ def find_table(
     DataError
         If there is no row of numbers, or the layout is ambiguous.
     """
-    if has_own_header:
+    if is_ftlm_file:
         layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(
             layout_options
         )
@@ -337,7 +337,7 @@ def find_table(
         top = _first_row(table_lines, width)
     else:
         top = min(layout_options.header, len(table_lines))
-    names, units, top = _header(table_lines, top, width, layout_options, source, has_own_header=has_own_header)
+    names, units, top = _header(table_lines, top, width, layout_options, source, is_ftlm_file=is_ftlm_file)
     header = 0 if names is None else 1 if units is None else 2
     layout = Layout(
         separator=_WORDS_BY_SEPARATOR[separator],
@@ -350,7 +350,7 @@ def find_table(
     if layout_options.skip is None:
         _check_above(table_lines[: top - header], width, source, (comma, thousands_separator))
     if (
-        not has_own_header
+        not is_ftlm_file
         and names is None
         and top < len(table_lines)
         and table_lines[top].words
@@ -358,7 +358,7 @@ def find_table(
     ):
         # A first row with words and numbers may be a header.
         raise _mixed_line(table_lines[top], source)
-    if names is not None and not has_own_header and layout_options.separator is None:
+    if names is not None and not is_ftlm_file and layout_options.separator is None:
         _check_mixed(table_lines, top, separator, comma, source)
     first_line = table_lines[top].at if top < len(table_lines) else table_lines[-1].at + 1
     if names is not None:
@@ -528,7 +528,7 @@ def _has_unit(units: Sequence[str]) -> bool:
 
 
 def _header(
-    lines: list[_Line], top: int, width: int, layout: Layout, source: str, *, has_own_header: bool
+    lines: list[_Line], top: int, width: int, layout: Layout, source: str, *, is_ftlm_file: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
     """Return names, units and the index of the first row; names or units are None if the header lacks them.
 
@@ -554,7 +554,7 @@ def _header(
     if count is None:
         count = 0
         units_above = top > 1 and (_is_unit_line(lines[top - 1]) or _is_settings_line(lines, top - 1))
-        if top > 0 and (lines[top - 1].has_only_words or has_own_header or units_above):
+        if top > 0 and (lines[top - 1].has_only_words or is_ftlm_file or units_above):
             count = 1
             if units_above and len(fit_names(lines[top - 2])) == width and lines[top - 2].words:
                 count = 2
@@ -574,10 +574,10 @@ def _header(
         return None, None, top
     line = lines[top - count]
     names = fit_names(line)
-    if not has_own_header and count == 1 and line.count and layout.header is None:
+    if not is_ftlm_file and count == 1 and line.count and layout.header is None:
         raise _mixed_line(line, source)
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
-    if commas and not has_own_header and count == 1:
+    if commas and not is_ftlm_file and count == 1:
         raise DataError(
             f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is not a line of names; give "
             f"{layout_parameter(decimal='comma')}"
@@ -601,13 +601,13 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
             )
 
 
-def _check_above(preceding: list[_Line], width: int, source: str, number_marks: tuple[bool, str | None]) -> None:
+def _check_above(preceding: list[_Line], width: int, source: str, number_format: tuple[bool, str | None]) -> None:
     """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped.
 
-    `number_marks` is (whether the decimal mark is a comma, name of the thousands separator). `width` is the number of
+    `number_format` is (whether the decimal mark is a comma, name of the thousands separator). `width` is the number of
     cells per row of the table, for the message.
     """
-    comma, thousands_separator = number_marks
+    comma, thousands_separator = number_format
     rows = [
         line
         for line in preceding

@@ -73,15 +73,15 @@ MAX_RESPONSE_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
-def verdict_box(verdict_shown: Verdict, subject: str = "") -> Markup:
+def verdict_box(shown_verdict: Verdict, subject: str = "") -> Markup:
     """Return a verdict as an HTML box for the top of a page; the prefix `subject` names one of several models."""
     remedy = (
-        Markup(' <span class="todo">→ {}</span>').format(typeset(verdict_shown.remedy)) if verdict_shown.remedy else ""
+        Markup(' <span class="todo">→ {}</span>').format(typeset(shown_verdict.remedy)) if shown_verdict.remedy else ""
     )
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LEVEL_CSS_CLASSES[verdict_shown.level],
-        f"{subject}{verdict_shown.level}" if subject else verdict_shown.level.capitalize(),
-        typeset(verdict_shown.reason),
+        _LEVEL_CSS_CLASSES[shown_verdict.level],
+        f"{subject}{shown_verdict.level}" if subject else shown_verdict.level.capitalize(),
+        typeset(shown_verdict.reason),
         remedy,
     )
 

@@ -323,7 +323,7 @@ class _AngleRegression:
             self._transforms[key] = series, haar_transform(series)
         return self._transforms[key]
 
-    def places(self, terms: str) -> list[str]:
+    def term_signals(self, terms: str) -> list[str]:
         """Return the signal ("own", "other" or "u") in each of the terms with coefficients a, b, d and g.
 
         `terms` is a key of `TERM_INTERPRETATIONS`.
@@ -338,7 +338,7 @@ class _AngleRegression:
         """
         alpha = orders["alpha"]
         etas = [*(alpha - orders[n] for n in TERM_INTERPRETATIONS[terms]["orders"]), alpha]
-        time, haar = zip(*map(self.integral, self.places(terms), etas), strict=True)
+        time, haar = zip(*map(self.integral, self.term_signals(terms), etas), strict=True)
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
     def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
@@ -422,7 +422,7 @@ def _closest_recomputation(output: str, angles: Sequence[_AngleRegression], scal
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
         solved = {p: angle.solve_coefficients(haar, priors, p) for p in INNOVATION_LENGTHS}
-        own_terms = np.array([place == "own" for place in angle.places(terms)])
+        own_terms = np.array([signal == "own" for signal in angle.term_signals(terms)])
         for k, prior in enumerate(priors):
             errors = {p: metrics(angle.y, time @ x[k]) for p, x in solved.items()}
             for flipped in (False, True):

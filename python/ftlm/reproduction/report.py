@@ -83,18 +83,22 @@ def angle_chart(
 
 
 def fit_chart(
-    models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", reference: str = "measured"
+    models: Sequence[tuple[str, Comparison]],
+    output: str,
+    title: str,
+    caption: str = "",
+    reference_label: str = "measured",
 ) -> LineChart:
     """Return a chart of a measured (or reference) angle and its simulations by the models (label, comparison).
 
-    Simulated values far outside the range of this angle are omitted, and the caption reports this. `reference` is the
-    label of its line.
+    Simulated values far outside the range of this angle are omitted, and the caption reports this. `reference_label` is
+    the label of its line.
     """
     first = models[0][1]
     measured, time = first.measured[output][0], pulse_times(first)
     middle = float(np.mean(measured))
     limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
-    lines, remarks = [(reference, measured)], []
+    lines, remarks = [(reference_label, measured)], []
     for label, comparison in models:
         response = comparison.simulated[output][0]
         with np.errstate(invalid="ignore"):
@@ -161,13 +165,14 @@ def derivative_chart(derived: DroppedDerivative, reference: str = "simulated arm
 
 
 def _fits_chart(
-    models: Mapping[str, Candidate], output: str, place: str, reference: str, *, sine: bool
+    models: Mapping[str, Candidate], output: str, place: str, reference: str, *, on_validation_run: bool
 ) -> list[Figure]:
     """Return a list with one chart of an angle simulated by several models on one run; empty if the run is absent.
 
-    The run is the validation run (`sine`) or the estimation run. `place` is the number of the paper's figure.
+    The run is the validation run (`on_validation_run`) or the estimation run. `place` is the number of the paper's
+    figure.
     """
-    compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
+    compared = {label: c.validation if on_validation_run else c.estimation for label, c in models.items()}
     present = [(label, c) for label, c in compared.items() if c is not None]
     if not present:
         return []
@@ -175,7 +180,7 @@ def _fits_chart(
     caption = f"Fit: {fits}."
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
         caption += f" {page_text('filtered_rows')}"
-    title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
+    title = f"Figure {place}. {symbol(output)}, {'sine' if on_validation_run else 'square'} input"
     return [fit_chart(present, output, title, caption, reference)]
 
 
@@ -202,7 +207,7 @@ def stage_figures(stage: Stage, reference: str) -> list[Figure]:
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
         number = f"{first + 2}({letter})"
-        figures += _fits_chart(_comparison_models(stage), output, number, reference, sine=False)
+        figures += _fits_chart(_comparison_models(stage), output, number, reference, on_validation_run=False)
     return figures
 
 
@@ -215,11 +220,11 @@ def sine_figures(reproduction: Reproduction) -> list[Figure]:
     figures = []
     for stage, output in reproduction.angles:
         models, place = _comparison_models(stage), _place(10, output)
-        figures += _fits_chart(models, output, place, reproduction.reference_label, sine=True)
+        figures += _fits_chart(models, output, place, reproduction.reference_label, on_validation_run=True)
     return figures
 
 
-def rival_figures(reproduction: Reproduction) -> list[Figure]:
+def optimizer_comparison_figures(reproduction: Reproduction) -> list[Figure]:
     """Return the charts that correspond to Figure 11 of the paper: multi-innovation and the genetic algorithm.
 
     They show the validation run if there is one, otherwise the estimation run.
@@ -228,8 +233,10 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
     figures = []
     for output, comparison in reproduction.optimizer_comparisons.items():
         models = {names.get(n, n): c for n, c in comparison.models.items() if n != "differential evolution"}
-        sine = comparison.models["genetic"].validation is not None
-        figures += _fits_chart(models, output, _place(11, output), reproduction.reference_label, sine=sine)
+        has_validation = comparison.models["genetic"].validation is not None
+        figures += _fits_chart(
+            models, output, _place(11, output), reproduction.reference_label, on_validation_run=has_validation
+        )
     return figures
 
 
@@ -449,7 +456,7 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
     return [
         make_table("genetic", best),
-        make_table("optimizers", {o: errors(o) for o in comparisons}, alpha=stage_module.RIVAL_ALPHA),
+        make_table("optimizers", {o: errors(o) for o in comparisons}, alpha=stage_module.COMPARISON_ALPHA),
         make_table("seeds", {o: errors_by_seed(o) for o in comparisons}, {"@seeds": [f"seed {s}" for s in seeds]}),
     ]
 
@@ -570,7 +577,7 @@ def _sections(reproduction: Reproduction) -> list[Section]:
     for s in stages:
         title = page_text("printed_orders", angle=symbol(s.outputs[1]), table=3 + s.number)
         models = [("printed orders", s.printed_orders.estimation)]
-        near.append(fit_chart(models, s.outputs[1], title, reference=reference))
+        near.append(fit_chart(models, s.outputs[1], title, reference_label=reference))
         for output, traces in s.weak_traces.items():
             weak.append(convergence_chart(traces, f"{symbol(output)}: error (45), weak prior"))
         derived.append(derivative_chart(s.derived, reference))
@@ -598,7 +605,9 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         sections.append(make_section("sine", figures=sine_figures(reproduction)))
     if reproduction.optimizer_comparisons:
         tables = optimizer_tables(reproduction)
-        sections.append(make_section("optimizers", figures=rival_figures(reproduction), folded_tables=tables))
+        sections.append(
+            make_section("optimizers", figures=optimizer_comparison_figures(reproduction), folded_tables=tables)
+        )
     return [
         *sections,
         make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(reproduction)]),

@@ -24,7 +24,7 @@ from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_pr
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
 from ftlm.reproduction.stage import Cases, OptimizerComparison, Preset, Stage, StageWork
-from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of_all
+from ftlm.reproduction.workload import COMPARISON_INCREMENT, TotalProgress, WorkerProgress, seconds_of_all
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
 from ftlm.utils.parameters import Placeholder, parameter, setting
@@ -187,7 +187,7 @@ def reproduce(
     noise: float = 1e-4,
     seed: int = 1,
     genetic: GeneticAlgorithm | None = None,
-    rivals_increment: float = CONTEST_STEP,
+    rivals_increment: float = COMPARISON_INCREMENT,
     arms: Sequence[str] | None = None,
     records: int = 3,
     threads: int | None = None,
@@ -292,7 +292,9 @@ def reproduce(
     for outcome in run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress):
         whole += outcome
     notes = tuple(dict.fromkeys(whole.notes))
-    return Reproduction(square, sine, simulated, whole.stages, grid, notes, whole.cases, whole.rows, whole.printed)
+    return Reproduction(
+        square, sine, simulated, whole.stages, grid, notes, whole.cases, whole.printed_model_runs, whole.as_printed
+    )
 
 
 @dataclass(frozen=True)
@@ -305,13 +307,19 @@ class StageOutcome:
 
     cases: Cases = field(default_factory=Cases)
     stages: dict[int, Stage] = field(default_factory=dict)
-    rows: tuple[PrintedModelRun, ...] = ()
-    printed: dict[str, AsPrinted] = field(default_factory=dict)
+    printed_model_runs: tuple[PrintedModelRun, ...] = ()
+    as_printed: dict[str, AsPrinted] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def __add__(self, other: StageOutcome) -> StageOutcome:
-        stages, printed = {**self.stages, **other.stages}, {**self.printed, **other.printed}
-        return StageOutcome(self.cases + other.cases, stages, self.rows + other.rows, printed, self.notes + other.notes)
+        stages, tables = {**self.stages, **other.stages}, {**self.as_printed, **other.as_printed}
+        return StageOutcome(
+            self.cases + other.cases,
+            stages,
+            self.printed_model_runs + other.printed_model_runs,
+            tables,
+            self.notes + other.notes,
+        )
 
 
 #: Job of a worker thread, a function of the progress to which it reports.

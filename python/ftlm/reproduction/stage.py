@@ -37,7 +37,7 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import FIRST_P, INNOVATION_LENGTHS, LAST_P, PRIOR_COVARIANCES, page_text
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, StageNumber, decimate_run, demo_run
-from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of, seeds_for
+from ftlm.reproduction.workload import COMPARISON_INCREMENT, WorkerProgress, seconds_of, seeds_for
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
 from ftlm.simulation.simulate import explicit_euler
@@ -53,7 +53,7 @@ TRACE_EVERY = 2
 MULTI_INNOVATION_LABELS = ("p = 7", "p = 7, weak prior")
 #: Interval of alpha in the paper's order grid, and in the optimizer comparison. The latter contains the orders printed
 #: for both methods, and is so short that all candidates can be evaluated.
-GRID_ALPHA, RIVAL_ALPHA = (1.05, 2.0), (1.95, 2.0)
+GRID_ALPHA, COMPARISON_ALPHA = (1.05, 2.0), (1.95, 2.0)
 #: An error has converged once it stays below the final error of p = 1 times 1 plus this margin.
 CONVERGENCE_MARGIN = 0.02
 #: Decimation factor of joint fits: 8 ms on the virtual rig, a fifteenth of the period of the fastest link mode.
@@ -61,7 +61,7 @@ ROW_STRIDE = 4
 #: Method of joint fits (of both equations of a joint): output error with squared residuals and white noise.
 JOINT_METHOD = OutputError(loss="squares", intervals="auto", noise="white")
 #: Increment of the order grids with which claims on the innovation length are tested (:class:`Trial`).
-PANEL_STEP = 0.25
+TRIAL_INCREMENT = 0.25
 #: Radius [increments] of the search by instrumental variables around the orders of least squares. It is small because
 #: every candidate takes several simulations.
 INSTRUMENTAL_RADIUS_STEPS = 2
@@ -457,7 +457,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
 
     Return one trial per angle and prior covariance K0. `square` is the estimation run with noise of this `seed`.
     """
-    structure, grid = published_structure(stage), OrderGrid(increment=PANEL_STEP, alpha=GRID_ALPHA)
+    structure, grid = published_structure(stage), OrderGrid(increment=TRIAL_INCREMENT, alpha=GRID_ALPHA)
     run, trials = square.select(list(structure.signals)), []
     m = default_m([run], power_of_two=True)
     manual = euler_means(link_model(stage=stage, form="published"), run, m)
@@ -530,16 +530,16 @@ class Preset:
     order_grid: OrderGrid
     top: int | None = None  # table rows of an order search with identification; None for no identification
     trace_every: int = TRACE_EVERY  # recursion steps between two points of a convergence curve
-    rivals_increment: float | None = CONTEST_STEP  # minimum order increment of the comparison; None for no comparison
+    rivals_increment: float | None = COMPARISON_INCREMENT  # minimum order increment of the comparison; None without one
     genetic: GeneticAlgorithm | None = None  # settings of the optimizer comparison; None for default settings
     threads: int | None = None
 
     @property
-    def rivals_order_grid(self) -> OrderGrid | None:
+    def comparison_order_grid(self) -> OrderGrid | None:
         """Order grid of the optimizer comparison; None for no comparison."""
         if self.rivals_increment is None:
             return None
-        return OrderGrid(increment=max(self.order_grid.increment, self.rivals_increment), alpha=RIVAL_ALPHA)
+        return OrderGrid(increment=max(self.order_grid.increment, self.rivals_increment), alpha=COMPARISON_ALPHA)
 
     def seconds_of(self, step: str) -> float:
         """Return the expected processor time [s] of the step with this name, at the order increments of this preset."""
@@ -555,7 +555,7 @@ def simulated_cases(
     :func:`cases_of` returns them.
     """
     cases, structure = Cases(), published_structure(stage)
-    work: dict[str, Any] = {"threads": preset.threads, "progress": progress}
+    execution_options: dict[str, Any] = {"threads": preset.threads, "progress": progress}
     for seed in seeds:
         recording = partial(demo_run, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
         run, validation = recording("square"), recording("sine")
@@ -563,14 +563,16 @@ def simulated_cases(
         cases += Cases(tuple(trials_of(stage, run, arm, seed, preset.threads)))
         if arm == MAIN_ARM or seed != seeds[0]:
             continue
-        own, grid = run.select(list(structure.signals)), preset.rivals_order_grid
+        own, grid = run.select(list(structure.signals)), preset.comparison_order_grid
         if grid is not None:
             for output in structure.outputs:
                 progress.begin(preset.seconds_of("rivals"))
-                comparison = compare_optimizers(own, structure.equation(output), grid, preset.genetic, **work)
+                comparison = compare_optimizers(
+                    own, structure.equation(output), grid, preset.genetic, **execution_options
+                )
                 cases += Cases(contests=(OptimizerErrors.of(arm, output, comparison),))
         progress.begin(preset.seconds_of("freed"))
-        cases += Cases(order_comparisons=(compare_orders(stage, run, arm, validation=validation, **work),))
+        cases += Cases(order_comparisons=(compare_orders(stage, run, arm, validation=validation, **execution_options),))
     return cases
 
 
@@ -611,7 +613,7 @@ class StageWork:
         self.progress.begin(self.preset.seconds_of(step))
 
     @property
-    def work(self) -> dict[str, Any]:
+    def execution_options(self) -> dict[str, Any]:
         """Number of threads and progress callback, as arguments of searches and fits."""
         return {"threads": self.preset.threads, "progress": self.progress}
 
@@ -657,7 +659,7 @@ class StageWork:
 
     def identify_candidate(self, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD) -> Candidate:
         """Identify a model from a run, by default by output error, and return it with its errors on both runs."""
-        result = identify(run, structure, method=method, **self.work)
+        result = identify(run, structure, method=method, **self.execution_options)
         return self.candidate(result.model, result)
 
     def manual(self) -> Candidate:
@@ -727,16 +729,16 @@ class StageWork:
         of a zero output, so no candidate can be excluded by a bound on its error. The fine grid is therefore searched
         only around the best candidate of a coarser grid.
         """
-        run, work = self.estimation_run, {**self.work, **options}
+        run, search_options = self.estimation_run, {**self.execution_options, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
         is_expensive = own_terms > 1 and options["coefficients"] == "multi-innovation"
         if not (is_expensive and own.increment < COARSE_INCREMENT and not own.orders):
-            return rank_orders(run, single, own, top=1, **work)
+            return rank_orders(run, single, own, top=1, **search_options)
         values, ends, radius = own.values(single), [], 2 * COARSE_INCREMENT - 1e-9
         coarse = replace(own, increment=COARSE_INCREMENT)
-        for row in rank_orders(run, single, coarse, top=REFINED_CANDIDATES, **work).table:
+        for row in rank_orders(run, single, coarse, top=REFINED_CANDIDATES, **search_options).table:
             near = {n: [v for v in values[n] if abs(v - at) < radius] for n, at in row.orders.items()}
-            ends.append(rank_orders(run, single, replace(own, orders=near), top=1, **work))
+            ends.append(rank_orders(run, single, replace(own, orders=near), top=1, **search_options))
         return min(ends, key=attrgetter("score"))
 
     def instrumental(self, start: Candidate) -> Candidate:
@@ -773,7 +775,7 @@ class StageWork:
         guess = self.published_values(near)
         if self.simulated:
             task, options = Task((run,), structure), (None, check_threads(self.preset.threads), self.progress)
-            fit = estimate_output_error(task, *options, intervals="quadratic", begin=guess, alone=True)
+            fit = estimate_output_error(task, *options, intervals="quadratic", begin=guess, single_start=True)
             result = assess_fit(fit)
             return self.candidate(result.model, result)
         try:
@@ -808,14 +810,14 @@ class StageWork:
         The result is empty if the preset omits the comparisons. It is also empty if a comparison is impossible; a note
         then states the reason.
         """
-        run, grid, comparisons = self.estimation_run, self.preset.rivals_order_grid, {}
+        run, grid, comparisons = self.estimation_run, self.preset.comparison_order_grid, {}
         if grid is None:
             return {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             self.begin(f"the rivals on {output}", "rivals")
             try:
-                comparison = compare_optimizers(run, single, grid, self.preset.genetic, **self.work)
+                comparison = compare_optimizers(run, single, grid, self.preset.genetic, **self.execution_options)
             except ModelError as error:
                 self.notes.append(page_text("rivals_omitted", reason=error))
                 return {}

@@ -25,10 +25,10 @@ STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "freed": (4.0, 0, 1),
 }
 #: Number of candidates of the order grid in the optimizer comparison at its default increment.
-CONTEST_CANDIDATES = 3800
+COMPARISON_CANDIDATES = 3800
 #: Default minimum increment of the order grid in the optimizer comparison. The paper's grid has 60 000 candidates per
 #: angle. With as many evaluations per seed, a comparison would take minutes.
-CONTEST_STEP = 0.1
+COMPARISON_INCREMENT = 0.1
 #: Maximum and minimum number of seeds of an optimizer, and maximum number of evaluations on one angle over all seeds.
 MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
 
@@ -41,7 +41,7 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
     return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
-def seconds_of(step: str, increment: float, rivals_increment: float | None = CONTEST_STEP) -> float:
+def seconds_of(step: str, increment: float, rivals_increment: float | None = COMPARISON_INCREMENT) -> float:
     """Return the expected processor time [s] of the step with this name.
 
     The time of an order search is proportional to the inverse fourth power of the increment. `rivals_increment` is the
@@ -53,13 +53,20 @@ def seconds_of(step: str, increment: float, rivals_increment: float | None = CON
     elif step == "rivals":
         candidates = 0
         if rivals_increment is not None:
-            candidates = round(CONTEST_CANDIDATES * (CONTEST_STEP / max(increment, rivals_increment)) ** 4)
-        scale = candidates * len(seeds_for(candidates)) / (CONTEST_CANDIDATES * len(seeds_for(CONTEST_CANDIDATES)))
+            candidates = round(COMPARISON_CANDIDATES * (COMPARISON_INCREMENT / max(increment, rivals_increment)) ** 4)
+        scale = (
+            candidates * len(seeds_for(candidates)) / (COMPARISON_CANDIDATES * len(seeds_for(COMPARISON_CANDIDATES)))
+        )
     return STEP_COSTS[step][0] * scale
 
 
 def seconds_of_all(
-    increment: float, stages: int, arms: int = 0, records: int = 1, *, rivals_increment: float | None = CONTEST_STEP
+    increment: float,
+    stages: int,
+    arms: int = 0,
+    records: int = 1,
+    *,
+    rivals_increment: float | None = COMPARISON_INCREMENT,
 ) -> float:
     """Return the expected processor time of the whole reproduction [s].
 

@@ -163,21 +163,21 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
     rest_length = min((int(rows[0]) for rows in change_indices if rows.size), default=0)
     if rest_length >= START_SETTINGS.quiet_rows:
         levels = {}
-        has_nonzero_input = any(run[n][0] != 0.0 for n in inputs)
+        shows_level = any(run[n][0] != 0.0 for n in inputs)
         # A command that changes often may have changed before the run, so a longer quiet phase is required.
-        has_sampled_hold = has_nonzero_input and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
+        has_frequent_changes = shows_level and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
         for name in outputs:
             noise = noise_at_start(run[name])
             rows = _without_outliers(drop_missing(run[name][:rest_length]), noise)
             if rows.size < START_SETTINGS.quiet_rows or not _is_at_rest(rows, noise):
                 return None
             drift_error = noise * run.length / _noise_to_slope_error_ratio(rows.size)
-            if has_sampled_hold and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
+            if has_frequent_changes and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
                 return None
             levels[name] = float(np.mean(rows))
             threshold = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
-            has_nonzero_input |= abs(levels[name]) > threshold
-        return RestEvidence(rest_length, levels, {n: float(run[n][0]) for n in inputs}, has_nonzero_input)
+            shows_level |= abs(levels[name]) > threshold
+        return RestEvidence(rest_length, levels, {n: float(run[n][0]) for n in inputs}, shows_level)
     constant = all(_change_indices(run[n][1:]).size == 0 for n in inputs)
     if not constant or not any(np.any(run[n][1:]) for n in inputs):
         return None
@@ -368,7 +368,7 @@ def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure)
 
 
 def huber_loss_excess(
-    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], deviations: Sequence[float]
+    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], output_deviations: Sequence[float]
 ) -> float:
     """Return the excess of the Huber loss with few initial terms over that with many, in units of the noise variance.
 
@@ -380,11 +380,13 @@ def huber_loss_excess(
     few_term_residuals, many_term_residuals
         Residuals of each output with few and with many terms; infinite if the simulation is not finite, NaN at missing
         samples.
-    deviations
+    output_deviations
         Standard deviation of each measured output.
     """
     excess = 0.0
-    for few_series, many_series, deviation in zip(few_term_residuals, many_term_residuals, deviations, strict=True):
+    for few_series, many_series, deviation in zip(
+        few_term_residuals, many_term_residuals, output_deviations, strict=True
+    ):
         is_finite = ~np.isnan(few_series)
         if float(np.sqrt(np.mean(few_series[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * deviation:
             excess += huber_excess(few_series[is_finite], many_series[is_finite])
@@ -392,14 +394,16 @@ def huber_loss_excess(
 
 
 def loss_excess_of_fits(
-    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], deviations: Sequence[float]
+    few_term_residuals: Sequence[Floats], many_term_residuals: Sequence[Floats], output_deviations: Sequence[float]
 ) -> float:
     """Return the larger of :func:`huber_loss_excess` and a quarter of the excess sum of squares, for two fits.
 
     The excess is divided by the noise variance. Arguments are those of :func:`huber_loss_excess`.
     """
     squares = 0.0
-    for few_series, many_series, deviation in zip(few_term_residuals, many_term_residuals, deviations, strict=True):
+    for few_series, many_series, deviation in zip(
+        few_term_residuals, many_term_residuals, output_deviations, strict=True
+    ):
         is_finite = ~np.isnan(few_series)
         floor, squares_excess = (
             float(np.mean(many_series[is_finite] ** 2)),
@@ -407,7 +411,7 @@ def loss_excess_of_fits(
         )
         if math.sqrt(float(np.mean(few_series[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * deviation:
             squares += squares_excess / floor if floor > 0.0 else math.inf
-    return max(huber_loss_excess(few_term_residuals, many_term_residuals, deviations), SQUARES_WEIGHT * squares)
+    return max(huber_loss_excess(few_term_residuals, many_term_residuals, output_deviations), SQUARES_WEIGHT * squares)
 
 
 def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
@@ -438,13 +442,13 @@ def needs_history(
     structure: Structure,
     few_term_residuals: Sequence[Floats],
     many_term_residuals: Sequence[Floats],
-    deviations: Sequence[float],
+    output_deviations: Sequence[float],
     terms: tuple[int, int],
 ) -> bool:
     """Whether residuals with Caputo's initial terms are so large that terms for past inputs (a history) are required.
 
     `few_term_residuals` and `many_term_residuals` are the residuals of each output with Caputo's terms and with a
-    history. `terms` are the numbers of these terms, and `deviations` the standard deviations of the outputs.
+    history. `terms` are the numbers of these terms, and `output_deviations` the standard deviations of the outputs.
 
     The powers of t of a history can also fit an effect that the structure lacks. The threshold is therefore higher for
     colored residuals.
@@ -461,5 +465,5 @@ def needs_history(
         ) + START_SETTINGS.history_margin < start_score(few_term_residuals, terms[0], few_term_residuals)
     significance_level = HISTORY_TEST_LEVEL if structure.offset == "none" else HISTORY_TEST_LEVEL_WITH_OFFSET
     return additional_terms > 0 and loss_excess_of_fits(
-        few_term_residuals, many_term_residuals, deviations
+        few_term_residuals, many_term_residuals, output_deviations
     ) > chi_squared(additional_terms, significance_level)

@@ -163,15 +163,15 @@ def add_levels(
     `outputs` and `initial` are deviations from these levels.
     """
     terms = {
-        o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in exponent_values.items()}
-        for o, exponent_values in initial.items()
+        o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in coefficients_by_exponent.items()}
+        for o, coefficients_by_exponent in initial.items()
     }
     return outputs + np.array([levels[o] for o in model.outputs])[:, None], terms
 
 
 def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) -> dict[str, dict[float, float]]:
     """Return initial terms, given as (exponent, coefficient) pairs for each output, by output and exponent."""
-    return {o: dict(exponent_values) for o, exponent_values in zip(model.outputs, terms, strict=True)}
+    return {o: dict(coefficients_by_exponent) for o, coefficients_by_exponent in zip(model.outputs, terms, strict=True)}
 
 
 def check_uniform_samples(run: Run, model: Model) -> None:
@@ -209,8 +209,8 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
         return long
     terms = sum(map(len, short_terms.values())), sum(map(len, long_terms.values()))
     residuals = [*output_residuals(outputs, short_samples)], [*output_residuals(outputs, long_samples)]
-    deviations = np.nanstd(outputs, axis=1).tolist()
-    return long if needs_history(model.structure, *residuals, deviations, terms) else short
+    output_deviations = np.nanstd(outputs, axis=1).tolist()
+    return long if needs_history(model.structure, *residuals, output_deviations, terms) else short
 
 
 def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:

@@ -153,8 +153,8 @@ def _fit_past_inputs(
     names = initial_names(model, "caputo")
     free = [[exponent for output, exponent in names if output == o] for o in model.outputs]
     exponents = [
-        sorted({*free_exponents, *(e for e, _ in terms_by_exponent)})
-        for free_exponents, terms_by_exponent in zip(free, terms[1], strict=True)
+        sorted({*free_exponents, *(e for e, _ in terms_of_output)})
+        for free_exponents, terms_of_output in zip(free, terms[1], strict=True)
     ]
     history = core.fit_past_inputs(
         exponents, free, terms[2], RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()

@@ -238,12 +238,12 @@ class Store:
         self,
         request: object,
         compute: Callable[[], Result],
-        write: Callable[[Result], Answer | None],
-        convert: Callable[[Answer], Result],
+        encode: Callable[[Result], Answer | None],
+        decode: Callable[[Answer], Result],
     ) -> Result:
         """Return the result of a step from the file, or compute it and store it there.
 
-        `write` returns the stored form of a result, and `convert` the result from its stored form. If `write` returns
+        `encode` returns the stored form of a result, and `decode` the result from its stored form. If `encode` returns
         None, the result is not stored.
         """
         key = _digest(request)
@@ -251,14 +251,14 @@ class Store:
             stored = self._results.get(key)
         if stored is None:
             result = compute()
-            stored = write(result)
+            stored = encode(result)
             if stored is None:
                 return result
             with self._lock:
                 self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, stored))])
                 self._results[key] = stored
         # Decode the stored form even of a new result, so that a resumed selection gives the same bits.
-        return convert(stored)
+        return decode(stored)
 
     def fit(
         self,
@@ -269,36 +269,36 @@ class Store:
     ) -> JointFit | FtlmError:
         """Return the stored or computed fit of a structure on all runs, or the error of the fit."""
 
-        def write(result: JointFit | FtlmError) -> Answer | None:
+        def encode(result: JointFit | FtlmError) -> Answer | None:
             return StoredFit.of(result) if isinstance(result, JointFit) else FitError.of(result)
 
-        def convert(result: Answer) -> JointFit | FtlmError:
+        def decode(result: Answer) -> JointFit | FtlmError:
             if isinstance(result, FitError):
                 return result.error()
             return self._check_result_type(result, StoredFit, "a fit").fit()
 
-        return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, convert)
+        return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, encode, decode)
 
     def validation(
         self, name: str, structure: Structure, joint: JointFit, is_final: bool, compute: Callable[[], Trial]
     ) -> Trial:
         """Return the stored or computed trial of a fitted candidate on validation data."""
 
-        def convert(result: Answer) -> Trial:
+        def decode(result: Answer) -> Trial:
             trial = self._check_result_type(result, StoredTrial, "a validation").trial
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
         request = ("judge", structure, joint.names, joint.values, joint.initial, is_final)
-        return self.recall_or_compute(request, compute, lambda trial: StoredTrial(replace(trial, joint=None)), convert)
+        return self.recall_or_compute(request, compute, lambda trial: StoredTrial(replace(trial, joint=None)), decode)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return the stored or computed result of the best-subset search."""
 
-        def convert(result: Answer) -> list[ScreenedSubset]:
+        def decode(result: Answer) -> list[ScreenedSubset]:
             return self._check_result_type(result, StoredSubsets, "subsets").subsets
 
-        return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, convert)
+        return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, decode)
 
     def close(self) -> None:
         """Close the file and release the lock."""

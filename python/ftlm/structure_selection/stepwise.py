@@ -58,7 +58,7 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], min_count: int, pool
     if decimation == 1 or len(starts) <= min_count or not all(s.is_linear for s, _ in starts):
         return all_indices
 
-    def power(start: Start) -> float:
+    def cost_of(start: Start) -> float:
         structure, points = start
         try:
             return _prescreen_cost(runs, fix_initial_conditions(structure, runs), points, decimation)
@@ -66,10 +66,10 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], min_count: int, pool
             # The fit to all samples reports the error.
             return math.inf
 
-    levels = pool.map_items(power, starts)
-    limit = MAX_PRESCREEN_COST_RATIO * min(levels)
-    best_levels = sorted(all_indices, key=lambda k: (levels[k], k))[:min_count]
-    return [k for k in all_indices if levels[k] <= limit or k in best_levels]
+    costs = pool.map_items(cost_of, starts)
+    limit = MAX_PRESCREEN_COST_RATIO * min(costs)
+    best_indices = sorted(all_indices, key=lambda k: (costs[k], k))[:min_count]
+    return [k for k in all_indices if costs[k] <= limit or k in best_indices]
 
 
 def _prescreen_cost(
@@ -243,7 +243,7 @@ def initial_guesses(
     defaults |= {
         i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in INITIAL_INPUT_FRACTIONS] for i in problem.inputs
     }
-    values_by_name = {n: [values[n]] if n in values else values_by_name for n, values_by_name in defaults.items()}
+    values_by_name = {n: [values[n]] if n in values else guesses for n, guesses in defaults.items()}
     return [dict(zip(values_by_name, point, strict=True)) for point in itertools.product(*values_by_name.values())]
 
 
@@ -275,11 +275,11 @@ class StepwiseSelection:
         optional, the structure with all orders free is a second initial structure.
         """
         subsets = self.work.best_subsets(self.nested)
-        ends_from_subsets = self._select_from_subsets(subsets)
-        if ends_from_subsets:
+        subset_results = self._select_from_subsets(subsets)
+        if subset_results:
             # Screened subsets are not fitted again as neighbors of other variants.
             self.keys = {self._key(s.change) for s in subsets}
-            return self._eliminate_from_ends(ends_from_subsets)
+            return self._eliminate_from_results(subset_results)
         if not self.nested.droppable:
             return self._select_from_full()
         pairs = self._fit_roughly(self._untried_changes(self.nested.simplest()))
@@ -292,7 +292,7 @@ class StepwiseSelection:
         results = [self._select_forward(best) for root in roots.values() for best in self._by_criterion(root)[:1]]
         best_result = min(results, key=lambda pair: _ranking_key(pair[0]))
         from_above = self._eliminate_from_full(best_result[1], fits)
-        return self._eliminate_from_ends([*results, *([] if from_above is None else [from_above])])
+        return self._eliminate_from_results([*results, *([] if from_above is None else [from_above])])
 
     def _build(self, change: Change) -> Structure:
         return self.nested.build(change.variant)
@@ -317,7 +317,7 @@ class StepwiseSelection:
         self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
         return self.work.trials
 
-    def _eliminate_from_ends(self, results: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
+    def _eliminate_from_results(self, results: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
         """Run backward elimination from each of the `results` that predicts as well as the best; return all trials."""
         lowest_key = min(_ranking_key(trial) for trial, _ in results)
         for trial, at in results:
@@ -347,7 +347,7 @@ class StepwiseSelection:
             for trial, at in reversed(list(zip(root_trials, roots, strict=False)))
             if trial.score <= lowest_score + MAX_ROOT_SCORE_GAP
         ]
-        return self._eliminate_from_ends(results)
+        return self._eliminate_from_results(results)
 
     def _select_from_subsets(self, subsets: Sequence[ScreenedSubset]) -> list[tuple[Trial, FittedVariant]]:
         """Return the best fitted subset, then its extension by forward selection; [] if no subset can be fitted."""

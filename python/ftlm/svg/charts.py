@@ -484,9 +484,9 @@ def _rectangle(x: float, y: float, width: float, height: str, color: str) -> Mar
     return element("rect", x=x, y=y, width=width + 0.3, height=height, fill=color)
 
 
-def _label_indices(count: int, maximum: int) -> list[int]:
-    """Return at most `maximum` equally spaced indices from 0 to count - 1. Cells with these indices get a label."""
-    return list(range(0, count, max(1, math.ceil((count - 1) / max(maximum - 1, 1)))))
+def _label_indices(count: int, max_count: int) -> list[int]:
+    """Return at most `max_count` equally spaced indices from 0 to count - 1. Cells with these indices get a label."""
+    return list(range(0, count, max(1, math.ceil((count - 1) / max(max_count - 1, 1)))))
 
 
 #: Colors from correlation -1 to 1: blue, light gray, vermilion. Black text is readable on the colors in the middle.

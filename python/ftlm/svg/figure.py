@@ -231,25 +231,25 @@ class PlotArea:
         ]
 
 
-def ticks(low: float, high: float, maximum: int = 6) -> Ticks:
+def ticks(low: float, high: float, max_count: int = 6) -> Ticks:
     """Return the ticks of an axis, at multiples of 1, 2 or 5 times a power of ten within an interval.
 
     Parameters
     ----------
     low, high
         Ends of the interval, low < high.
-    maximum
+    max_count
         Approximate maximum number of ticks; at least two are returned.
     """
-    raw_step = (high - low) / max(maximum, 1)
+    raw_step = (high - low) / max(max_count, 1)
     exponent = math.floor(math.log10(raw_step))
     mantissa = next((s for s in (1, 2, 5) if s * 10.0**exponent >= raw_step * (1 - 1e-9)), 10)
     if mantissa == 10:
         mantissa, exponent = 1, exponent + 1
     step = mantissa * 10.0**exponent
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    if last - first < 1 and maximum < 20:
-        return ticks(low, high, maximum + 1)
+    if last - first < 1 and max_count < 20:
+        return ticks(low, high, max_count + 1)
     # Integer multiples of a power of ten avoid rounding, such as 0.30000000000000004 for 0.3.
     multiples = [k * mantissa for k in range(first, last + 1)]
     values = [float(m * 10**exponent) if exponent >= 0 else m / 10**-exponent for m in multiples]
@@ -260,13 +260,13 @@ def ticks(low: float, high: float, maximum: int = 6) -> Ticks:
     return Ticks(values, labels, f"×10{str(shift).translate(SUPERSCRIPT_DIGITS)}" if shift else "", shift)
 
 
-def log_ticks(low: float, high: float, maximum: int) -> Ticks:
+def log_ticks(low: float, high: float, max_count: int) -> Ticks:
     """Return the ticks of a logarithmic axis from 10**low to 10**high, with decimal logarithms as tick values.
 
     The ticks are powers of ten, a 1-2-5 series if there would be fewer than three powers, or linear ticks for a short
-    interval. The number of powers is at most about `maximum`.
+    interval. The number of powers is at most about `max_count`.
     """
-    stride = max(1, math.ceil((high - low) / maximum))
+    stride = max(1, math.ceil((high - low) / max_count))
     first, last = math.ceil(low / stride - 1e-9), math.floor(high / stride + 1e-9)
     powers = [k * stride for k in range(first, last + 1)]
     if len(powers) >= 3:
@@ -277,12 +277,12 @@ def log_ticks(low: float, high: float, maximum: int) -> Ticks:
     if len(visible_ticks) >= 2:
         labels = [f"{s * 10.0**p:g}".replace("-", "−") for s, p in visible_ticks]
         return Ticks([math.log10(s) + p for s, p in visible_ticks], labels)
-    scale_ticks = ticks(10.0**low, 10.0**high, maximum)
+    scale_ticks = ticks(10.0**low, 10.0**high, max_count)
     pairs = [(math.log10(v), label) for v, label in zip(scale_ticks.values, scale_ticks.labels, strict=True) if v > 0]
     return Ticks([v for v, _ in pairs], [label for _, label in pairs], scale_ticks.factor)
 
 
-def decimate(y: ArrayLike, maximum: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
+def decimate(y: ArrayLike, max_count: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     """Return indices of the points that are sufficient to draw a line.
 
     These are the ends of intervals of constant value or, if there are too many of these, the extreme values of blocks.
@@ -291,24 +291,24 @@ def decimate(y: ArrayLike, maximum: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     ----------
     y
         Values of the line; nonfinite values are omitted.
-    maximum
+    max_count
         Maximum number of indices, at least 4.
 
     Returns
     -------
     ndarray of int
-        Ascending indices. All finite values are included if there are at most ``maximum``.
+        Ascending indices. All finite values are included if there are at most ``max_count``.
     """
     values = as_floats("y", y, gaps=True)
     finite = np.flatnonzero(np.isfinite(values))
-    if finite.size <= maximum:
+    if finite.size <= max_count:
         return finite
     # Points inside a constant interval are on the line between its ends. Staircases keep their shape without them.
     changes = values[1:] != values[:-1]
     segment_ends = np.flatnonzero(np.isfinite(values) & (np.append(True, changes) | np.append(changes, True)))
-    if segment_ends.size <= maximum:
+    if segment_ends.size <= max_count:
         return segment_ends
-    edges = np.linspace(0, finite.size, max(1, (maximum - 2) // 2) + 1).astype(np.intp)
+    edges = np.linspace(0, finite.size, max(1, (max_count - 2) // 2) + 1).astype(np.intp)
     # Sorting by (block, value) places the extreme values of every block at its ends.
     stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
     order = np.lexsort((values[finite], stretch))

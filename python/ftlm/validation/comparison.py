@@ -590,14 +590,14 @@ def validation_findings(estimation: Comparison, validation: Comparison) -> list[
     findings = []
     for k, (name, _, _) in enumerate(estimation.per_run):
         for j, (validation_run, _, _) in enumerate(validation.per_run):
-            first_lags, validation_lags = (
+            estimation_samples, validation_samples = (
                 np.stack([c.measured[o][i] for o in estimation.measured]) for c, i in ((estimation, k), (validation, j))
             )
-            shared_rows = common_rows(first_lags, validation_lags)
-            if shared_rows == validation_lags.shape[1] == first_lags.shape[1]:
+            shared_rows = common_rows(estimation_samples, validation_samples)
+            if shared_rows == validation_samples.shape[1] == estimation_samples.shape[1]:
                 findings.append(make_finding("estimation_run_repeated", run=validation_run, other=name))
             elif shared_rows:
-                details = {"count": shared_rows, "rows": validation_lags.shape[1]}
+                details = {"count": shared_rows, "rows": validation_samples.shape[1]}
                 findings.append(make_finding("estimation_rows_repeated", run=validation_run, other=name, **details))
     return findings + validation_fit_findings({n: f.fit for n, f in estimation.output_error.items()}, validation)
 
@@ -615,17 +615,17 @@ def common_rows(first_series: Floats, second_series: Floats) -> int:
     """
     if first_series.shape == second_series.shape and np.array_equal(first_series, second_series, equal_nan=True):
         return int(first_series.shape[1])
-    for delayed, reference in ((first_series, second_series), (second_series, first_series)):
-        first_change = next(iter(np.flatnonzero(np.any(np.diff(reference) != 0.0, axis=0))), 0)
-        head = reference[:, first_change : first_change + ALIGNMENT_ROWS]
-        if head.shape[1] < ALIGNMENT_ROWS or delayed.shape[1] < MIN_COMMON_ROWS:
+    for earlier, later in ((first_series, second_series), (second_series, first_series)):
+        first_change = next(iter(np.flatnonzero(np.any(np.diff(later) != 0.0, axis=0))), 0)
+        head = later[:, first_change : first_change + ALIGNMENT_ROWS]
+        if head.shape[1] < ALIGNMENT_ROWS or earlier.shape[1] < MIN_COMMON_ROWS:
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(delayed, ALIGNMENT_ROWS, axis=1)
+        windows = np.lib.stride_tricks.sliding_window_view(earlier, ALIGNMENT_ROWS, axis=1)
         for start in np.flatnonzero(np.all(windows == head[:, None, :], axis=(0, 2))) - first_change:
-            count = min(delayed.shape[1] - start, reference.shape[1])
+            count = min(earlier.shape[1] - start, later.shape[1])
             if start < 0 or count < MIN_COMMON_ROWS:
                 continue
-            if np.array_equal(delayed[:, start : start + count], reference[:, :count], equal_nan=True):
+            if np.array_equal(earlier[:, start : start + count], later[:, :count], equal_nan=True):
                 return int(count)
     return 0
 

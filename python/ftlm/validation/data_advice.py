@@ -199,17 +199,14 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         return
     # The output may be at rest while an input already changes, because it responds after a dead time.
     tail = max(1, int(DEAD_TIME_SHARE * rows))
-    first_values = [run[n][start : start + rows - tail] for n in run.inputs]
+    head_samples = [run[n][start : start + rows - tail] for n in run.inputs]
     tail_samples = [run[n][start + rows - tail : start + rows + 1] for n in run.inputs]
-    is_moving = any(
-        np.any(change_after != row_before[0])
-        for row_before, change_after in zip(first_values, tail_samples, strict=True)
-    )
-    without_input = not any(values[0] for values in first_values)
-    if all(np.ptp(values) == 0 for values in first_values) and (without_input or (start == 0 and is_moving)):
+    is_moving = any(np.any(after != before[0]) for before, after in zip(head_samples, tail_samples, strict=True))
+    without_input = not any(values[0] for values in head_samples)
+    if all(np.ptp(values) == 0 for values in head_samples) and (without_input or (start == 0 and is_moving)):
         return
     start_time, end_time = start * run.step, (start + rows) * run.step
-    change_after = (
+    advice = (
         f"use {parameter('window', (float(f'{end_time:.4g}'), None))}"
         if start < run.length // 20
         else "check the sensor, or cut it away"
@@ -223,7 +220,7 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         begin=start_time,
         end=end_time,
         rows=rows,
-        after=change_after,
+        after=advice,
     )
 
 

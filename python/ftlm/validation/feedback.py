@@ -362,11 +362,13 @@ class _Innovations:
         input_lags_of_runs = [np.concatenate([_lags(u, 1, self.input_lags, self.start) for u in inputs])]
         other_lags = []
         for other_input in other_inputs:
-            length = math.sqrt(float(np.mean(np.concatenate([(v - v.mean()) ** 2 for v in other_input]))))
-            if length > 0:
+            other_deviation = math.sqrt(float(np.mean(np.concatenate([(v - v.mean()) ** 2 for v in other_input]))))
+            if other_deviation > 0:
                 lag_count = min(self.input_lags, MAX_OTHER_LAGS)
                 other_lags.append(
-                    np.concatenate([_lags((v - v.mean()) / length, 0, lag_count, self.start) for v in other_input])
+                    np.concatenate(
+                        [_lags((v - v.mean()) / other_deviation, 0, lag_count, self.start) for v in other_input]
+                    )
                 )
         lines = [[np.ones(u.size), *_line_regressors(u)] for u in inputs]
         self.past = np.column_stack([*input_lags_of_runs, *other_lags, *self._block_diagonal(lines)])
@@ -380,14 +382,14 @@ class _Innovations:
         self.innovation, self.scale = w, robust_deviation(w)
         levels = self._block_diagonal([[np.ones(u.size)] for u in inputs])
         output_lags_of_runs = [np.concatenate([_lags(e, 1, output_lags, self.start) for e in outputs])]
-        driving_lags = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
+        present_input_lags = [np.concatenate([_lags(u, 0, output_lags, self.start) for u in inputs])]
         self.residuals = self._stack_rows(outputs)
         projected = _project_out(
-            np.column_stack([*output_lags_of_runs, *driving_lags, *other_lags, *levels]), self.residuals
+            np.column_stack([*output_lags_of_runs, *present_input_lags, *other_lags, *levels]), self.residuals
         )
-        strictly_past = [columns[:, 1:] for columns in driving_lags]
+        past_input_lags = [columns[:, 1:] for columns in present_input_lags]
         self.same_row_output = _project_out(
-            np.column_stack([*output_lags_of_runs, *strictly_past, *other_lags, *levels]), self.residuals
+            np.column_stack([*output_lags_of_runs, *past_input_lags, *other_lags, *levels]), self.residuals
         )
         self.noise = robust_deviation(projected)
         self.output_innovation = np.clip(projected / max(self.noise, 1e-300), -OUTPUT_CLIP, OUTPUT_CLIP)
