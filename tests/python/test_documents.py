@@ -138,7 +138,11 @@ def test_linked_files_exist(document: Path) -> None:
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "notebook",
+    [pytest.param(p, marks=pytest.mark.slow if p.stem == "flexible_link" else ()) for p in NOTEBOOKS],
+    ids=[p.stem for p in NOTEBOOKS],
+)
 def test_the_notebooks_run(notebook: Path, tmp_path: Path) -> None:
     script = (
         "import sys, nbformat, nbclient\n"

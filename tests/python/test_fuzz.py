@@ -12,7 +12,7 @@ KEPT = sorted(path for path in REGRESSIONS.rglob("*") if path.is_file())
 def test_mutations_end_well_or_in_an_error_of_ftlm(target):
     if target in NEEDS:
         pytest.importorskip(NEEDS[target])
-    count = 4 if target in SLOW else 400
+    count = 4 if target in SLOW else 200
     tried, faults = fuzz(target, seed=1, inputs=count)
     assert (tried, faults) == (count, {})
 

@@ -191,8 +191,8 @@ def test_stages_that_do_not_meet_are_two_machines(tmp_path) -> None:
         (),
         # Accelerations of each other: as they are, a little below and a little above.
         ((0.0, 0), (0.0, 1)),
-        ((1.85, None), (1.7, None)),
-        ((1.95, None), (1.9, None)),
+        pytest.param(((1.85, None), (1.7, None)), marks=pytest.mark.slow),
+        pytest.param(((1.95, None), (1.9, None)), marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_are_those_of_finite_differences(leans) -> None:
