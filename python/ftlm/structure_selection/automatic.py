@@ -187,10 +187,13 @@ def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
     return sorted((replace(f, bic=fit_criterion(f.joint, inflation)) for f in fits), key=lambda f: f.bic)
 
 
-def _fit_form(problem: OutputProblem, form: IntegerOrderForm) -> FittedForm:
-    """Return the fit of a form to the runs of a problem."""
+def _fit_form(problem: OutputProblem, form: IntegerOrderForm) -> FittedForm | None:
+    """Return the fit of a form to the runs of a problem; None if it fails."""
     structure = form.structure(problem)
-    joint = fit(problem.runs, structure, [], refine=False)
+    try:
+        joint = fit(problem.runs, structure, [], refine=False)
+    except FtlmError:
+        return None
     return FittedForm(structure, joint, form, residual_variance_inflation(joint))
 
 
@@ -396,24 +399,34 @@ class AutomaticSelection:
         without this input, are linear, so they are faster than a fit with friction. The result is True if a fit fails.
         """
         problem, linear = self.problem, replace(form, friction="none")
+        without = _fit_form(problem, linear)
+        if without is None:
+            return True
+        model, runs = fitted_model(without.joint, without.structure), as_runs(problem.runs)
         try:
-            without = _fit_form(problem, linear)
-            model, runs = fitted_model(without.joint, without.structure), as_runs(problem.runs)
-            row = model.outputs.index(problem.output)
-            outputs = [samples.outputs[row] for samples in simulate_runs(model, runs)]
-            is_speed = form.friction == "output"
-            forces = [np.tanh(problem.tanh_slope * y) if is_speed else np.sign(np.gradient(y)) for y in outputs]
-            name = f"{problem.output}.friction"
-            with_force = _fit_form(
-                replace(
-                    problem,
-                    runs=[run_with_inputs(run, {name: -force}) for run, force in zip(runs, forces, strict=True)],
-                    drivers=(*problem.drivers, name),
-                    delays={**problem.delays, name: 0.0},
-                ),
-                linear,
-            )
+            simulations = simulate_runs(model, runs)
         except FtlmError:
+            return True
+        row = model.outputs.index(problem.output)
+        velocity_signs = [
+            np.tanh(problem.tanh_slope * samples.outputs[row])
+            if form.friction == "output"
+            else np.sign(np.gradient(samples.outputs[row]))
+            for samples in simulations
+        ]
+        name = "friction_force"
+        while name in runs[0].signals:
+            name += "_"
+        with_force = _fit_form(
+            replace(
+                problem,
+                runs=[run_with_inputs(run, {name: -sign}) for run, sign in zip(runs, velocity_signs, strict=True)],
+                drivers=(*problem.drivers, name),
+                delays={**problem.delays, name: 0.0},
+            ),
+            linear,
+        )
+        if with_force is None:
             return True
         is_better = _rank([without, with_force])[0].structure is with_force.structure
         coefficient = with_force.joint.coefficients[f"b{len(problem.drivers) + 1}_0{problem.suffix}"]
