@@ -80,22 +80,15 @@ def test_auto_finds_the_level_of_an_output_rather_than_a_pole_and_a_zero_at_zero
     assert values["delay_u"].value == pytest.approx(12, abs=0.3)
 
 
-@pytest.fixture
-def friction_guesses(monkeypatch: pytest.MonkeyPatch) -> list[list[dict[str, float]]]:
-    """Initial guesses of every fit of a structure with friction; an empty list stands for automatic guesses."""
-    guesses = []
+def test_noise_with_a_color_does_not_raise_the_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_friction: list[str] = []
     whole = stepwise.fit
 
-    def record_guesses(runs, structure, starts, **options):  # type: ignore[no-untyped-def]
-        if structure.has_friction:
-            guesses.append(starts)
+    def record_friction(runs, structure, starts, **options):  # type: ignore[no-untyped-def]
+        with_friction.extend(structure.coefficient_names if structure.has_friction else ())
         return whole(runs, structure, starts, **options)
 
-    monkeypatch.setattr(stepwise, "fit", record_guesses)
-    return guesses
-
-
-def test_noise_with_a_color_does_not_raise_the_order(friction_guesses) -> None:
+    monkeypatch.setattr(stepwise, "fit", record_friction)
     g = np.random.default_rng(1)
     u = np.repeat(g.choice([-1.0, 1.0], 100), 15)
     b, a, _ = cont2discrete(([4.0], [1.0, 0.8, 4.0]), 0.05)[:3]
@@ -106,7 +99,7 @@ def test_noise_with_a_color_does_not_raise_the_order(friction_guesses) -> None:
     lower, upper = found.best.intervals["a1"]
     assert lower < -0.8 < upper
     # A friction force along the motion of the linear fit explains nothing of this noise.
-    assert friction_guesses == []
+    assert with_friction == []
 
 
 def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -315,9 +308,7 @@ def rubbing_mass(
         (0.0, {"a1": -0.8}),
     ],
 )
-def test_auto_finds_dry_friction_rather_than_higher_orders(
-    spring: float, own: dict[str, float], friction_guesses
-) -> None:
+def test_auto_finds_dry_friction_rather_than_higher_orders(spring: float, own: dict[str, float]) -> None:
     run = rubbing_mass(1, spring, 0.25)
     found = ftlm.select(run, "auto", threads=1).best
     (item,) = found.model.structure.equations
@@ -326,9 +317,6 @@ def test_auto_finds_dry_friction_rather_than_higher_orders(
     assert found.coefficients["fc"] == pytest.approx(0.25, rel=0.1)
     values = {n: v for n, v in found.coefficients.items() if n.startswith("a")}
     assert values == pytest.approx(own, rel=0.1)
-    # Automatic guesses cost seconds: they are those of the first form that fits; all others start from its optimum.
-    first = next(k for k, starts in enumerate(friction_guesses) if starts)
-    assert all(all("fc" in start for start in starts) and starts for starts in friction_guesses[first:])
 
 
 def test_auto_finds_dry_friction_behind_a_dead_time() -> None:

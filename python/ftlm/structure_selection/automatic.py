@@ -26,7 +26,7 @@ from ftlm.structure.parser import equation
 from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import Trial, fit, fit_criterion, residual_variance_inflation
-from ftlm.structure_selection.stepwise import CandidateEvaluator, initial_guesses
+from ftlm.structure_selection.stepwise import CandidateEvaluator
 from ftlm.validation.comparison import simulate_runs
 from ftlm.validation.feedback import feedback_test
 from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
@@ -230,22 +230,9 @@ class AutomaticSelection:
             self._validate(fractional[:VALIDATED_FRACTIONAL])
         return self.evaluator.trials
 
-    def _fit(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm] = ()) -> list[FittedForm]:
-        """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial.
-
-        A form with friction starts from the best of `fits` with the same order and kind of friction, because a fit of
-        friction from automatic initial guesses is slow. All other forms start from automatic guesses.
-        """
-        items = []
-        for form in dict.fromkeys(forms):
-            structure = form.structure(self.problem)
-            kind = form.friction, form.order
-            similar = [f for f in fits if f.form and kind == (f.form.friction, f.form.order)]
-            use = form.friction != "none" and similar
-            items.append(
-                (structure, form, initial_guesses(structure, similar[0].joint.values_by_name, {}) if use else [])
-            )
-        return self._fit_structures(items)
+    def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
+        """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial."""
+        return self._fit_structures([(f.structure(self.problem), f, []) for f in dict.fromkeys(forms)])
 
     def _fit_structures(
         self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
@@ -277,7 +264,7 @@ class AutomaticSelection:
             for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
             if form not in {f.form for f in fits}
         ]:
-            integer_fits = self._fit(reduced, fits)
+            integer_fits = self._fit(reduced)
             if not integer_fits:
                 break
             fits = _rank([*fits, *integer_fits])
@@ -321,7 +308,7 @@ class AutomaticSelection:
             neighbors = [n for form in newest if form for n in _neighbors(form) if self._is_admissible(n)]
             untried = [n for n in dict.fromkeys(neighbors) if n not in forms_before]
             forms_before.update(untried)
-            fits = _rank([*fits, *self._fit(untried, fits)])
+            fits = _rank([*fits, *self._fit(untried)])
             newest = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in extended_forms]
         return fits
 
@@ -384,9 +371,7 @@ class AutomaticSelection:
         for form in (speeds if changes_sign else []) + [position, replace(position, integrator=True)]:
             if fits and not has_white_residuals(fits[0].joint) and self._is_friction_likely(form):
                 # Negative friction would add energy, so it is not physical.
-                friction_fits = [
-                    f for f in self._fit([form], fits) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0
-                ]
+                friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
                 ranked = _rank([*fits, *friction_fits])
                 lowest_bic = min(f.bic for f in ranked if f.form != form)
                 fits = ranked if ranked[0].bic < lowest_bic - MIN_BIC_DECREASE else fits

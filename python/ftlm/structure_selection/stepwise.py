@@ -239,7 +239,7 @@ def initial_guesses(
         at = integer_orders.get(name, 0.5 * (low + high))
         defaults[name] = [min(max(at + shift, low), high) for shift in INITIAL_ORDER_SHIFTS]
     friction_names = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
-    defaults |= {n: [0.0] for n in problem.coefficients if n in values or n not in friction_names}
+    defaults |= {n: [0.0] for n in problem.coefficients if n not in friction_names}
     defaults |= {
         i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in INITIAL_INPUT_FRACTIONS] for i in problem.inputs
     }
