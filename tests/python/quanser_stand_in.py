@@ -317,6 +317,10 @@ class HIL:
         if board.page is not None:
             board.page.set("volts1", volts[0])
             board.page.set("volts2", volts[1])
+            if board.page.has_expired:
+                # A process may be stopped between the check above and this write; the outputs of a board are locked.
+                board.page.set("volts1", board.analog_state[0])
+                board.page.set("volts2", board.analog_state[1])
         board.log.append(("write_analog", board.sample, board.volts))
 
     def write_digital(self, channels, count, states):
