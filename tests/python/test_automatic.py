@@ -102,6 +102,20 @@ def test_noise_with_a_color_does_not_raise_the_order(monkeypatch: pytest.MonkeyP
     assert with_friction == []
 
 
+def test_colored_noise_at_nonuniform_sample_times_does_not_end_auto() -> None:
+    g = np.random.default_rng(5)
+    t = np.cumsum(0.1 + 0.02 * g.uniform(-1.0, 1.0, 300))
+    u = np.repeat(g.choice([-1.0, 1.0], 30), 10)
+    y = np.zeros(300)
+    for k, step in enumerate(np.diff(t)):
+        y[k + 1] = 2.0 * u[k] + (y[k] - 2.0 * u[k]) * np.exp(-step)
+    y += lfilter([0.02], [1.0, -0.9], g.standard_normal(300))
+    run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, time=t - t[0], resample=0.1)
+    found = ftlm.select(run, "auto", threads=1)
+    assert "fc" not in found.winner.name
+    assert found.best.model.dcgain() == pytest.approx(2.0, rel=0.15)
+
+
 def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = stepwise.fit
 

@@ -383,7 +383,9 @@ class AutomaticSelection:
         The input is significant if it lowers BIC and its coefficient has the sign of friction. Both fits, with and
         without this input, are linear, so they are faster than a fit with friction. The result is True if a fit fails.
         """
-        problem, linear = self.problem, replace(form, friction="none")
+        # A computed force has one sample per row, so nonuniform samples are replaced by those on the grid of the run.
+        problem = replace(self.problem, runs=[run_with_inputs(run, {}) for run in self.problem.runs])
+        linear = replace(form, friction="none")
         without = _fit_form(problem, linear)
         if without is None:
             return True
