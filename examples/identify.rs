@@ -104,6 +104,7 @@ fn main() -> Result<()> {
         coordinates: vec![Coordinate::Plain; 3],
         inputs: Vec::new(),
         coupled: false,
+        priors: Vec::new(),
         initial: Initial::Rest,
     };
     let samples = point_samples(&measured);

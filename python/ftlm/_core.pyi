@@ -408,6 +408,8 @@ class _JointFit(TypedDict):
     left: list[_Matrix]
     #: (number of down-weighted residuals, number of outliers, number of residuals); None without a robust loss.
     robust: tuple[int, int, int] | None
+    #: Share of the information on a parameter that its prior contributes, for each prior in the sequence of parameters.
+    prior_shares: list[float]
     on_grid: _Vector
     #: Estimated initial states of each run, for models with friction.
     states: list[list[float]]

@@ -6,6 +6,7 @@ use super::model::{Evaluation, NonlinearModel, Point};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::LeastSquaresProblem;
 use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
+use crate::estimation::optimization::prior::minimize_with_priors;
 use crate::estimation::output_error::Experiment;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::parallel::Stop;
@@ -39,7 +40,7 @@ pub struct NonlinearFit {
     pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Residuals with weights, run after run.
+    /// Residuals with weights, run after run, then one residual (mean − value)/deviation of each prior.
     pub residuals: Vec<f64>,
     /// Derivatives of the residuals with respect to orders, coefficients and input parameters, one vector each. The
     /// span of the derivatives with respect to the initial states is projected out.
@@ -292,7 +293,8 @@ pub fn fit(
         check_finite("states of the initial guess", values)?;
     }
     let problem = OutputError { model, experiments, stop };
-    let found = minimize(&problem, Point { orders, coefficients, inputs, states }, settings)?;
+    let start = Point { orders, coefficients, inputs, states };
+    let (found, residuals) = minimize_with_priors(&problem, &model.model.priors, Point::value, start, settings)?;
     let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();
     for column in found.jacobian.iter().skip(numbers) {
@@ -314,7 +316,7 @@ pub fn fit(
         inputs,
         states,
         cost: found.cost,
-        residuals: found.evaluation.residuals,
+        residuals,
         jacobian,
         evaluations: found.evaluations,
         status: found.status,

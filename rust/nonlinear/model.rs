@@ -98,6 +98,14 @@ pub(super) struct Point {
     pub(super) states: Vec<Vec<f64>>,
 }
 
+impl Point {
+    /// Value of a parameter, numbered as orders, then coefficients, then input parameters; NaN if it does not exist.
+    pub(super) fn value(&self, parameter: usize) -> f64 {
+        let mut values = self.orders.iter().chain(&self.coefficients).chain(&self.inputs);
+        values.nth(parameter).copied().unwrap_or(f64::NAN)
+    }
+}
+
 /// Residuals with weights at a point, and intermediate results of each experiment from which their derivatives follow.
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,

@@ -252,6 +252,7 @@ impl OutputSimulation {
             coordinates: Vec::new(),
             inputs: Vec::new(),
             coupled: self.recording.is_coupled,
+            priors: Vec::new(),
             initial,
         };
         let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };

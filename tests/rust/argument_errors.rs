@@ -149,6 +149,7 @@ fn free_model(order: AffineOrder, own: AffineOrder, bounds: (f64, f64)) -> FreeM
         coordinates: vec![Coordinate::Plain],
         inputs: Vec::new(),
         coupled: false,
+        priors: Vec::new(),
         initial: Initial::Caputo,
     }
 }

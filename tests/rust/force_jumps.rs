@@ -137,6 +137,7 @@ fn model(bodies: usize, stribeck: f64, law: InputLaw) -> NonlinearModel {
             coordinates: vec![Coordinate::Plain; 3],
             inputs: (0..bodies).map(|i| FreeInput { signal: bodies + i, law, bounds }).collect(),
             coupled: true,
+            priors: Vec::new(),
             initial: Initial::Rest,
         },
         derived: vec![],

@@ -181,6 +181,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
         coupled: true,
+        priors: Vec::new(),
         initial: Initial::Rest,
     };
     let frictions = vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))];

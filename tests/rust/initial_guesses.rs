@@ -65,6 +65,7 @@ fn structure(alpha: Order, beta: f64) -> ParametricStructure {
         derived: Vec::new(),
         equations: vec![ParametricEquation { output: 0, order: alpha, terms, friction: None }],
         bounds: [].into(),
+        priors: [].into(),
         coupled: true,
         delayed: false,
         initial: Initial::Rest,

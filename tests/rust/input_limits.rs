@@ -65,6 +65,7 @@ fn linear(law: InputLaw) -> FreeModel {
         coordinates: vec![Coordinate::Plain; 2],
         inputs: limited(law),
         coupled: false,
+        priors: Vec::new(),
         initial: Initial::Rest,
     }
 }

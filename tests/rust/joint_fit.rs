@@ -26,6 +26,7 @@ fn problem(equation: FreeEquation, order_bounds: &[(f64, f64)], coefficients: us
         coordinates: vec![Coordinate::Plain; coefficients],
         inputs: Vec::new(),
         coupled: true,
+        priors: Vec::new(),
         initial,
     };
     Problem::new(vec!["y".into()], model, Vec::new()).unwrap()

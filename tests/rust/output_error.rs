@@ -57,6 +57,7 @@ fn two_link(coupled: bool, initial: Initial) -> FreeModel {
             Coordinate::ExcessLogarithm,
         ],
         coupled,
+        priors: Vec::new(),
         initial,
     }
 }
@@ -422,6 +423,7 @@ fn at_once(coupled: bool, initial: Initial, inputs: Vec<FreeInput>) -> FreeModel
         coordinates: vec![Coordinate::Plain; 6],
         inputs,
         coupled,
+        priors: Vec::new(),
         initial,
     }
 }
@@ -516,6 +518,7 @@ fn a_fit_that_its_grid_stops_says_so() {
         coordinates: vec![Coordinate::Logarithm],
         inputs: Vec::new(),
         coupled: false,
+        priors: Vec::new(),
         initial: Initial::Rest,
     };
     let settings = MinimizationSettings { evaluations: 500, tolerance: 1e-7 };
@@ -630,6 +633,7 @@ fn driven() -> (FreeModel, Vec<Experiment>) {
         coordinates: vec![Coordinate::Logarithm; 3],
         inputs: Vec::new(),
         coupled: false,
+        priors: Vec::new(),
         initial: Initial::Caputo,
     };
     let mut random = Random::new(811);

@@ -25,6 +25,7 @@ fn problem(equations: &[(Orders, Terms<'_>)], coefficients: usize) -> Problem {
         coordinates: vec![Coordinate::Plain; coefficients],
         inputs: Vec::new(),
         coupled: true,
+        priors: Vec::new(),
         initial: Initial::Rest,
     };
     let outputs = (0..equations.len()).map(|k| format!("y{k}")).collect();

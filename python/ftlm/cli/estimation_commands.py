@@ -207,6 +207,7 @@ def identify(
     options |= {} if grid.grid() is None else {"order_grid": grid.grid()}
     options |= {} if fit.start is None else {"start": load_model(fit.start)}
     options |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
+    options |= {} if fit.priors is None else {"priors": ranges("--priors", fit.priors)}
     estimator = method_with_options(method, options)
     runs = reading.runs(files, equation)
     validation_data = validation_runs(reading, validation, validation_window, equation)

@@ -58,17 +58,19 @@ def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
 
 
 def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """Parse NAME=NUMBER or NAME=LOW:HIGH options into a dictionary of numbers or (low, high) tuples.
+    """Parse NAME=NUMBER or NAME=FIRST:SECOND options into a dictionary of numbers or pairs of numbers.
 
     Raise ModelError for other text.
     """
     description, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
+    pair_form = "MEAN:DEVIATION" if option == "--priors" else "LOW:HIGH"
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, texts).items():
         bounds = split_numbers(value)
         if len(bounds) not in (1, 2):
             raise ModelError(
-                f"{option} {name}={value}: {value!r} is neither {description} nor LOW:HIGH; give one, such as {example}"
+                f"{option} {name}={value}: {value!r} is neither {description} nor {pair_form}; give one, such as "
+                f"{example}"
             )
         values[name] = bounds[0] if len(bounds) == 1 else (bounds[0], bounds[1])
     return values

@@ -334,6 +334,8 @@ class OutputErrorOptions(MethodOptions):
         Reference signal of a closed loop; also name it with -u.
     noise
         Noise of the output; ar: an autoregression; default white.
+    priors : NAME=MEAN:DEVIATION
+        Mean and standard deviation of a parameter before the fit.
     """
 
     loss: Loss | None = None
@@ -342,6 +344,7 @@ class OutputErrorOptions(MethodOptions):
     reference: str | None = None
     noise: Noise | None = None
     bounds: list[str] | None = None
+    priors: list[str] | None = None
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,7 @@ def core_arguments(structure: Structure) -> Any:
         "derived": derived_signals(structure),
         "equations": equations,
         "bounds": [(name, (values[0], values[-1])) for name, values in structure.order_values.items()],
+        "priors": list((structure.priors or {}).items()),
         "coupled": structure.coupling == "simulated",
         "delayed": bool(structure.delay),
         "initial": initial_tuple(structure.initial, offset, states),

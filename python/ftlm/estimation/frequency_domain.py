@@ -15,7 +15,6 @@ from ftlm import _core
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.estimation.circuit_problem import CircuitProblem, check_admissible, profile_intervals
-from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.frequency_result import FrequencyIdentification
 from ftlm.estimation.model_checks import (
     SAME_MODEL_POWER,
@@ -23,6 +22,7 @@ from ftlm.estimation.model_checks import (
     second_optimum_findings,
 )
 from ftlm.estimation.objective import covariance_of
+from ftlm.estimation.prior_knowledge import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.response_problem import MAX_EXPONENT, ConstraintText, ResponseProblem
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
-from ftlm.estimation.coefficient_bounds import check_intervals
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction, make_model
 from ftlm.estimation.model_checks import coefficient_law_findings
+from ftlm.estimation.prior_knowledge import check_intervals
 from ftlm.estimation.result import Task
 from ftlm.findings import make_finding
 from ftlm.kernels import block_pulse_kernel

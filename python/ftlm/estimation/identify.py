@@ -17,7 +17,6 @@ from ftlm.data.run import Run
 from ftlm.data.runs import Runs, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
-from ftlm.estimation.coefficient_bounds import Bounds
 from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.extensions import run_extension_tests
 from ftlm.estimation.fit import Fit
@@ -41,6 +40,7 @@ from ftlm.estimation.nuisance_parameters import (
     output_sensitivities,
 )
 from ftlm.estimation.output_error import JointFit, parameter_set
+from ftlm.estimation.prior_knowledge import Bounds, Priors
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
@@ -90,6 +90,7 @@ def identify(
     initial: str | Iterable[float] | None = None,
     offset: Offset | None = None,
     bounds: Bounds | None = None,
+    priors: Priors | None = None,
     m: int | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -127,6 +128,9 @@ def identify(
         prevents this, but the level of a run that rests before an input changes is still used.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
+    priors
+        (mean, standard deviation) of normal priors of parameters by name, such as ``{"a": (2, 0.1)}``. They replace the
+        priors of the method; see :class:`ftlm.OutputError`.
     m
         Number of block pulses per run; by default 2048, or fewer for shorter runs (a power of two for Haar rows).
         Without `m`, instrumental variables use the default for the order search and all samples, at most 16384, for the
@@ -154,8 +158,9 @@ def identify(
     """
     run_list = as_runs(runs)
     estimator = resolve_method(method)
-    if bounds is not None:
-        estimator = method_with_options(estimator.name, {**vars(estimator), "bounds": bounds})
+    prior_knowledge = {n: v for n, v in (("bounds", bounds), ("priors", priors)) if v is not None}
+    if prior_knowledge:
+        estimator = method_with_options(estimator.name, {**vars(estimator), **prior_knowledge})
     if isinstance(structure, str) and structure == "auto":
         raise ModelError("structure = 'auto'; use ftlm.select(runs, 'auto').best, which chooses and identifies one")
     structure = as_structure("structure", structure)

@@ -13,7 +13,6 @@ import numpy as np
 from ftlm.data.run import Run
 from ftlm.errors import InternalError, ModelError
 from ftlm.estimation.closed_loop import instrument_runs, with_reference_findings
-from ftlm.estimation.coefficient_bounds import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.confidence_intervals import Intervals
 from ftlm.estimation.estimators import estimate_order_search, estimate_output_error, number_covariance
 from ftlm.estimation.fit import Fit, ProgressCallback, check_no_friction
@@ -21,6 +20,16 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.genetic import GeneticAlgorithm
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, Loss, Noise, start_from_values
+from ftlm.estimation.prior_knowledge import (
+    Bounds,
+    Priors,
+    check_bounds,
+    check_distributions,
+    check_intervals,
+    fit_within_bounds,
+    prior_findings,
+    with_priors,
+)
 from ftlm.estimation.result import Identification, Task
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -177,14 +186,18 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
         return joint.covariance
     objective, start = _at_estimate(fit, joint, fit.task.runs, 1.0 / max(*joint.noise.values(), 1e-300))
     rows = np.asarray(objective.minimize(start, 1, linear_scale=True).outcome["jacobian"])
-    scale = 1.0 / np.maximum(column_norms(rows.T), 1e-300)
-    rows = rows * scale[:, None]
+    priors = fit.task.structure.priors or {}
+    prior_information = np.array([priors[n][1] ** -2.0 if n in priors else 0.0 for n in joint.names])
+    scale = 1.0 / np.maximum(np.sqrt(column_norms(rows.T) ** 2 + prior_information), 1e-300)
+    rows, prior_information = rows * scale[:, None], np.diag(prior_information * scale**2)
     # Lagged residuals are set to 0 at missing samples, at which the sensitivities are 0.
     basis = orthonormal(
         np.nan_to_num(_lag_columns(residuals, order)) * np.any(rows != 0.0, axis=0)[:, None], LAG_RANK_TOLERANCE
     )
     residual_rows = rows - (rows @ basis) @ basis.T
-    additional_covariance = np.linalg.pinv(residual_rows @ residual_rows.T) - np.linalg.pinv(rows @ rows.T)
+    additional_covariance = np.linalg.pinv(residual_rows @ residual_rows.T + prior_information) - np.linalg.pinv(
+        rows @ rows.T + prior_information
+    )
     covariance: Floats = joint.covariance + scale[:, None] * additional_covariance * scale
     return covariance
 
@@ -244,12 +257,16 @@ class OutputError:
     bounds
         (lower, upper) of coefficients and orders by name; infinite without a bound on that side. A coefficient that
         ends on a bound is fixed at the bound, has no confidence interval, and is named by a finding.
+    priors
+        (mean, standard deviation) of normal priors of orders, coefficients, delays and limits by name. The estimate
+        maximizes the posterior density, and its intervals include the priors. Findings name a prior that the runs
+        contradict by more than three standard deviations, and a parameter that its prior determines.
 
     Raises
     ------
     ModelError
         If `loss`, `intervals` or `noise` is unknown, `start` or `reference` has the wrong type, or a reference is
-        combined with profile likelihood or a noise model.
+        combined with profile likelihood, a noise model or priors.
     """
 
     name: ClassVar[str] = "output-error"
@@ -259,12 +276,14 @@ class OutputError:
     reference: str | None = None
     noise: Noise = "white"
     bounds: Bounds | None = None
+    priors: Priors | None = None
 
     def __post_init__(self) -> None:
         check_choice("loss", self.loss, get_args(Loss))
         check_choice("intervals", self.intervals, get_args(Intervals))
         check_choice("noise", self.noise, get_args(Noise))
         check_intervals(self.bounds or {})
+        check_distributions(self.priors or {})
         if not (self.start is None or isinstance(self.start, (Identification, Model, Mapping))):
             raise ModelError(
                 f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
@@ -275,6 +294,11 @@ class OutputError:
             raise ModelError(
                 f"{parameter('intervals', 'profile')} needs a cost that has its minimum at the estimate, and "
                 f"{parameter('reference')} has none; use {parameter('intervals', 'quadratic')}, or leave it out"
+            )
+        if self.priors and self.reference is not None:
+            raise ModelError(
+                f"{parameter('priors')} needs a cost that has its minimum at the estimate, and "
+                f"{parameter('reference')} has none; leave one of the two out"
             )
         if self.noise == "ar" and (self.reference is not None or self.intervals == "profile" or self.loss != "squares"):
             conflicting_option = (
@@ -313,6 +337,7 @@ class OutputError:
         values = self.start.parameters.items() if isinstance(self.start, Identification) else ()
         start_values = {n: p.value for n, p in values if not p.fixed}
         structure, bounds = check_bounds(structure, self.bounds, start_model)
+        structure = with_priors(structure, self.priors)
         if self.noise == "ar":
             check_noise_model(runs, structure)
 
@@ -362,6 +387,12 @@ class OutputError:
 
         fit, bound_findings = fit_within_bounds(structure, bounds, estimate)
         fit = replace(fit, findings=[*fit.findings, *bound_findings])
+        if self.priors and fit.joint is not None:
+            fit = replace(
+                fit,
+                findings=[*fit.findings, *prior_findings(self.priors, fit.joint)],
+                settings={**fit.settings, "priors": dict(structure.priors or {})},
+            )
         return fit if self.reference is None else with_reference_findings(fit, self.reference, instrument_findings)
 
     @property

@@ -237,9 +237,14 @@ def settings_text(settings: Mapping[str, Any]) -> str:
     text += f", offset: {settings['offset']}, one per run" if "offset" in settings else ""
     text += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
     text += f", noise: autoregression of order {len(settings['noise_model'])}" if "noise_model" in settings else ""
+    text += f", priors: {_priors_text(settings['priors'])}" if "priors" in settings else ""
     return text + (
         f", instrument: the part of the inputs that {settings['reference']} explains" if "reference" in settings else ""
     )
+
+
+def _priors_text(priors: Mapping[str, tuple[float, float]]) -> str:
+    return ", ".join(f"{name} = {mean:g} ± {deviation:g}" for name, (mean, deviation) in priors.items())
 
 
 def robust_loss_text(settings: Mapping[str, Any]) -> str:
@@ -280,6 +285,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         rows.append(["offset found by test", settings["offset_test"]])
     if "noise_model" in settings:
         rows.append(["noise", f"autoregression of order {len(settings['noise_model'])}, estimated with the model"])
+    if "priors" in settings:
+        rows.append(["priors, mean ± standard deviation", _priors_text(settings["priors"])])
     if "reference" in settings:
         rows.append(["reference", f"{settings['reference']}; instrument: the part of the inputs that it explains"])
     if searched:

@@ -136,6 +136,9 @@ class Structure:
         Name of the structure.
     hints
         Prior knowledge for initial guesses. Hints are not saved and do not affect equality of structures.
+    priors
+        (mean, standard deviation) of normal priors of free parameters by name, which :func:`ftlm.identify` sets. Like
+        hints, they are not saved and do not affect equality.
     offset
         ``"none"``; ``"constant"``: an unknown constant on the right-hand side of each equation; ``"ramp"``: a constant
         and a constant times t; ``"level"``: an unknown constant that is added to each output; ``"auto"``: the
@@ -164,6 +167,7 @@ class Structure:
     offset: Offset = "none"
     # Omitted from digests and files when unset.
     input_nonlinearities: tuple[InputNonlinearity, ...] | UnsetType = UNSET
+    priors: Mapping[str, tuple[float, float]] | UnsetType = field(default=UNSET, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.equations:

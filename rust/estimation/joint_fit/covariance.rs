@@ -26,15 +26,20 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 /// rows. [`Error::Structure`] if its singular values are not found.
 pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<Vec<f64>> {
     let series: Vec<Vec<f64>> = grid.residuals(attempt).into_iter().flatten().collect();
-    let robust_weights = grid.weights.robust_weights.is_some().then(|| grid.flat_sample_weights());
-    robust_covariance(&attempt.jacobian, series, robust_weights.as_deref())
+    let priors = grid.problem.model.priors.len();
+    let robust_weights = grid.weights.robust_weights.is_some().then(|| {
+        let mut weights = grid.flat_sample_weights();
+        weights.resize(weights.len() + priors, 1.0);
+        weights
+    });
+    robust_covariance(&attempt.jacobian, series, robust_weights.as_deref(), priors)
 }
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian and residuals.
 ///
-/// `jacobian` has one row per parameter and includes the robust weights. `series` contains the residuals by run and
-/// output, without robust weights. `robust_weights` contains the robust weight of each residual; it is None for a
-/// squared loss.
+/// `jacobian` has one row per parameter and includes the robust weights. Its last `priors` columns are the derivatives
+/// of the residuals of priors. `series` contains the residuals of samples by run and output, without robust weights.
+/// `robust_weights` contains the robust weight of each column; it is None for a squared loss.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals or `robust_weights` have
@@ -43,26 +48,34 @@ pub fn robust_covariance(
     jacobian: &[Vec<f64>],
     series: Vec<Vec<f64>>,
     robust_weights: Option<&[f64]>,
+    priors: usize,
 ) -> Result<Vec<f64>> {
     let squares = |series: &[Vec<f64>]| {
         let of = |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
         series.iter().map(of).sum::<f64>()
     };
     let Some(robust_weights) = robust_weights else {
-        return covariance_of_residuals(jacobian, &series, squares(&series));
+        return covariance_of_residuals(jacobian, &series, squares(&series), priors);
     };
     jacobian.iter().try_for_each(|row| check_length("robust weights of residuals", row.len(), robust_weights.len()))?;
-    let unweighted =
-        |(value, &robust_weight): (&f64, &f64)| value / if robust_weight > 0.0 { robust_weight } else { 1.0 };
+    let (series, moving) = huber_pseudo_residuals(series, jacobian.len());
+    let compared = robust_weights.len().saturating_sub(priors);
+    // The curvature of the loss is that of least squares times the fraction of residuals that are not clipped.
+    let unweighted = |(k, (value, &robust_weight)): (usize, (&f64, &f64))| {
+        let curvature = if k < compared { moving.sqrt() } else { 1.0 };
+        curvature * value / if robust_weight > 0.0 { robust_weight } else { 1.0 }
+    };
     let rows: Vec<Vec<f64>> =
-        jacobian.iter().map(|row| row.iter().zip(robust_weights).map(unweighted).collect()).collect();
-    let series = huber_pseudo_residuals(series, jacobian.len());
-    covariance_of_residuals(&rows, &series, squares(&series))
+        jacobian.iter().map(|row| row.iter().zip(robust_weights).enumerate().map(unweighted).collect()).collect();
+    covariance_of_residuals(&rows, &series, squares(&series), priors)
 }
 
-/// Pseudo-residuals of Huber's loss. Least squares on them has the covariance of the M-estimator.
+/// Pseudo-residuals of Huber's loss, and the fraction of residuals that are not clipped.
+///
+/// Least squares on the pseudo-residuals, with a Jacobian multiplied by the square root of the fraction, has the
+/// covariance of the M-estimator.
 #[allow(clippy::cast_precision_loss)]
-fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<Vec<f64>> {
+fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<Vec<f64>>, f64) {
     let finite: Vec<f64> = series.iter().flatten().copied().filter(|e| !e.is_nan()).collect();
     let level = match robust_deviation(&finite) {
         0.0 => 1.0,
@@ -72,14 +85,19 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<V
     let moving = (finite.iter().filter(|e| e.abs() < most).count() as f64 / count).max(1.0 / count);
     // Huber's small-sample correction.
     let few = 1.0 + parameters as f64 / count * (1.0 - moving) / moving;
-    series.iter_mut().flatten().for_each(|e| *e = if e.is_nan() { *e } else { e.clamp(-most, most) * few / moving });
-    series
+    let scale = few / moving.sqrt();
+    series.iter_mut().flatten().for_each(|e| *e = if e.is_nan() { *e } else { e.clamp(-most, most) * scale });
+    (series, moving)
 }
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian, residuals and their sum of squares.
 ///
-/// `jacobian` has one row per parameter. `series` contains the residuals by run and output, NaN for missing samples.
-/// `squares` is their sum of squares.
+/// `jacobian` has one row per parameter. Its last `priors` columns are the derivatives of the residuals of priors, which
+/// are in standard deviations of the priors. `series` contains the residuals of samples by run and output, NaN for
+/// missing samples. `squares` is their sum of squares.
+///
+/// With priors, the result is the mean square error of the estimate over noise and priors. For white noise, this is the
+/// covariance of the posterior distribution, linearized.
 ///
 /// The computation uses the singular values of the Jacobian with rows scaled to unit norm, because the normal equations
 /// would lose half of the digits. Singular values at rounding level count as zero, and the corresponding parameter
@@ -90,7 +108,12 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<V
 /// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if
 /// autocorrelated residuals have another length. [`Error::Structure`] if its singular values are not found.
 #[allow(clippy::cast_precision_loss)]
-pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squares: f64) -> Result<Vec<f64>> {
+pub fn covariance_of_residuals(
+    jacobian: &[Vec<f64>],
+    series: &[Vec<f64>],
+    squares: f64,
+    priors: usize,
+) -> Result<Vec<f64>> {
     let (p, count) = (jacobian.len(), jacobian.first().map_or(0, Vec::len));
     if p == 0 {
         return Ok(Vec::new());
@@ -134,18 +157,26 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
     // Rows of the pseudoinverse in the singular basis: the outer factor of the sandwich covariance.
     let inverse: Vec<Vec<f64>> =
         (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
-    let middle = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
-        let level = squares / finite_count.saturating_sub(p).max(1) as f64;
-        (0..p * p).map(|at| level * inner(&inverse[at / p], &inverse[at % p])).collect()
+    let compared = count.saturating_sub(priors);
+    let prior_basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][compared..count]).collect();
+    let prior_rows: Vec<Vec<f64>> =
+        inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, count - compared)).collect();
+    let from_priors = |at: usize| inner(&prior_rows[at / p], &prior_rows[at % p]);
+    let mut middle: Vec<f64> = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
+        // Number of parameters that the samples determine; the priors determine the others.
+        let degrees = p as f64 - prior_basis.iter().map(|row| inner(row, row)).sum::<f64>();
+        let level = squares / (finite_count as f64 - degrees).max(1.0);
+        (0..p * p).map(|at| level * (inner(&inverse[at / p], &inverse[at % p]) - from_priors(at))).collect()
     } else {
-        check_length("residuals", count, series.iter().map(Vec::len).sum())?;
-        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..count]).collect();
-        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, count)).collect::<Vec<_>>();
+        check_length("residuals", compared, series.iter().map(Vec::len).sum())?;
+        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..compared]).collect();
+        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, compared)).collect::<Vec<_>>();
         widen_covariance(
             autoregressive_covariance(&pseudoinverse_rows, &basis, series),
             &long_run_covariance(&pseudoinverse_rows, series)?,
         )
     };
+    middle.iter_mut().enumerate().for_each(|(at, value)| *value += from_priors(at));
     // The variance of a parameter with almost no effect can overflow.
     let mut result: Vec<f64> = (0..p * p).map(|at| middle[at] / (lengths[at / p] * lengths[at % p])).collect();
     (0..p).for_each(|i| is_unidentifiable[i] |= !result[i * p + i].is_finite());

@@ -8,6 +8,7 @@ use super::problem::{Iterate, Problem};
 use super::structure::{unique, Coefficient, Input, Law, ParametricEquation, ParametricStructure};
 use crate::equation::Initial;
 use crate::error::Result;
+use crate::estimation::optimization::prior::Prior;
 use crate::estimation::output_error::parameterization::TimeUnit as Unit;
 use crate::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial};
 use crate::fractional::kernels::MAX_ORDER;
@@ -93,7 +94,13 @@ impl ParameterSet {
             let [coulomb, stribeck, speed] = e.friction.as_ref()?.parameters().map(|(factor, c)| monomial(c, *factor));
             Some((place, FreeFrictionLaw { coulomb, stribeck, speed }))
         });
+        let inputs = structure.inputs.iter().map(|input| &input.name);
+        let prior = |(parameter, name): (usize, &String)| {
+            let (mean, deviation) = *structure.priors.get(name)?;
+            Some(Prior { parameter, mean, deviation })
+        };
         let model = FreeModel {
+            priors: orders.iter().chain(&coefficients).chain(inputs).enumerate().filter_map(prior).collect(),
             equations: structure.equations.iter().map(equation).collect(),
             order_bounds: bounds,
             coordinates: vec![Coordinate::Plain; coefficients.len()],

@@ -1,12 +1,13 @@
 //! Step refinement: the simulation step is halved until the estimate changes by a small part of its standard error.
 //! Each step defines a grid of block pulses (pulse grid).
 
-use super::covariance::covariance;
+use super::covariance::{covariance, covariance_of_residuals};
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::TimeScaling;
 use super::problem::{Iterate, OptimizationResult};
 use super::reweighting::{fit_reweighted, Loss, RobustSummary};
 use crate::error::{Error, Result};
+use crate::estimation::optimization::prior::Prior;
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;
 
@@ -61,6 +62,10 @@ pub struct OptimumStatistics {
     pub residuals: Vec<Vec<Vec<f64>>>,
     /// Counts of downweighted residuals of a robust loss; None for a squared loss.
     pub robust: Option<RobustSummary>,
+    /// Share of the information on a parameter that its prior contributes, for each prior of the problem.
+    ///
+    /// It is the variance of the posterior for white noise divided by that of the prior.
+    pub prior_shares: Vec<f64>,
 }
 
 /// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
@@ -240,11 +245,20 @@ impl<'a> Optimum<'a> {
             robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
             weights: grid.weights,
             pulses_per_sample: grid.sampling.pulses_per_sample,
+            prior_shares: prior_shares(&attempt, &grid.problem.model.priors),
             attempt,
             step_converged: has_converged,
             covariance,
         }
     }
+}
+
+/// Return the share of each prior in the information on its parameter; NaN if this is not computable.
+fn prior_shares(attempt: &OptimizationResult, priors: &[Prior]) -> Vec<f64> {
+    let size = attempt.jacobian.len();
+    let posterior = covariance_of_residuals(&attempt.jacobian, &[], 1.0, priors.len()).unwrap_or_default();
+    let variance = |parameter: usize| posterior.get(parameter * size + parameter).copied().unwrap_or(f64::NAN);
+    priors.iter().map(|prior| variance(prior.parameter) / prior.deviation.powi(2)).collect()
 }
 
 /// Return true if two estimates differ by at most a tenth of the standard errors in scaled time.

@@ -204,6 +204,10 @@ pub struct ParametricStructure {
     pub equations: Vec<ParametricEquation>,
     /// The given lower and upper bounds of free orders, by name.
     pub bounds: BTreeMap<String, (f64, f64)>,
+    /// Mean and standard deviation of the normal priors of free parameters, by name.
+    ///
+    /// Priors of parameters that are not free have no effect.
+    pub priors: BTreeMap<String, (f64, f64)>,
     /// True if simulated outputs enter the other equations, false if measured outputs do.
     pub coupled: bool,
     /// True if an input has a fixed delay.
@@ -231,6 +235,7 @@ impl ParametricStructure {
             derived: Vec::new(),
             equations,
             bounds: BTreeMap::new(),
+            priors: BTreeMap::new(),
             coupled: false,
             delayed: false,
             initial,

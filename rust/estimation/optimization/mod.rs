@@ -2,3 +2,4 @@
 
 pub mod damped_step;
 pub mod levenberg_marquardt;
+pub mod prior;

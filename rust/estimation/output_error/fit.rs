@@ -11,7 +11,8 @@ use super::parameterization::{Coordinate, FreeInput, FreeModel, ParameterPoint, 
 use super::residuals::Linearization;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::estimation::optimization::damped_step::LeastSquaresProblem;
-use crate::estimation::optimization::levenberg_marquardt::{minimize, MinimizationSettings, Status};
+use crate::estimation::optimization::levenberg_marquardt::{MinimizationSettings, Status};
+use crate::estimation::optimization::prior::minimize_with_priors;
 use crate::parallel::Stop;
 
 /// Optimum of an output-error fit.
@@ -23,6 +24,7 @@ pub struct OutputErrorFit {
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Residuals (y − ŷ)/σ with measured y, simulated ŷ and noise deviation σ, ordered by record, output and sample.
+    /// One residual (mean − value)/deviation of each prior follows.
     pub residuals: Vec<f64>,
     /// Derivatives of the residuals, one row per order, coefficient (in plain coordinates) and input parameter.
     ///
@@ -300,6 +302,7 @@ fn step_within_bounds(
 ///     coordinates: vec![Coordinate::Logarithm],
 ///     inputs: vec![],
 ///     coupled: false,
+///     priors: Vec::new(),
 ///     initial: Initial::Rest,
 /// };
 /// let start = ParameterPoint { orders: vec![1.0], coefficients: vec![1.0], inputs: vec![] };
@@ -357,7 +360,8 @@ pub fn fit_until(
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
     // If at most one evaluation is allowed, no coefficient is eliminated.
-    let linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
+    let mut linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
+    linear.retain(|&coefficient| !model.has_prior(coefficient));
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
     // Logarithmic coordinates are not needed for eliminated coefficients.
@@ -388,11 +392,11 @@ pub fn fit_until(
         caches,
         stop,
     };
-    let optimum = minimize(&problem, point, settings)?;
+    let (optimum, residuals) = minimize_with_priors(&problem, &model.priors, ParameterPoint::value, point, settings)?;
     Ok(OutputErrorFit {
         point: optimum.point,
         cost: optimum.cost,
-        residuals: optimum.evaluation.residuals().to_vec(),
+        residuals,
         jacobian: optimum.jacobian,
         initial: optimum.evaluation.initial_terms().0.to_vec(),
         exponents: optimum.evaluation.initial_terms().1.to_vec(),

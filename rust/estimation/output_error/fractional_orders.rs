@@ -498,6 +498,7 @@ mod tests {
             coordinates: vec![Coordinate::Plain; 5],
             inputs: Vec::new(),
             coupled: false,
+            priors: Vec::new(),
             initial,
         }
     }

@@ -9,6 +9,7 @@ use super::experiment::Experiment;
 use super::stability::is_unstable;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
+use crate::estimation::optimization::prior::Prior;
 use crate::regressors::Record;
 use crate::signal::block_pulse::{delay_samples, PulseJump};
 use crate::simulate::nyquist_margin;
@@ -117,6 +118,14 @@ pub struct ParameterPoint {
     pub inputs: Vec<f64>,
 }
 
+impl ParameterPoint {
+    /// Value of a parameter, numbered as orders, then coefficients, then input parameters; NaN if it does not exist.
+    pub(crate) fn value(&self, parameter: usize) -> f64 {
+        let mut values = self.orders.iter().chain(&self.coefficients).chain(&self.inputs);
+        values.nth(parameter).copied().unwrap_or(f64::NAN)
+    }
+}
+
 /// Model with free orders, coefficients and input parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeModel {
@@ -132,6 +141,8 @@ pub struct FreeModel {
     pub coupled: bool,
     /// Initial terms of each record.
     pub initial: Initial,
+    /// Normal priors of free parameters, numbered as orders, then coefficients, then input parameters.
+    pub priors: Vec<Prior>,
 }
 
 /// Minimum ratio of the denominator of the block-pulse scheme at the Nyquist frequency to its leading coefficient. A
@@ -194,7 +205,7 @@ impl FreeModel {
         {
             return refuse(format!("bounds {low} to {high} of an order"), "give two increasing orders");
         }
-        Ok(())
+        self.check_priors()
     }
 
     /// Check that an experiment is valid and has the outputs of the model.
@@ -208,6 +219,24 @@ impl FreeModel {
             return Err(Error::Structure { what, remedy: "fix its value, or resample the signal uniformly".into() });
         }
         Ok(())
+    }
+
+    /// Check that each prior is a normal distribution of a parameter that exists; [`Error::Structure`] if not.
+    fn check_priors(&self) -> Result<()> {
+        let size = self.order_bounds.len() + self.coordinates.len() + self.inputs.len();
+        for Prior { parameter, mean, deviation } in &self.priors {
+            let what = format!("the prior {mean} ± {deviation} of parameter {parameter} of {size}");
+            if *parameter >= size || !mean.is_finite() || !(deviation.is_finite() && *deviation > 0.0) {
+                let remedy = "number parameters from 0, and give a finite mean and a positive standard deviation";
+                return Err(Error::Structure { what, remedy: remedy.into() });
+            }
+        }
+        Ok(())
+    }
+
+    /// Return true if a coefficient has a prior.
+    pub(crate) fn has_prior(&self, coefficient: usize) -> bool {
+        self.priors.iter().any(|prior| prior.parameter == self.order_bounds.len() + coefficient)
     }
 
     /// Index of the free input parameter of a signal; None if it has none.

@@ -76,7 +76,8 @@ impl JointProblem {
     /// `start` holds the values of the free parameters, and the initial states of runs with friction. The coordinate of
     /// a nonzero coefficient is its logarithm, or the coefficient itself if `plain` is true or there are non-linear
     /// terms. `fixed` holds the indices of fixed parameters. With `requires_stability`, no step leads from a stable
-    /// model to an unstable one.
+    /// model to an unstable one. The cost includes the priors of the structure. The returned residuals and the Jacobian are
+    /// those of the samples alone.
     #[pyo3(signature = (runs, start, plain, fixed, evaluations, tolerance, requires_stability, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn minimize<'py>(
@@ -100,9 +101,13 @@ impl JointProblem {
         }
         let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
         let points = count_evaluated_pulses(&experiments, evaluations);
-        let optimum = run_interruptible(py, points, stop, move |stop| {
+        let priors = self.inner.problem.model.priors.len();
+        let mut optimum = run_interruptible(py, points, stop, move |stop| {
             free.problem_at(&place, plain, &fixed).minimize(&experiments, &place, settings, requires_stability, stop)
         })?;
+        for values in std::iter::once(&mut optimum.residuals).chain(&mut optimum.jacobian) {
+            values.truncate(values.len().saturating_sub(priors));
+        }
         let dict = PyDict::new(py);
         dict.set_item("values", optimum.values())?;
         dict.set_item("states", &optimum.iterate.states)?;

@@ -30,7 +30,7 @@ pub fn covariance_of<'py>(
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
     let covariance =
-        run_interruptible(py, points, None, move |_| spread::covariance_of_residuals(&jacobian, &series, squares))?;
+        run_interruptible(py, points, None, move |_| spread::covariance_of_residuals(&jacobian, &series, squares, 0))?;
     matrix(py, covariance, size)
 }
 
@@ -47,8 +47,9 @@ pub fn fit_covariance<'py>(
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let shares = shares.map(|shares| vector("shares", &shares)).transpose()?;
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let covariance =
-        run_interruptible(py, points, None, move |_| spread::robust_covariance(&jacobian, series, shares.as_deref()))?;
+    let covariance = run_interruptible(py, points, None, move |_| {
+        spread::robust_covariance(&jacobian, series, shares.as_deref(), 0)
+    })?;
     matrix(py, covariance, size)
 }
 

@@ -123,7 +123,7 @@ impl<'a> ProfileLikelihood<'a> {
 
     fn at(free: &'a ParameterSet, grid: Objective<'a>, values: &[f64], evaluations: usize) -> Result<Self> {
         let best = minimize(free, &grid, values, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let inverse_hessian = covariance_of_residuals(&best.jacobian, &[], 1.0)?;
+        let inverse_hessian = covariance_of_residuals(&best.jacobian, &[], 1.0, grid.problem.model.priors.len())?;
         let (spread, size) = (covariance(&best, &grid)?, values.len());
         let diagonal = |of: &[f64]| (0..size).map(|i| of[i * size + i]).collect::<Vec<f64>>();
         let (variances, curvatures) = (diagonal(&spread), diagonal(&inverse_hessian));

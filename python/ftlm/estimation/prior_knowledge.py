@@ -1,22 +1,28 @@
-"""Bounds on coefficients, imposed by an active-set method.
+"""Prior knowledge of parameters: bounds and normal priors.
 
-A coefficient beyond its bound is fixed at the bound, and the others are fitted again.
+Bounds are imposed by an active-set method: a coefficient beyond its bound is fixed at the bound, and the others are
+fitted again. Priors add their squared deviations to the cost of a fit, so that it maximizes the posterior density.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 from ftlm.errors import ConvergenceError, ModelError
+from ftlm.estimation.free_parameters import FreeProblem
+from ftlm.estimation.output_error import JointFit
 from ftlm.findings import Finding, make_finding
 from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.validation import check_known, join_names, real_number
 
 Bounds = Mapping[str, tuple[float, float]]
+#: Mean and standard deviation of the normal priors of parameters by name.
+Priors = Mapping[str, tuple[float, float]]
 
 FitType = TypeVar("FitType")
 
@@ -36,6 +42,76 @@ def check_intervals(bounds: object, *, finite: bool = False) -> None:
             )
 
 
+def check_distributions(priors: object) -> None:
+    """Raise ModelError unless `priors` maps names to pairs of a finite mean and a positive standard deviation."""
+    if not isinstance(priors, Mapping):
+        raise ModelError(f"priors = {priors!r} is not a mapping; write {{name: (mean, standard deviation)}}")
+    for name, pair in priors.items():
+        numbers = [real_number(f"prior of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
+        if not (len(numbers) == 2 and all(map(math.isfinite, numbers)) and numbers[1] > 0.0):
+            raise ModelError(
+                f"prior of {name} = {pair!r} is not a finite mean and a positive standard deviation; write "
+                f"{parameter('priors', {name: (Placeholder('mean'), Placeholder('deviation'))})}"
+            )
+
+
+def _check_independent(option: str, names: Iterable[str], structure: Structure) -> None:
+    """Raise ModelError for a coefficient that follows from a coefficient law, and so is not a free parameter."""
+    laws = {name: (factor, factors) for name, factor, factors in structure.coefficient_law}
+    for name in names:
+        if name in laws:
+            factor, factors = laws[name]
+            product = " ".join([*([] if factor == 1.0 else ["-" if factor == -1.0 else f"{factor:g}"]), *factors])
+            allowed = join_names([n for n in factors if n in structure.coefficient_names])
+            raise ModelError(
+                f"{parameter(option)} has {name}, which follows from the coefficient law {name} = {product}; "
+                f"{f'use {allowed}, or ' if allowed else ''}identify without the law"
+            )
+
+
+def with_priors(structure: Structure, priors: Priors | None) -> Structure:
+    """Return the structure with normal priors of free parameters, such as orders, coefficients and delays.
+
+    Raises
+    ------
+    ModelError
+        If a name is not a free parameter, or a prior is not a pair of a finite mean and a positive deviation.
+    """
+    check_distributions(priors or {})
+    if not priors:
+        return structure
+    _check_independent("priors", priors, structure)
+    check_known("prior of", priors, FreeProblem.of(replace(structure, initial="rest", offset="none")).names)
+    return replace(
+        structure, priors={name: (float(mean), float(deviation)) for name, (mean, deviation) in priors.items()}
+    )
+
+
+#: Distance of the estimate without a prior from the mean of the prior, in standard deviations of their difference,
+#: above which the two disagree.
+MAX_PRIOR_DISTANCE = 3.0
+#: Share of the information on a parameter above which its prior determines it.
+DETERMINING_SHARE = 0.5
+
+
+def prior_findings(priors: Priors, joint: JointFit) -> list[Finding]:
+    """Return findings on priors that the runs contradict, and on parameters that the priors determine.
+
+    If a prior of variance s² contributes the share w of the information, the estimate without it differs from the mean
+    of the prior by (estimate - mean) / (1 - w), and the variance of this difference is s² / (1 - w).
+    """
+    findings = []
+    for name, share in joint.prior_shares.items():
+        (mean, deviation), value = priors[name], joint.values_by_name[name]
+        numbers = {"parameter": name, "value": value, "mean": mean, "deviation": deviation}
+        distance = abs(value - mean) / (deviation * math.sqrt(1.0 - share)) if share < 1.0 else 0.0
+        if distance > MAX_PRIOR_DISTANCE:
+            findings.append(make_finding("prior_contradicts_runs", distance=distance, **numbers))
+        if share > DETERMINING_SHARE:
+            findings.append(make_finding("prior_determines_parameter", share=100.0 * share, **numbers))
+    return findings
+
+
 def check_bounds(structure: Structure, bounds: Bounds | None, start: object = None) -> tuple[Structure, Bounds]:
     """Return the structure with the bounds of its orders, and the bounds of its coefficients.
 
@@ -48,17 +124,8 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     check_intervals(bounds or {})
     out, limits = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
-    # A coefficient that follows from a law is not a free parameter.
-    laws = {name: (factor, factors) for name, factor, factors in structure.coefficient_law}
-    for name in limits:
-        if name in laws:
-            factor, factors = laws[name]
-            product = " ".join([*([] if factor == 1.0 else ["-" if factor == -1.0 else f"{factor:g}"]), *factors])
-            allowed = join_names([n for n in factors if n in structure.coefficient_names])
-            raise ModelError(
-                f"{parameter('bounds')} has {name}, which follows from the coefficient law {name} = {product}; "
-                f"{f'bound {allowed}, or ' if allowed else ''}identify without the law"
-            )
+    _check_independent("bounds", limits, structure)
+    laws = {name for name, _, _ in structure.coefficient_law}
     free = [n for n in structure.coefficient_names if n not in laws]
     check_known("bound of", limits, [*free, *structure.order_names, *inputs])
     for name, pair in limits.items():

@@ -1,0 +1,196 @@
+"""Normal priors of parameters beside the maximum of the posterior density that SciPy finds by its own simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm.cli.main import app
+
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
+STEP, COUNT = 0.02, 600
+TIME = STEP * np.arange(COUNT)
+INPUT = np.where(np.sin(1.3 * TIME) + np.sin(3.1 * TIME + 1) > 0, 1.0, -1.0)
+OSCILLATOR = "D^2 y = a1 D y + a0 y + b u"
+TRUTH = {"a1": -0.05, "a0": -4.0, "b": 3.0}
+
+
+def oscillator(a1: float, a0: float, b: float) -> np.ndarray:
+    """Return exact samples of the oscillator for a held input."""
+    whole = expm(STEP * np.array([[0, 1, 0], [a0, a1, b], [0, 0, 0]]))
+    states = [np.zeros(2)]
+    for held in INPUT[:-1]:
+        states.append(whole[:2, :2] @ states[-1] + whole[:2, 2] * held)
+    return np.array(states)[:, 0]
+
+
+def noisy(seed: int, deviation: float, count: int = COUNT) -> ftlm.Run:
+    y = oscillator(**TRUTH) + deviation * np.random.default_rng(seed).standard_normal(COUNT)
+    return ftlm.Run.from_arrays(outputs={"y": y[:count]}, inputs={"u": INPUT[:count]}, step=STEP)
+
+
+def values(found: ftlm.Identification, names: tuple[str, ...] = tuple(TRUTH)) -> list[float]:
+    return [found.parameters[n].value for n in names]
+
+
+def errors(found: ftlm.Identification, names: tuple[str, ...] = tuple(TRUTH)) -> list[float]:
+    return [found.parameters[n].standard_error for n in names]
+
+
+@pytest.mark.parametrize(
+    "priors",
+    [
+        {"b": (3.2, 0.05)},
+        {"a1": (-0.08, 0.01), "b": (2.9, 0.03)},
+        {"a1": (-0.05, 1e-4), "a0": (-4.0, 1e-4), "b": (3.0, 1e-4)},
+    ],
+)
+def test_the_estimate_is_the_maximum_of_the_posterior_and_its_errors_are_the_inverse_information(priors):
+    run = noisy(0, 0.5)
+    found = ftlm.identify(run, OSCILLATOR, priors=priors)
+    noise = found.settings["noise"]["y"]
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        deviations = [(p[k] - priors[n][0]) / priors[n][1] for k, n in enumerate(TRUTH) if n in priors]
+        # The first sample of a run at rest is an initial value, which has no residual.
+        return np.r_[(oscillator(*p) - run["y"])[1:] / noise, deviations]
+
+    oracle = least_squares(residuals, [*TRUTH.values()], x_scale=[0.01, 0.1, 0.1], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    posterior = np.sqrt(np.diag(np.linalg.inv(oracle.jac.T @ oracle.jac)))
+    # The noise level, and so the weight of the priors, is iterated to one per cent.
+    assert np.abs((values(found) - oracle.x) / posterior).max() < 0.05
+    assert errors(found) == pytest.approx(posterior, rel=0.01)
+
+
+def test_standardized_errors_of_drawn_parameters_have_unit_mean_square():
+    """Parameters are drawn from the prior, with which the posterior is calibrated."""
+    squares = []
+    random = np.random.default_rng(5)
+    prior = {"a1": (-0.05, 0.02), "b": (3.0, 0.05)}
+    for _ in range(40):
+        truth = {**TRUTH, **{n: mean + s * random.standard_normal() for n, (mean, s) in prior.items()}}
+        y = oscillator(**truth) + 0.5 * random.standard_normal(COUNT)
+        run = ftlm.Run.from_arrays(outputs={"y": y}, inputs={"u": INPUT}, step=STEP)
+        method = ftlm.OutputError(priors=prior, start=TRUTH, intervals="quadratic")
+        found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", method=method)
+        squares.append(np.square((np.array(values(found)) - [*truth.values()]) / errors(found)))
+    # Mean of 120 squares of normal numbers, of which those of a0 and b are correlated.
+    assert 0.7 < np.mean(squares) < 1.35
+
+
+@pytest.mark.parametrize(
+    ("structure", "options"),
+    [
+        ("D^alpha y = a y + b u", {}),
+        ("D^alpha y = a y + b u", {"method": ftlm.OutputError(loss="huber")}),
+        ("D^alpha y = a y + b u", {"method": ftlm.OutputError(noise="ar")}),
+        ("D^alpha y = a y + c y^3 + b u", {}),
+        ("D^alpha y = a y + b u(t - 0:0.2)", {}),
+    ],
+    ids=["linear", "huber", "autoregression", "cube", "delay"],
+)
+def test_a_sharp_prior_is_a_fixed_value_and_a_vague_one_changes_nothing(structure, options):
+    rng = np.random.default_rng(2)
+    delay = {"u": 0.06} if "0:0.2" in structure else {}
+    model = ftlm.Model(ftlm.equation("D^0.8 y = -1.5 y + 2 u", delay=delay))
+    u = np.repeat(rng.choice([-1.0, 1.0], 20), 15)
+    y = model.simulate(ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": 0 * u}, step=0.04))["y"]
+    y = y + 0.01 * rng.standard_normal(u.size)
+    run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.04)
+    sharp = ftlm.identify(run, structure, priors={"alpha": (0.75, 1e-7)}, **options)
+    fixed = ftlm.identify(run, structure.replace("alpha", "0.75"), **options)
+    names = tuple(fixed.parameters)
+    assert sharp.parameters["alpha"].value == pytest.approx(0.75, abs=1e-5)
+    assert values(sharp, names) == pytest.approx(values(fixed, names), rel=2e-3, abs=2e-4)
+    assert errors(sharp, names) == pytest.approx(errors(fixed, names), rel=0.05)
+    free = ftlm.identify(run, structure, **options)
+    vague = ftlm.identify(run, structure, priors={n: (p.value, 1e4) for n, p in free.parameters.items()}, **options)
+    names = tuple(free.parameters)
+    assert np.abs(np.subtract(values(vague, names), values(free, names)) / errors(free, names)).max() < 0.02
+    assert errors(vague, names) == pytest.approx(errors(free, names), rel=0.02)
+
+
+def test_a_prior_contributes_what_a_short_run_lacks():
+    """In 40 rows, damping is hardly visible; the same record and a prior determine it."""
+    run = noisy(1, 0.02, 40)
+    alone = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none")
+    found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", priors={"a1": (-0.05, 0.005)})
+    assert alone.parameters["a1"].standard_error > 0.05
+    assert found.parameters["a1"].standard_error == pytest.approx(0.005, rel=0.05)
+    assert found.parameters["a0"].standard_error < alone.parameters["a0"].standard_error
+    assert [f.parameter for f in found.findings if f.code == "prior_determines_parameter"] == ["a1"]
+    assert "priors: a1 = -0.05 ± 0.005" in found.details()
+
+
+def test_profile_intervals_include_the_prior():
+    run = noisy(1, 0.02, 40)
+    method = ftlm.OutputError(intervals="profile", priors={"a1": (-0.05, 0.005)})
+    found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", method=method)
+    low, high = found.parameters["a1"].interval
+    assert (high - low) / 2 == pytest.approx(1.96 * 0.005, rel=0.05)
+
+
+@pytest.mark.parametrize(("mean", "contradicts"), [(3.0, False), (3.1, False), (3.6, True), (2.4, True)])
+def test_a_prior_that_the_runs_contradict_is_named(mean, contradicts):
+    found = ftlm.identify(noisy(0, 0.5), OSCILLATOR, priors={"b": (mean, 0.05)})
+    assert any(f.code == "prior_contradicts_runs" for f in found.findings) == contradicts
+    if contradicts:
+        assert any("the runs contradict the prior of b" in reason for reason in found.verdict.reasons)
+
+
+def test_the_distance_of_a_true_prior_is_a_normal_number():
+    """Means are drawn around the truth; the estimate without the prior is then as far from them as computed."""
+    random, exceeded = np.random.default_rng(8), []
+    for seed in range(60):
+        run, mean = noisy(seed, 0.5), 3.0 + 0.05 * random.standard_normal()
+        method = ftlm.OutputError(priors={"b": (mean, 0.05)}, start=TRUTH, intervals="quadratic")
+        found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", method=method)
+        exceeded += [f.code for f in found.findings if f.code == "prior_contradicts_runs"]
+    assert len(exceeded) <= 2
+
+
+def test_the_command_line_has_priors(tmp_path):
+    run = noisy(0, 0.5)
+    run.to_csv(tmp_path / "run.csv")
+    called = ["identify", str(tmp_path / "run.csv"), "--structure", OSCILLATOR, "--priors", "b=3.2:0.05"]
+    done = CliRunner().invoke(app, [*called, "-u", "u", "-y", "y"])
+    assert done.exit_code == 0, done.output
+    expected = ftlm.identify(run, OSCILLATOR, priors={"b": (3.2, 0.05)}).parameters["b"].value
+    assert f"b = {expected:.3f}: its prior 3.2 ± 0.05" in done.output
+    done = CliRunner().invoke(app, [*called[:-1], "b=3.2", "-u", "u", "-y", "y"])
+    assert done.exit_code != 0
+    assert "prior of b = 3.2 is not a finite mean and a positive standard deviation" in done.output.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("priors", "options", "words"),
+    [
+        ({"B": (0, 1)}, {}, "prior of 'B' does not occur in the equation; known: a1, a0, b"),
+        ({"b": (2, 0)}, {}, r"prior of b = \(2, 0\) is not a finite mean and a positive standard deviation"),
+        ({"b": (math.nan, 1)}, {}, "is not a finite mean and a positive standard deviation; write priors="),
+        ({"b": 3}, {}, "prior of b = 3 is not a finite mean"),
+        ({"b": (0, math.inf)}, {}, "is not a finite mean"),
+        ([("b", 1)], {}, "priors = .* is not a mapping; write"),
+        ({"b": (0, 1)}, {"method": "least-squares"}, "priors= is not used by method='least-squares'"),
+        ({"b": (0, 1)}, {"method": ftlm.OutputError(reference="r")}, "priors= needs a cost that has its minimum"),
+    ],
+)
+def test_invalid_priors_are_refused(priors, options, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        ftlm.identify(noisy(0, 0.5), OSCILLATOR, priors=priors, **options)
+
+
+def test_a_coefficient_that_follows_from_a_law_has_no_prior_of_its_own():
+    structure = ftlm.flexible_link()
+    name = structure.coefficient_law[0][0] if structure.coefficient_law else None
+    assert name is not None
+    run = noisy(0, 0.5)
+    with pytest.raises(ftlm.ModelError, match=f"priors= has {name}, which follows from the coefficient law"):
+        ftlm.identify(run.rename({"y": structure.outputs[0]}), structure, priors={name: (0.0, 1.0)})
