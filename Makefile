@@ -29,7 +29,7 @@ lint: $(VENV)/.built
 	cargo fmt --check
 	cargo clippy --release --all-targets --quiet -- -D warnings
 	cargo clippy --release --all-targets --features python --quiet -- -D warnings
-	cargo doc --no-deps --quiet --features rig,oracles
+	cargo doc --release --no-deps --quiet --features rig,oracles
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy

@@ -1,18 +1,22 @@
-"""What one writes without ftlm, beside it: SciPy's least_squares on a Grünwald-Letnikov simulator, orders free.
+"""Free orders of ftlm beside those of SciPy's least_squares with a Grünwald-Letnikov simulator, and of FOMCON's fid.
 
-``python benches/alternatives.py [SEEDS]``: a motor's speed, a heated rod and a flexible tip, 400 samples with noise of
-2 % of the deviation, validated on another input without noise. The records are Grünwald-Letnikov runs at a fortieth of
-the step: neither rival's own scheme. SciPy starts at coefficients of one with their signs and whole orders, and at five
-more places of which the best counts; its intervals are of its Jacobian. FOMCON under Octave is not measured: Octave is
-packaged, FOMCON is in no registry of packages.
+``python benches/alternatives.py [SEEDS] [FOMCON]``: a motor's speed, a heated rod and a flexible tip, 400 samples with
+noise of 2 % of the standard deviation, validated on another input without noise. The records are Grünwald-Letnikov
+simulations at a fortieth of the step, which is the scheme of none of the three. SciPy and FOMCON start at coefficients
+of one with the right signs and at integer orders; SciPy also at five more points, of which the best fit counts. The
+intervals of SciPy follow from its Jacobian; FOMCON has none. FOMCON needs Octave with its packages optim and control,
+and FOMCON is the folder of its sources (github.com/AlekseiTepljakov/fomcon-matlab).
 """
 
 from __future__ import annotations
 
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -104,6 +108,29 @@ def by_scipy(plant: Plant, u: np.ndarray, y: np.ndarray, starts: Sequence[dict[s
     return dict(zip(names, best.x, strict=True)), dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 
+def by_fomcon(
+    sources: str, plant: Plant, inputs: tuple[np.ndarray, np.ndarray], outputs: Sequence[np.ndarray]
+) -> list[tuple[float, float, np.ndarray]]:
+    """Processor time [s], alpha and response to the second input of a fit by fid to each output.
+
+    A held input reaches the samples of FOMCON's implicit scheme one step later, as in :func:`sampled`.
+    """
+    t = np.arange(SAMPLES) * plant.step
+    late = [np.concatenate([[0.0], u[:-1]]) for u in inputs]
+    first = plant.first
+    start = [first["b0"] / -first["a0"], 1 / -first["a0"], first["alpha"]]
+    start += [] if plant.mu is None else [first["a1"] / first["a0"], first["mu"]]
+    with tempfile.TemporaryDirectory() as folder:
+        tables = {"train": np.stack([t, late[0], *outputs], axis=1), "test": np.stack([t, late[1]], axis=1)}
+        for name, table in {**tables, "start": np.array([start])}.items():
+            np.savetxt(Path(folder, f"{name}.csv"), table, delimiter=",", fmt="%.17g")
+        script = Path(__file__).with_name("fomcon_fid.m")
+        command = ["octave-cli", str(script), sources, folder]
+        lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    rows = [np.array(line.split(), dtype=float) for line in lines]
+    return [(row[0], row[1], row[2:]) for row in rows]
+
+
 def processor_time(work: Callable[[], object]) -> tuple[float, object]:
     """Processor time of all threads, and what came of it."""
     start_time = time.process_time()
@@ -111,16 +138,18 @@ def processor_time(work: Callable[[], object]) -> tuple[float, object]:
     return time.process_time() - start_time, result
 
 
-def measure(plant: Plant, seeds: int) -> list[str]:
+def measure(plant: Plant, seeds: int, fomcon: str | None) -> list[str]:
     """A row for each way."""
     t = np.arange(SAMPLES) * plant.step
     square = np.where((t / (SAMPLES * plant.step / 6)).astype(int) % 2 == 0, 1.0, -1.0)
     chirp = np.sin(2 * np.pi * 8 * (t / t[-1]) ** 1.6)
     clean, other = (sampled(plant.truth, u, plant.step, FINER) for u in (square, chirp))
     ways: dict[str, list[tuple[float, float, int, float]]] = {}
+    outputs = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         y = clean + NOISE * np.std(clean) * rng.standard_normal(SAMPLES)
+        outputs.append(y)
         run = ftlm.Run.from_arrays(step=plant.step, inputs={"u": square}, outputs={"y": y})
         unseen = ftlm.Run.from_arrays(step=plant.step, inputs={"u": chirp}, outputs={"y": other})
         seconds, result = processor_time(lambda run=run, plant=plant: ftlm.identify(run, ftlm.equation(plant.words)))
@@ -142,21 +171,29 @@ def measure(plant: Plant, seeds: int) -> list[str]:
             hits = sum(abs(values[n] - plant.truth[n]) <= 1.96 * errors[n] for n in plant.truth)
             model = fit(other, sampled(values, chirp, plant.step))
             ways.setdefault(name, []).append((seconds, model, hits, abs(values["alpha"] - plant.alpha)))
+    if fomcon is not None:
+        ways["FOMCON, one start"] = [
+            (seconds, fit(other, response), 0, abs(alpha - plant.alpha))
+            for seconds, alpha, response in by_fomcon(fomcon, plant, (square, chirp), outputs)
+        ]
     count = len(plant.truth)
     rows = []
     for name, each in ways.items():
         seconds, fits, hits, off = (np.array(v) for v in zip(*each, strict=True))
         ratio = float(np.median(seconds) / np.median([s for s, *_ in ways["ftlm, no start"]]))
+        held = "–" if name.startswith("FOMCON") else f"{100 * np.sum(hits) / (count * seeds):.0f}"
         rows.append(
             f"| {plant.name} | {name} | {np.median(fits):.1f} | {np.min(fits):.1f} | {np.median(off):.3f} | "
-            f"{100 * np.sum(hits) / (count * seeds):.0f} | {ratio:.2g} |"
+            f"{held} | {ratio:.2g} |"
         )
     return rows
 
 
 def main() -> None:
     """Measure, print and keep."""
-    seeds = next((int(word) for word in sys.argv[1:] if word.isdigit()), 5)
+    words = [word for word in sys.argv[1:] if word != "--write"]
+    seeds = next((int(word) for word in words if word.isdigit()), 5)
+    fomcon = next((word for word in words if not word.isdigit()), None)
     lines = [
         f"{SAMPLES} samples, noise {NOISE:.0%}, seeds 0 to {seeds - 1}.",
         "",
@@ -165,8 +202,9 @@ def main() -> None:
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for plant in PLANTS:
-        lines += measure(plant, seeds)
-        print("\n".join(lines[-3:]), flush=True)
+        rows = measure(plant, seeds, fomcon)
+        lines += rows
+        print("\n".join(rows), flush=True)
     if "--write" in sys.argv:
         save([f"{heading()}: {lines[0]}", *lines[1:]])
 

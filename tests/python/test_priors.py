@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +43,13 @@ def values(found: ftlm.Identification, names: tuple[str, ...] = tuple(TRUTH)) ->
 
 def errors(found: ftlm.Identification, names: tuple[str, ...] = tuple(TRUTH)) -> list[float]:
     return [found.parameters[n].standard_error for n in names]
+
+
+def assert_prior_is_fixed(sharp: ftlm.Identification, fixed: ftlm.Identification) -> None:
+    """Check that a sharp prior gives the estimates and the standard errors of a fit with a fixed value."""
+    names = tuple(fixed.parameters)
+    assert np.abs(np.subtract(values(sharp, names), values(fixed, names)) / errors(fixed, names)).max() < 0.05
+    assert errors(sharp, names) == pytest.approx(errors(fixed, names), rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -106,15 +114,52 @@ def test_a_sharp_prior_is_a_fixed_value_and_a_vague_one_changes_nothing(structur
     run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.04)
     sharp = ftlm.identify(run, structure, priors={"alpha": (0.75, 1e-7)}, **options)
     fixed = ftlm.identify(run, structure.replace("alpha", "0.75"), **options)
-    names = tuple(fixed.parameters)
     assert sharp.parameters["alpha"].value == pytest.approx(0.75, abs=1e-5)
-    assert values(sharp, names) == pytest.approx(values(fixed, names), rel=2e-3, abs=2e-4)
-    assert errors(sharp, names) == pytest.approx(errors(fixed, names), rel=0.05)
+    assert_prior_is_fixed(sharp, fixed)
     free = ftlm.identify(run, structure, **options)
     vague = ftlm.identify(run, structure, priors={n: (p.value, 1e4) for n, p in free.parameters.items()}, **options)
     names = tuple(free.parameters)
     assert np.abs(np.subtract(values(vague, names), values(free, names)) / errors(free, names)).max() < 0.02
     assert errors(vague, names) == pytest.approx(errors(free, names), rel=0.02)
+
+
+def test_a_sharp_prior_of_friction_is_a_fixed_friction():
+    rng, step, position, speed, rows = np.random.default_rng(0), 0.01, 0.0, 0.0, []
+    force = np.repeat(rng.choice([-3.0, 0.0, 3.0], 30), 20)
+    for applied in force:
+        rows.append(position)
+        for _ in range(20):
+            drive = applied - 0.5 * speed
+            friction = 0.8 * np.sign(speed) if speed else np.clip(drive, -0.8, 0.8)
+            following = speed + step / 20 * (drive - friction)
+            speed = 0.0 if speed * following < 0 else following
+            position += step / 20 * speed
+    y = np.array(rows) + 1e-3 * rng.standard_normal(force.size)
+    run = ftlm.Run.from_arrays(inputs={"u": force}, outputs={"y": y}, step=step)
+    sharp = ftlm.identify(run, "D^2 y = -a D y + b u - fc*sign(D y)", priors={"fc": (0.7, 1e-6)})
+    assert_prior_is_fixed(sharp, ftlm.identify(run, "D^2 y = -a D y + b u - 0.7*sign(D y)"))
+
+
+@pytest.mark.parametrize("coupling", ["simulated", "measured"])
+def test_a_prior_holds_in_coupled_equations(coupling):
+    rng, step, state, rows = np.random.default_rng(0), 0.02, np.zeros(5), []
+    system = np.zeros((5, 5))
+    system[:4, :4] = [[0, 1, 0, 0], [-9, -0.3, 2, 0], [0, 0, 0, 1], [1, 0, -4, -0.2]]
+    system[1, 4] = 3.0
+    transition, u = expm(step * system), np.repeat(rng.choice([-1.0, 1.0], 40), 15)
+    for held in u:
+        rows.append(state[[0, 2]])
+        state = transition @ [*state[:4], held]
+    y, z = np.transpose(rows) + [[0.01], [0.002]] * rng.standard_normal((2, u.size))
+    run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y, "z": z}, step=step)
+    second = ftlm.equation("D^2 z = d D z + e z + g y").equations[0]
+
+    def structure(k: str) -> ftlm.Structure:
+        first = ftlm.equation(f"D^2 y = a D y + c y + {k} z + b u")
+        return replace(first, equations=(first.equations[0], second), coupling=coupling)
+
+    sharp = ftlm.identify(run, structure("k"), offset="none", priors={"k": (1.8, 1e-7)})
+    assert_prior_is_fixed(sharp, ftlm.identify(run, structure("1.8"), offset="none"))
 
 
 def test_a_prior_contributes_what_a_short_run_lacks():

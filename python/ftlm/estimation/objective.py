@@ -210,11 +210,15 @@ def covariance(iterate: Iterate, objective: Objective) -> Floats:
     """Return the covariance matrix of the parameters at an optimum, robust to colored residuals.
 
     A parameter that is not identifiable has infinite variance, because small singular values are not truncated. With a
-    robust loss the matrix is the covariance of an M-estimator.
+    robust loss the matrix is the covariance of an M-estimator. Priors of the structure are further observations.
     """
     series = [residuals for run_residuals in objective.residuals(iterate) for residuals in run_residuals.values()]
-    robust_weights = None if objective.robust_weights is None else objective.residual_weights
-    return _core.fit_covariance(np.asarray(iterate.outcome["jacobian"]), series, robust_weights)
+    jacobian, names = np.asarray(iterate.outcome["jacobian"]), objective.problem.names
+    priors = {names.index(n): s for n, (_, s) in (objective.problem.structure.priors or {}).items() if n in names}
+    columns = np.zeros((len(jacobian), len(priors)))
+    columns[list(priors), range(len(priors))] = [-1.0 / s for s in priors.values()]
+    weights = None if objective.robust_weights is None else np.r_[objective.residual_weights, np.ones(len(priors))]
+    return _core.fit_covariance(np.hstack([jacobian, columns]), series, weights, len(priors))
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
