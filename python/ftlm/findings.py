@@ -256,15 +256,15 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         return self._render("; ".join(part for part in (topic.remedy, topic.alternative) if part))
 
     def _render(self, template: str) -> str:
-        words: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
+        fields: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
         # An option in the words of the one who loaded the run means nothing to the reader of a page.
         otherwise = self.numbers.get("otherwise", "") if current_interface() in TYPED_INTERFACES else ""
         otherwise = f"; otherwise {otherwise}" if otherwise else ""
-        words |= {**self.numbers, "otherwise": otherwise, "ask": _Reference(), "choose": _Choice()}
+        fields |= {**self.numbers, "otherwise": otherwise, "ask": _Reference(), "choose": _Choice()}
         try:
             if "{remedy}" in template:
-                words["remedy"] = self.remedy
-            return _Sentence().vformat(template, (), words)
+                fields["remedy"] = self.remedy
+            return _Sentence().vformat(template, (), fields)
         except (KeyError, ValueError, TypeError):
             # A finding from a file may lack a number of the sentence.
             return self.code
@@ -291,13 +291,13 @@ def _storable(value: float | str) -> float | int | str:
     return value if isinstance(value, str) else int(value)
 
 
-def make_finding(code: str, **words: Any) -> Finding:
+def make_finding(code: str, **fields: Any) -> Finding:
     """Return the finding with the given code; keyword arguments are its subjects and numbers by name.
 
     Raise ModelError if the code is not in the catalogue.
     """
-    subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
-    return Finding(code, **subject, numbers=words)
+    subject = {n: fields.pop(n) for n in SUBJECT_FIELDS if n in fields}
+    return Finding(code, **subject, numbers=fields)
 
 
 def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
@@ -339,8 +339,8 @@ class FindingGroup:
     @property
     def count(self) -> str:
         """Text such as " (and 2 more alike)" on the findings after the first; empty for a single finding."""
-        more = len(self.findings) - 1
-        return f" (and {more} more alike)" if more else ""
+        count = len(self.findings) - 1
+        return f" (and {count} more alike)" if count else ""
 
     @property
     def remedy(self) -> str:
@@ -358,12 +358,14 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
     Each finding of the topic "other" forms its own group.
     """
     order = list(finding_catalogue().topics)
-    by: dict[tuple[int, int, int], list[Finding]] = {}
-    for place, item in enumerate(unique(findings)):
-        alone = place if item.kind.topic == "other" else 0
-        by.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), alone), []).append(item)
+    groups: dict[tuple[int, int, int], list[Finding]] = {}
+    for index, item in enumerate(unique(findings)):
+        singleton = index if item.kind.topic == "other" else 0
+        groups.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), singleton), []).append(item)
     # Within a group, findings with their own remedy precede those with the remedy of their topic.
-    return tuple(FindingGroup(tuple(sorted(by[key], key=lambda item: not item.kind.remedy))) for key in sorted(by))
+    return tuple(
+        FindingGroup(tuple(sorted(g, key=lambda item: not item.kind.remedy))) for _, g in sorted(groups.items())
+    )
 
 
 def hidden_findings_text(groups: Sequence[FindingGroup]) -> str:

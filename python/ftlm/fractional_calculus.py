@@ -122,15 +122,15 @@ def fractional_derivative(
     values = as_floats("initial", [] if initial is None else initial)
     alpha, width = real_number("order", order), real_number("step", step)
 
-    def work(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def differentiate(rows: NDArray[np.float64]) -> NDArray[np.float64]:
         if values.ndim <= 1:
-            starts = np.broadcast_to(values.reshape(1, -1), (rows.shape[0], values.size))
+            initial_values = np.broadcast_to(values.reshape(1, -1), (rows.shape[0], values.size))
         else:
-            starts = values.reshape(-1, values.shape[-1])
-        starts = np.ascontiguousarray(starts)
-        return _core.fractional_derivative(rows, alpha, width, definition, starts)
+            initial_values = values.reshape(-1, values.shape[-1])
+        initial_values = np.ascontiguousarray(initial_values)
+        return _core.fractional_derivative(rows, alpha, width, definition, initial_values)
 
-    return apply_along_axis(x, axis, work)
+    return apply_along_axis(x, axis, differentiate)
 
 
 @check_arguments

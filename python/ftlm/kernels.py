@@ -154,8 +154,8 @@ def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.floa
     values, orders = finite_floats("x", x), finite_floats("order", order)
     m = _length("x", values)
     lead = _broadcast({"x": values.shape[:-1], "order": orders.shape})
-    distinct, groups = np.unique(np.broadcast_to(orders, lead), return_inverse=True)
-    kernels = _core.block_pulse_kernels(distinct, m, real_number("step", step))
+    unique_orders, groups = np.unique(np.broadcast_to(orders, lead), return_inverse=True)
+    kernels = _core.block_pulse_kernels(unique_orders, m, real_number("step", step))
     rows = np.broadcast_to(values, (*lead, m)).reshape(-1, m)
     return _core.toeplitz_apply(kernels, rows, groups.ravel().tolist()).reshape(*lead, m)
 
@@ -421,18 +421,18 @@ class Candidates:
                 f"prior_covariance is not positive, or has a wrong shape; give one positive number, or "
                 f"{len(self._terms)}, one per term"
             )
-        places = self._integral_rows(table)
+        columns = self._integral_rows(table)
         gram = self._gram(length, rows)
-        normal = gram[places[:, :, None], places[:, None, :]]
+        normal = gram[columns[:, :, None], columns[:, None, :]]
         normal[:, range(len(self._terms)), range(len(self._terms))] += 1.0 / np.broadcast_to(prior, len(self._terms))
-        sizes = np.sqrt(np.einsum("nii->ni", normal))
+        norms = np.sqrt(np.einsum("nii->ni", normal))
         with np.errstate(divide="ignore", invalid="ignore"):
-            unit = normal / (sizes[:, :, None] * sizes[:, None, :])
-            target = gram[places, 0] / sizes
-        coefficients = np.full(places.shape, np.nan)
-        usable = np.flatnonzero(np.all(sizes > 0, axis=1))
-        usable = usable[np.linalg.eigvalsh(unit[usable])[:, 0] > MIN_CORRELATION_EIGENVALUE]
-        coefficients[usable] = np.linalg.solve(unit[usable], target[usable, :, None])[..., 0] / sizes[usable]
+            correlation = normal / (norms[:, :, None] * norms[:, None, :])
+            target = gram[columns, 0] / norms
+        coefficients = np.full(columns.shape, np.nan)
+        usable = np.flatnonzero(np.all(norms > 0, axis=1))
+        usable = usable[np.linalg.eigvalsh(correlation[usable])[:, 0] > MIN_CORRELATION_EIGENVALUE]
+        coefficients[usable] = np.linalg.solve(correlation[usable], target[usable, :, None])[..., 0] / norms[usable]
         return coefficients
 
     @check_arguments
@@ -485,8 +485,8 @@ class Candidates:
         """
         table = self._orders(orders)
         check_choice("norm", norm, ("l1", "l2"))
-        highest = real_number("limit", limit)
-        if math.isnan(highest):
+        max_error = real_number("limit", limit)
+        if math.isnan(max_error):
             raise ModelError(f"{parameter('limit', limit)} is not a number; give a maximum error, or inf for no limit")
         if coefficients is None:
             coefficients_table = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
@@ -495,7 +495,7 @@ class Candidates:
         scores = np.full(len(table), np.inf)
         is_finite = np.all(np.isfinite(coefficients_table), axis=1)
         scores[is_finite] = self._points[norm].scores(
-            np.hstack([table, coefficients_table])[is_finite], highest, check_threads(threads)
+            np.hstack([table, coefficients_table])[is_finite], max_error, check_threads(threads)
         )
         return scores, coefficients_table
 
@@ -525,17 +525,17 @@ class Candidates:
         The cost per tuple is O(k M log M). Terms of the output (autoregressive terms) add O(M log^2 M).
         """
         table = self._orders(orders)
-        numbers = self._check_shape(finite_floats("coefficients", coefficients), len(table))
+        coefficients_table = self._check_shape(finite_floats("coefficients", coefficients), len(table))
         m, output_terms = self._signals.shape[1], self._terms == self._output
         divisor = np.zeros((len(table), m))
         divisor[:, 0] = 1.0
         forced = np.zeros((len(table), m))
         order_differences = table[:, :1] - table[:, 1:]
-        for k, is_own in enumerate(output_terms):
-            if is_own:
-                divisor -= numbers[:, [k]] * block_pulse_kernel(order_differences[:, k], m, step=self._step)
+        for k, is_output in enumerate(output_terms):
+            if is_output:
+                divisor -= coefficients_table[:, [k]] * block_pulse_kernel(order_differences[:, k], m, step=self._step)
             else:
-                forced += numbers[:, [k]] * integrate(
+                forced += coefficients_table[:, [k]] * integrate(
                     self._signals[self._terms[k]], order_differences[:, k], step=self._step
                 )
         return toeplitz_solve(divisor, forced) if output_terms.any() else forced
@@ -582,21 +582,19 @@ class Candidates:
         """
         order_differences = np.round(orders[:, :1] - orders[:, 1:], 9)
         # A pair (signal, order) is encoded as a complex number: NumPy sorts these faster than rows of an array.
-        distinct, inverse = np.unique((self._terms + 1j * order_differences).ravel(), return_inverse=True)
-        keys = [(int(pair.real), float(pair.imag)) for pair in distinct]
-        new = [key for key in keys if key not in self._columns]
-        if new or not self._cache:
-            rows, etas = [row for row, _ in new], [gap for _, gap in new]
-            signals_before = self._cache.get("time", self._signals[[self._output]])
-            whole = (
-                np.vstack([signals_before, integrate(self._signals[rows], etas, step=self._step)])
-                if new
-                else signals_before
+        unique_keys, inverse = np.unique((self._terms + 1j * order_differences).ravel(), return_inverse=True)
+        keys = [(int(pair.real), float(pair.imag)) for pair in unique_keys]
+        new_keys = [key for key in keys if key not in self._columns]
+        if new_keys or not self._cache:
+            rows, etas = [row for row, _ in new_keys], [eta for _, eta in new_keys]
+            integrals = self._cache.get("time", self._signals[[self._output]])
+            all_integrals = (
+                np.vstack([integrals, integrate(self._signals[rows], etas, step=self._step)]) if new_keys else integrals
             )
-            self._columns |= {key: len(signals_before) + k for k, key in enumerate(new)}
-            self._cache = {"time": whole}
-        at = np.array([self._columns[key] for key in keys], dtype=np.intp)
-        return at[inverse.ravel()].reshape(order_differences.shape)
+            self._columns |= {key: len(integrals) + k for k, key in enumerate(new_keys)}
+            self._cache = {"time": all_integrals}
+        rows_of_keys = np.array([self._columns[key] for key in keys], dtype=np.intp)
+        return rows_of_keys[inverse.ravel()].reshape(order_differences.shape)
 
     def _gram(self, p: int, rows: str) -> NDArray[np.float64]:
         """Return the matrix of inner products of the output and all cached integrals.
@@ -780,10 +778,8 @@ def _broadcast(shapes: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError:
-        words = " and ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise DataError(
-            f"leading axes of {words} do not broadcast; give axes of equal length, or of length 1"
-        ) from None
+        text = " and ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise DataError(f"leading axes of {text} do not broadcast; give axes of equal length, or of length 1") from None
 
 
 def _solve_rows(columns: NDArray[np.float64], rows: NDArray[np.float64], groups: list[int]) -> NDArray[np.float64]:
@@ -802,17 +798,17 @@ def _solve_rows(columns: NDArray[np.float64], rows: NDArray[np.float64], groups:
 
 
 def _with_kernels(
-    work: Callable[[NDArray[np.float64], NDArray[np.float64], list[int]], NDArray[np.float64]],
+    function: Callable[[NDArray[np.float64], NDArray[np.float64], list[int]], NDArray[np.float64]],
     kernel: ArrayLike,
     name: str,
     vectors: ArrayLike,
 ) -> NDArray[np.float64]:
     """Broadcast kernels against vectors, and return ``work(kernels, rows, kernel index of each row)`` reshaped."""
-    columns, of = _rows("kernel", kernel)
+    columns, shape = _rows("kernel", kernel)
     values = finite_floats(name, vectors)
     m = _length(name, values)
     if columns.shape[1] != m:
         raise DataError(f"kernel has {columns.shape[1]} values and {name} has {m}; give both the same length")
-    lead = _broadcast({"kernel": of, name: values.shape[:-1]})
-    groups = np.broadcast_to(np.arange(columns.shape[0]).reshape(of), lead).ravel().tolist()
-    return work(columns, np.broadcast_to(values, (*lead, m)).reshape(-1, m), groups).reshape(*lead, m)
+    lead = _broadcast({"kernel": shape, name: values.shape[:-1]})
+    groups = np.broadcast_to(np.arange(columns.shape[0]).reshape(shape), lead).ravel().tolist()
+    return function(columns, np.broadcast_to(values, (*lead, m)).reshape(-1, m), groups).reshape(*lead, m)

@@ -40,12 +40,12 @@ def format_time_left(seconds: float) -> str:
     return f"about {round_coarsely(seconds / 3600):g} h left"
 
 
-def format_duration_estimate(least: float, most: float) -> str:
-    """Return text on an estimated duration between `least` and `most` [s]: one value, a range, or an upper bound."""
-    low, high = format_time_left(least).split(" ")[1:3], format_time_left(most).split(" ")[1:3]
+def format_duration_estimate(shortest: float, longest: float) -> str:
+    """Return text on a duration estimated between `shortest` and `longest` [s]: a value, a range or an upper bound."""
+    low, high = format_time_left(shortest).split(" ")[1:3], format_time_left(longest).split(" ")[1:3]
     if low == high:
         return f"about {' '.join(high)}"
-    if least < 1.0:
+    if shortest < 1.0:
         return f"up to {' '.join(high)}"
     return f"{low[0]} to {' '.join(high)}" if low[1] == high[1] else f"{' '.join(low)} to {' '.join(high)}"
 
@@ -70,19 +70,19 @@ class ShareTracker:
         self.reached = 0.0
         self._reported_parts = -1
 
-    def advance_to(self, share: float) -> None:
-        """Report that the fraction `share` of the whole work is completed; a decrease is ignored."""
-        self.reached = max(self.reached, min(share, 1.0))
+    def advance_to(self, fraction: float) -> None:
+        """Report that the fraction `fraction` of the whole work is completed; a decrease is ignored."""
+        self.reached = max(self.reached, min(fraction, 1.0))
         parts = round(TOTAL_PARTS * self.reached)
         if self._listener is not None and parts > self._reported_parts:
             self._reported_parts = parts
             self._listener(parts, TOTAL_PARTS)
 
-    def subtask(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
-        """Return a callback (done, total) for a part of the work that ends at the fraction `share` of the whole.
+    def subtask(self, end_fraction: float, pass_fraction: float = 0.5) -> Callable[[int, int], None]:
+        """Return a callback (done, total) for a part of the work that ends at the fraction `end_fraction` of the whole.
 
-        The part may count from 0 to its total several times. Each such pass then covers the fraction `sweep` of the
-        remaining work of the part.
+        The part may count from 0 to its total several times. Each such pass then covers the fraction `pass_fraction` of
+        the remaining work of the part.
         """
         first, last = self.reached, 0.0
 
@@ -92,7 +92,7 @@ class ShareTracker:
             if fraction < last:
                 first = self.reached
             last = fraction
-            self.advance_to(first + sweep * (share - first) * fraction)
+            self.advance_to(first + pass_fraction * (end_fraction - first) * fraction)
 
         return report_subtask
 
@@ -146,36 +146,36 @@ class Progress:
         """Show that ``count`` of ``total`` candidates are completed, of which ``pruned`` were excluded early."""
         if self._quiet or time.monotonic() - self._start < BAR_DELAY_S or total == 0:
             return
-        passed = max(time.monotonic() - self._start, 1e-9)
+        elapsed = max(time.monotonic() - self._start, 1e-9)
         text = f"{100 * count // total:.0f} %"
         # For work without natural units, only the percentage is shown.
         if not isinstance(total, ShareTotal):
             text += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
-            text += f" {count / passed:,.0f}/s"
-        share = "" if pruned is None else f"{100 * pruned / max(count, 1):.1f} % pruned"
-        time_left = format_time_left(passed * (total - count) / count) if 0 < count < total else ""
-        self._show(text, share, time_left, completed=count, total=total)
+            text += f" {count / elapsed:,.0f}/s"
+        pruned_text = "" if pruned is None else f"{100 * pruned / max(count, 1):.1f} % pruned"
+        time_left = format_time_left(elapsed * (total - count) / count) if 0 < count < total else ""
+        self._show(text, pruned_text, time_left, completed=count, total=total)
         if count >= total:
             # The next search of the same job starts a new bar.
             self._stop()
 
     def so_far(self, count: int, total: int) -> None:
         """Show that ``count`` of ``total`` parts are completed, for work whose total may still increase."""
-        passed = time.monotonic() - self._start
-        if self._quiet or passed < BAR_DELAY_S:
+        elapsed = time.monotonic() - self._start
+        if self._quiet or elapsed < BAR_DELAY_S:
             return
-        self._show(f"{count} of {total} so far", time_left=f"after {passed:.0f} s")
+        self._show(f"{count} of {total} so far", time_left=f"after {elapsed:.0f} s")
 
     @property
     def quiet(self) -> bool:
         """Whether nothing is shown."""
         return self._quiet
 
-    def expect(self, what: str, least: float, most: float | None = None) -> None:
-        """Print the estimated duration of the work `what`, from `least` to `most` [s], if it is long."""
-        most = least if most is None else most
-        if not self._quiet and most >= ANNOUNCEMENT_THRESHOLD_S:
-            print(f"{what} takes {format_duration_estimate(least, most)}; Ctrl-C ends it", file=sys.stderr)
+    def expect(self, label: str, shortest: float, longest: float | None = None) -> None:
+        """Print the estimated duration of the work `label`, from `shortest` to `longest` [s], if it is long."""
+        longest = shortest if longest is None else longest
+        if not self._quiet and longest >= ANNOUNCEMENT_THRESHOLD_S:
+            print(f"{label} takes {format_duration_estimate(shortest, longest)}; Ctrl-C ends it", file=sys.stderr)
 
     def name(self, label: str) -> None:
         """Set the label of the bar."""

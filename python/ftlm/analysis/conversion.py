@@ -229,18 +229,18 @@ def to_tf(model: Model) -> Any:
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
     filtered, filter_numerator, filter_denominator = _output_filter(model, transfer.inputs)
-    tops, bottoms = [], []
+    numerators, denominators = [], []
     for output in transfer.outputs:
         output_numerator, output_denominator = (
             (filter_numerator, filter_denominator) if output in filtered else (np.ones(1), np.ones(1))
         )
         denominator = np.convolve(_coefficients(transfer.denominator[output]), output_denominator)
-        tops.append(
+        numerators.append(
             [np.convolve(_coefficients(transfer.numerators[output, u]), output_numerator) for u in transfer.inputs]
         )
-        bottoms.append([denominator] * len(transfer.inputs))
+        denominators.append([denominator] * len(transfer.inputs))
     names = {"inputs": list(transfer.inputs), "outputs": list(transfer.outputs)}
-    system = control.TransferFunction(tops, bottoms, name=identifier(model.structure.name), **names)
+    system = control.TransferFunction(numerators, denominators, name=identifier(model.structure.name), **names)
     return _with_delay(system, transfer.delay)
 
 
@@ -330,10 +330,10 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
     sensor = model.structure.sensor_filter
     if sensor is None:
         return (), np.ones(1), np.ones(1)
-    behind = next((name for name in inputs if name in sensor.signals), None)
-    if behind is not None:
+    name = next((name for name in inputs if name in sensor.signals), None)
+    if name is not None:
         raise ModelError(
-            f"the input {behind} has a sensor filter, whose inverse is not a transfer function; remove the filter"
+            f"the input {name} has a sensor filter, whose inverse is not a transfer function; remove the filter"
         )
     return tuple(sensor.signals), _coefficients(sensor.numerator), _coefficients(sensor.denominator)
 
@@ -350,9 +350,9 @@ def _filter_output(
     numerator, denominator = numerator / denominator[0], denominator / denominator[0]
     shift = np.eye(count, k=1)
     shift[:, :1] -= denominator[1:, None]
-    fed = (numerator[1:] - denominator[1:] * numerator[0])[:, None]
-    a = np.block([[a, np.zeros((system_states, count))], [fed @ c[output : output + 1], shift]])
-    b = np.vstack([b, fed @ d[output : output + 1]])
+    filter_input = (numerator[1:] - denominator[1:] * numerator[0])[:, None]
+    a = np.block([[a, np.zeros((system_states, count))], [filter_input @ c[output : output + 1], shift]])
+    b = np.vstack([b, filter_input @ d[output : output + 1]])
     c = np.hstack([c, np.zeros((c.shape[0], count))])
     c[output], d[output] = numerator[0] * c[output], numerator[0] * d[output]
     c[output, system_states : system_states + 1] += 1.0
@@ -385,21 +385,21 @@ def _sample_system(
     ]
     state_count = count + sum(lengths)
     # The columns are the states, past values of each input, and the inputs at this sample.
-    motion, output_map = np.zeros((state_count, state_count + inputs)), np.zeros((c.shape[0], state_count + inputs))
-    motion[:count, :count], output_map[:, :count] = hold(np.zeros((count, 1)), step)[0], c
+    update, output_map = np.zeros((state_count, state_count + inputs)), np.zeros((c.shape[0], state_count + inputs))
+    update[:count, :count], output_map[:, :count] = hold(np.zeros((count, 1)), step)[0], c
     state = count
     for j, length in enumerate(lengths):
         column, has_full_delay = b[:, j : j + 1], length > whole_steps[j]
         column_indices = [state_count + j, *range(state, state + length)]
-        motion[:count, [column_indices[whole_steps[j]]]] += hold(
+        update[:count, [column_indices[whole_steps[j]]]] += hold(
             column, step - fractions[j] if has_full_delay else step
         )[1]
         output_map[:, column_indices[-1]] += d[:, j]
         if has_full_delay:
-            motion[:count, [column_indices[-1]]] += hold(column, step - fractions[j])[0] @ hold(column, fractions[j])[1]
-        motion[column_indices[1:], column_indices[:-1]] = 1.0
+            update[:count, [column_indices[-1]]] += hold(column, step - fractions[j])[0] @ hold(column, fractions[j])[1]
+        update[column_indices[1:], column_indices[:-1]] = 1.0
         state += length
-    return motion[:, :state_count], motion[:, state_count:], output_map[:, :state_count], output_map[:, state_count:]
+    return update[:, :state_count], update[:, state_count:], output_map[:, :state_count], output_map[:, state_count:]
 
 
 def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
@@ -437,10 +437,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
         )
     signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(polynomials[0][1]))
     results = _names("outputs", outputs, getattr(system, "output_labels", None), len(polynomials))
-    twice = sorted(set(signals) & set(results))
-    if twice:
+    duplicates = sorted(set(signals) & set(results))
+    if duplicates:
         raise ModelError(
-            f"{', '.join(twice)}: each is the name of both an input and an output; pass {parameter('inputs')} and "
+            f"{', '.join(duplicates)}: each is the name of both an input and an output; pass {parameter('inputs')} and "
             f"{parameter('outputs')} with other names"
         )
     rows = zip(results, polynomials, strict=True)
@@ -489,13 +489,14 @@ def _equation_text(output: str, inputs: Sequence[str], denominator: Floats, nume
     return f"D^{order} {output} = " + " + ".join(term_texts).replace("+ -", "- ")
 
 
-def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
+def _from_fractions(numerator_table: Any, denominator_table: Any) -> list[tuple[Floats, list[Floats]]]:
     """Return, for each output, a common monic denominator and the numerator of each input over it.
 
-    `tops` and `bottoms` are numerators and denominators by output and input, with the highest power first.
+    `numerator_table` and `denominator_table` are numerators and denominators by output and input, with the highest
+    power first.
     """
     fractions = []
-    for numerator_row, denominator_row in zip(tops, bottoms, strict=True):
+    for numerator_row, denominator_row in zip(numerator_table, denominator_table, strict=True):
         denominators = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in denominator_row]
         distinct_denominators: list[Floats] = []
         for d in (d / d[0] for d in denominators):

@@ -210,10 +210,10 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
         raise DataError(f"w has shape {omega.shape}; give a vector of frequencies in rad/s")
     is_invalid = ~(np.isfinite(omega) & (omega >= 0))
     if np.any(is_invalid):
-        at = int(np.argmax(is_invalid))
+        index = int(np.argmax(is_invalid))
         raise DataError(
-            f"w is {omega[at]} at index {at} ({int(np.sum(is_invalid))} such values in all); give finite frequencies "
-            "of at least 0 rad/s"
+            f"w is {omega[index]} at index {index} ({int(np.sum(is_invalid))} such values in all); give finite "
+            "frequencies of at least 0 rad/s"
         )
     inputs = response_inputs(model, coupled=coupled)
     out = np.zeros((len(model.outputs), len(inputs), omega.size), dtype=np.complex128)
@@ -327,23 +327,23 @@ def parameter_vector(model: Model) -> Floats:
 
 def with_parameter_vector(model: Model, parameters: Floats) -> Model:
     """Return the model with parameters from a vector, in the sequence of :func:`parameter_vector`."""
-    at = iter(parameters.tolist())
+    values = iter(parameters.tolist())
     equations = []
     for equation in model.equations:
-        alpha = replace(equation.order, constant=next(at))
+        alpha = replace(equation.order, constant=next(values))
         # Keyword arguments are evaluated in this sequence: the order first, then the coefficient.
         terms = [
-            replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor)
+            replace(t, order=replace(t.order, constant=next(values)), coefficient=next(values) / t.factor)
             for t in equation.terms
         ]
         friction = (
             None
             if equation.friction is None
-            else equation.friction.with_numbers([next(at) for _ in equation.friction.numbers])
+            else equation.friction.with_numbers([next(values) for _ in equation.friction.numbers])
         )
         equations.append(_replace_unchecked(equation, alpha, tuple(terms), friction))
     structure = replace(model.structure, equations=tuple(equations))
-    return replace(model, structure=structure.with_inputs({name: next(at) for name in structure.fixed_inputs}))
+    return replace(model, structure=structure.with_inputs({name: next(values) for name in structure.fixed_inputs}))
 
 
 def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Iterator[tuple[int, float, Model, Model]]:
@@ -424,19 +424,20 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
         raise DataError("time is not a vector of at least three sample times [s] from 0; use numpy.arange")
     step = float(t[-1]) / (t.size - 1)
-    off = np.abs(t - step * np.arange(t.size)) > 1e-6 * step
-    if step <= 0 or np.any(off):
+    irregular = np.abs(t - step * np.arange(t.size)) > 1e-6 * step
+    if step <= 0 or np.any(irregular):
         raise DataError(
-            f"time is not regular, first at index {int(np.argmax(off))} ({int(np.sum(off))} in all); use numpy.arange"
+            f"time is not uniform, first at index {int(np.argmax(irregular))} ({int(np.sum(irregular))} in all); use "
+            "numpy.arange"
         )
     inputs = response_inputs(model, coupled=True)
-    together = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
+    coupled_model = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
     out = np.zeros((len(model.outputs), len(inputs), t.size))
     for k, name in enumerate(inputs):
-        drive = {n: np.full(t.size, float(n == name)) for n in inputs}
+        inputs_by_name = {n: np.full(t.size, float(n == name)) for n in inputs}
         zero_outputs = {n: np.zeros(t.size) for n in model.outputs}
-        run = Run.from_arrays(step=step, inputs=drive, outputs=zero_outputs, name=f"unit step of {name}")
-        stepped = simulate(together, run, tolerance=tolerance)
+        run = Run.from_arrays(step=step, inputs=inputs_by_name, outputs=zero_outputs, name=f"unit step of {name}")
+        simulated = simulate(coupled_model, run, tolerance=tolerance)
         for i, output in enumerate(model.outputs):
-            out[i, k] = stepped[output]
+            out[i, k] = simulated[output]
     return out

@@ -301,12 +301,12 @@ def _linearized_equation(equation: Equation, values: Mapping[Channel, float]) ->
     terms = [t for t in equation.terms if t.nonlinear is None]
     slopes: dict[tuple[str, Order], float] = {}
     for term in equation.nonlinear_terms:
-        shape = term.nonlinear
-        assert shape is not None
-        for (signal, order), slope in shape.gradient(values).items():
+        expression = term.nonlinear
+        assert expression is not None
+        for (signal, order), slope in expression.gradient(values).items():
             if not math.isfinite(slope):
-                point_text = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in shape.channels)
-                raise ModelError(f"{shape} has no derivative at {point_text}; choose another operating point")
+                point_text = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in expression.channels)
+                raise ModelError(f"{expression} has no derivative at {point_text}; choose another operating point")
             column = signal, Order(round(term.order.constant + order, 9))
             slopes[column] = slopes.get(column, 0.0) + float(term.fixed or 0.0) * float(slope)
     leading_coefficient = 1.0 - slopes.pop((equation.output, equation.order), 0.0)

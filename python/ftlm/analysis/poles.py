@@ -140,8 +140,8 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
         return None
     coefficients = np.zeros(degree + 1)
     for power, log_magnitude in logs.items():
-        at = degree - round((power - lowest) / base)
-        coefficients[at] = math.copysign(
+        index = degree - round((power - lowest) / base)
+        coefficients[index] = math.copysign(
             math.exp(log_magnitude), polynomial[power] / math.copysign(1.0, polynomial[highest])
         )
     return base, np.asarray(np.roots(coefficients) * math.exp(unit * base), dtype=np.complex128)
@@ -310,8 +310,8 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
             origin = max(origin, round(lowest - min(numerator_orders), 9)) if numerator_orders else origin
     every_power = [p - min(polynomial) for polynomial in polynomials for p in polynomial]
     base = common_base(every_power) if method == "poles" else None
-    good = unstable == 0 and not has_root_on_axis and origin <= 0
-    return Stability(good, unstable, max(origin, 0.0), has_root_on_axis, method, base)
+    is_stable = unstable == 0 and not has_root_on_axis and origin <= 0
+    return Stability(is_stable, unstable, max(origin, 0.0), has_root_on_axis, method, base)
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
@@ -476,11 +476,11 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     check_model(model)
     coupled = is_coupled(coupling)
     result: list[Mode] = []
-    for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
+    for group, polynomial in enumerate(characteristic(model, coupled=coupled)):
         # A pole that underflows counts as a pole at the origin. A pole that overflows has no visible effect.
-        sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
-        deviations = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
-        result += [_mode(w, deviation) for w, deviation in zip(sheet, deviations, strict=True)]
+        zeros = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
+        deviations = _standard_deviations(model, group, np.array(zeros), coupled=coupled)
+        result += [_mode(w, deviation) for w, deviation in zip(zeros, deviations, strict=True)]
     return tuple(sorted(result, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
 
@@ -549,7 +549,7 @@ def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_A
             is_in_sector = is_in_sector[is_in_sector.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
         return sorted(is_in_sector.tolist(), key=lambda z: (z.real, z.imag))
     values = np.array(list(polynomial.values()))
-    roots_so_far: list[complex] = []
+    zeros: list[complex] = []
     seeds = [_two_term_zeros(powers, values, max_argument)]
     for base in SEED_ORDER_BASES:
         if (highest - lowest) / base > MAX_SEED_DEGREE:
@@ -557,10 +557,10 @@ def zeros_of(polynomial: Polynomial, max_argument: float = math.pi + REAL_AXIS_A
         seeds.append(_rounded_order_zeros(polynomial, base, max_argument))
     for z in _newton_zeros(np.concatenate(seeds), powers, values):
         if -DISTINCT_ZERO_TOLERANCE <= z.imag <= max_argument and all(
-            abs(z - known_root) > DISTINCT_ZERO_TOLERANCE for known_root in roots_so_far
+            abs(z - known_root) > DISTINCT_ZERO_TOLERANCE for known_root in zeros
         ):
-            roots_so_far.append(complex(z.real, max(z.imag, 0.0)))
-    return sorted(roots_so_far, key=lambda z: (z.real, z.imag))
+            zeros.append(complex(z.real, max(z.imag, 0.0)))
+    return sorted(zeros, key=lambda z: (z.real, z.imag))
 
 
 def _rounded_order_zeros(polynomial: Polynomial, base: float, max_argument: float) -> Complex:
@@ -610,8 +610,8 @@ def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
         step = np.where(np.isfinite(step), step, 0.0)
         w = w - step * np.minimum(1.0, MAX_NEWTON_STEP / np.maximum(np.abs(step), 1e-300))
     terms, _ = _terms(w, powers, values)
-    good = np.abs(np.sum(terms, axis=0)) <= ZERO_TOLERANCE * np.sum(np.abs(terms), axis=0)
-    return [complex(z) for z in w[good]]
+    is_zero = np.abs(np.sum(terms, axis=0)) <= ZERO_TOLERANCE * np.sum(np.abs(terms), axis=0)
+    return [complex(z) for z in w[is_zero]]
 
 
 def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
@@ -625,23 +625,23 @@ def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]
 
 
 def _standard_deviations(
-    model: Model, at: int, zeros: Complex, *, coupled: bool
+    model: Model, group: int, zeros: Complex, *, coupled: bool
 ) -> Sequence[tuple[float, float, float] | None]:
     """Return the standard deviations of Re ln s, Im ln s and ln abs(Re s) of each zero; None without a covariance.
 
-    `zeros` are values of ln s at which the characteristic function D of the group `at` of coupled equations is 0. The
-    derivatives with respect to the parameters follow from d ln s = -dD / (dD/d ln s).
+    `zeros` are values of ln s at which the characteristic function D of the group `group` of coupled equations is 0.
+    The derivatives with respect to the parameters follow from d ln s = -dD / (dD/d ln s).
     """
     matrix = covariance_of(model)
     if matrix is None or not zeros.size:
         return [None] * zeros.size
     slopes = np.zeros((len(matrix), zeros.size), dtype=np.complex128)
-    polynomial_of_pole = characteristic(model, coupled=coupled)[at]
+    polynomial_of_pole = characteristic(model, coupled=coupled)[group]
     _, unit = _terms(zeros, np.array(list(polynomial_of_pole)), np.array(list(polynomial_of_pole.values())))
 
     def value(shifted: Model) -> tuple[Complex, Complex]:
         """Return D and dD / d ln s of a model with changed parameters at the zeros, relative to the largest term."""
-        polynomial = characteristic(shifted, coupled=coupled)[at]
+        polynomial = characteristic(shifted, coupled=coupled)[group]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
         scale = np.exp(level - unit)

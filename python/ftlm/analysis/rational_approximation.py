@@ -315,38 +315,38 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
     exact_response = frequency_response(model, omega, sensor=False)
-    approximated = system.frequency_response(omega)
+    approximate_response = system.frequency_response(omega)
     gain, phase = {}, {}
     for i, output in enumerate(system.outputs):
         for j, signal in enumerate(system.inputs):
             if not np.any(exact_response[i, j]):
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
-                quotient = approximated[i, j] / exact_response[i, j]
+                quotient = approximate_response[i, j] / exact_response[i, j]
                 gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
                 phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
     roots = np.linalg.eigvals(system.a)
     stable = bool(np.all(roots.real < -ORIGIN_POLE_RATIO * low))
-    texts = []
+    warnings = []
     worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
     if not (worst_gain <= MAX_GAIN_ERROR_DB and worst_phase <= MAX_PHASE_ERROR_DEGREES):
-        texts.append(
+        warnings.append(
             f"from {low:g} to {high:g} rad/s the error of the approximation is up to {worst_gain:.2g} dB "
             f"and {worst_phase:.2g} degrees, so smaller gain and phase margins are meaningless; "
             + _error_cause(model, system)
         )
     sensor = model.structure.sensor_filter
     if sensor is not None:
-        texts.append(
+        warnings.append(
             f"the sensor filter of {', '.join(sensor.signals)} is not in the system; multiply its transfer function by "
             "that of the filter"
         )
     if stability(model).unstable_poles != np.sum(roots.real > ORIGIN_POLE_RATIO * low):
-        texts.append(
+        warnings.append(
             "the approximation and the model have different numbers of unstable poles, so its stability margins do not "
             "apply to the model; raise order, or move the band"
         )
-    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(texts))
+    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(warnings))
 
 
 def _error_cause(model: Model, system: Approximation) -> str:

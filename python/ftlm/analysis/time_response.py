@@ -93,16 +93,16 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
         raise ModelError(f"{setting('kind')} {kind!r} is not known; use 'step' or 'impulse'")
     if time is None:
         # A non-linear model has no poles from which a settling time follows.
-        span = settling_time(model) if model.structure.is_linear else 10.0
-        time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
-    instants = as_floats("time", time)
-    nominal = step_response(model, instants)
-    deviation = _deviation(model, instants, impulse=kind == "impulse")
+        duration = settling_time(model) if model.structure.is_linear else 10.0
+        time = np.linspace(0.0, duration, DEFAULT_TIME_POINTS)
+    times = as_floats("time", time)
+    nominal = step_response(model, times)
+    deviation = _deviation(model, times, impulse=kind == "impulse")
     if kind == "impulse":
-        nominal = np.diff(nominal) / (instants[1] - instants[0])
-        instants = (instants[1:] + instants[:-1]) / 2
-    finals = _final_values(model) if kind == "step" else {}
-    return Response(kind, model.outputs, response_inputs(model, coupled=True), instants, nominal, deviation, finals)
+        nominal = np.diff(nominal) / (times[1] - times[0])
+        times = (times[1:] + times[:-1]) / 2
+    final_values = _final_values(model) if kind == "step" else {}
+    return Response(kind, model.outputs, response_inputs(model, coupled=True), times, nominal, deviation, final_values)
 
 
 def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float | None]]:
@@ -132,7 +132,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     weights, directions = np.linalg.eigh(scaled)
     variance: Floats = np.zeros(1)
     # A model without an estimate is simulated without an uncertainty band.
-    bare = replace(model, estimate=None)
+    plain_model = replace(model, estimate=None)
     for weight, direction in zip(weights.tolist(), directions.T, strict=True):
         if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
             continue
@@ -140,7 +140,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
         shift[rows] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * deviations[rows]
         try:
             upper, lower = (
-                step_response(with_parameter_vector(bare, parameters + increment), time)
+                step_response(with_parameter_vector(plain_model, parameters + increment), time)
                 for increment in (shift, -shift)
             )
         except FtlmError:

@@ -141,49 +141,49 @@ def energies(
     """
     law = order_law(stage)
     h, d = 2 * stage - 1, 2 * stage
-    free = [f"alpha{h}", f"alpha{d}", f"gamma{h}", f"beta{d}", f"mu{d}"]
+    names = [f"alpha{h}", f"alpha{d}", f"gamma{h}", f"beta{d}", f"mu{d}"]
     for name in orders or {}:
-        if name not in free:
-            raise ModelError(f"order {name!r} is not known; the stage's free orders are {', '.join(free)}")
-    at = {n: float((orders or {}).get(n, integer_order(n))) for n in free}
-    for name in free[2:]:
-        if not 0.0 <= at[name] <= 1.0:
-            raise ModelError(f"{name} = {at[name]:g} is outside [0, 1]; give an order of a passive force")
+        if name not in names:
+            raise ModelError(f"order {name!r} is not known; the stage's free orders are {', '.join(names)}")
+    values = {n: float((orders or {}).get(n, integer_order(n))) for n in names}
+    for name in names[2:]:
+        if not 0.0 <= values[name] <= 1.0:
+            raise ModelError(f"{name} = {values[name]:g} is outside [0, 1]; give an order of a passive force")
     link = parameters or PARAMETER_SETS["effective"][stage]
-    hub, bend, current = (
+    hub, deflection, current = (
         np.asarray(run[n], dtype=np.float64) for n in (f"theta{stage}1", f"theta{stage}2", f"I{stage}")
     )
     step = run.step
     if run.length < MIN_SAMPLES:
         raise DataError(f"run {run.name!r} has {plural(run.length, 'row')}; energies need at least {MIN_SAMPLES}")
-    for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", bend)):
+    for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", deflection)):
         _check_rest(run.name, name, angle)
 
     def rate(x: Floats, order: float) -> Floats:
         return fractional_derivative(x, order, step=step, definition="caputo", initial=[0.0, 0.0, 0.0])
 
-    hub_rate, bend_rate = rate(hub, 1.0), rate(bend, 1.0)
-    turning, bending = rate(hub, at[f"gamma{h}"]), rate(bend, at[f"mu{d}"])
-    elastic = rate(bend, at[f"beta{d}"])
+    hub_rate, deflection_rate = rate(hub, 1.0), rate(deflection, 1.0)
+    hub_derivative, deflection_derivative = rate(hub, values[f"gamma{h}"]), rate(deflection, values[f"mu{d}"])
+    elastic = rate(deflection, values[f"beta{d}"])
     j1, j2 = link.hub_inertia, link.link_inertia
     # Inertial terms of equations (14) and (15), with orders by the order law.
-    across = at[f"alpha{h}"] - at[f"gamma{h}"] + at[f"mu{d}"]
-    inertia = hub_rate * ((j1 + j2) * rate(hub, at[f"alpha{h}"]) + j2 * rate(bend, across))
-    inertia += bend_rate * j2 * (rate(hub, law[f"gamma{d}"].at(at)) + rate(bend, at[f"alpha{d}"]))
+    cross_order = values[f"alpha{h}"] - values[f"gamma{h}"] + values[f"mu{d}"]
+    inertia = hub_rate * ((j1 + j2) * rate(hub, values[f"alpha{h}"]) + j2 * rate(deflection, cross_order))
+    inertia += deflection_rate * j2 * (rate(hub, law[f"gamma{d}"].at(values)) + rate(deflection, values[f"alpha{d}"]))
     torque = link.torque_constant * current
     time: Floats = np.arange(run.length, dtype=np.float64) * step
     return Energies(
         time,
         0.5 * link.stiffness * elastic**2,
-        0.5 * j1 * turning**2,
-        0.5 * j2 * (turning + bending) ** 2,
-        torque - link.hub_friction * turning,
-        -link.link_friction * bending,
+        0.5 * j1 * hub_derivative**2,
+        0.5 * j2 * (hub_derivative + deflection_derivative) ** 2,
+        torque - link.hub_friction * hub_derivative,
+        -link.link_friction * deflection_derivative,
         torque * hub_rate,
         inertia,
-        power(bend, link.stiffness, at[f"beta{d}"], step),
-        power(hub, link.hub_friction, at[f"gamma{h}"], step),
-        power(bend, link.link_friction, at[f"mu{d}"], step),
+        power(deflection, link.stiffness, values[f"beta{d}"], step),
+        power(hub, link.hub_friction, values[f"gamma{h}"], step),
+        power(deflection, link.link_friction, values[f"mu{d}"], step),
     )
 
 
@@ -192,12 +192,12 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
 
     A motion before the first sample would act as an impulse at the first sample.
     """
-    moves = np.diff(angle)
-    way_out = "energies need runs that start at rest with angle 0; cut the run where it rests, and subtract that angle"
+    steps = np.diff(angle)
+    remedy = "energies need runs that start at rest with angle 0; cut the run where it rests, and subtract that angle"
     if abs(angle[0]) > REST_ANGLE_FRACTION * np.max(np.abs(angle)):
-        raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {way_out}")
-    if abs(moves[0]) > max(REST_INCREMENT_FRACTION * np.max(np.abs(moves)), REST_INCREMENT_RATIO * abs(moves[1])):
-        raise DataError(f"run {run!r}: {name} moves by {moves[0]:.4g} rad in its first step; {way_out}")
+        raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {remedy}")
+    if abs(steps[0]) > max(REST_INCREMENT_FRACTION * np.max(np.abs(steps)), REST_INCREMENT_RATIO * abs(steps[1])):
+        raise DataError(f"run {run!r}: {name} moves by {steps[0]:.4g} rad in its first step; {remedy}")
 
 
 def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
@@ -223,28 +223,28 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     Power
         Supplied power, stored energy and dissipated power at the N samples.
     """
-    start = np.concatenate([[0.0], np.diff(angle)])
+    increments = np.concatenate([[0.0], np.diff(angle)])
     rate = np.gradient(angle, step)
-    nothing = np.zeros(angle.size)
+    zeros = np.zeros(angle.size)
     if order == 0.0:
-        return Power(coefficient * angle * rate, 0.5 * coefficient * angle**2, nothing)
+        return Power(coefficient * angle * rate, 0.5 * coefficient * angle**2, zeros)
     if order == 1.0:
-        return Power(coefficient * rate**2, nothing, coefficient * rate**2)
+        return Power(coefficient * rate**2, zeros, coefficient * rate**2)
     duration = step * (angle.size - 1)
     low, high = math.log(MIN_RATE_TIMES_DURATION / duration), math.log(MAX_RATE_TIMES_STEP / step)
     count = max(2, round((high - low) / RATE_LOG_SPACING))
-    share = math.sin(math.pi * order) / math.pi
+    scale = math.sin(math.pi * order) / math.pi
     # Each rate is at the middle of its interval in ln(w), so the intervals cover exactly the range from low to high.
     width = (high - low) / count
     rates = np.exp(low + width * (np.arange(count) + 0.5))
-    spring, dashpot = share * math.exp(low * order) / order, share * math.exp(high * (order - 1.0)) / (1.0 - order)
+    spring, dashpot = scale * math.exp(low * order) / order, scale * math.exp(high * (order - 1.0)) / (1.0 - order)
     force = spring * angle + dashpot * rate
     stored, lost = 0.5 * spring * angle**2, dashpot * rate**2
     k = np.arange(angle.size)
-    for w, weight in zip(rates.tolist(), (share * width * rates**order).tolist(), strict=True):
+    for w, weight in zip(rates.tolist(), (scale * width * rates**order).tolist(), strict=True):
         # z is exact for an angle that is linear between samples.
         decay = np.exp(-w * step * k) * (-math.expm1(-w * step) / (w * step))
-        z = _core.series_multiply(decay, start, angle.size)
+        z = _core.series_multiply(decay, increments, angle.size)
         force += weight * z
         stored += 0.5 * weight * z**2
         lost += weight * w * z**2

@@ -81,9 +81,9 @@ class LinkParameters:
         They are a, b, d and g of the hub equation, and a, b and d of the deflection equation, eq. (15) of the paper.
         """
         hub, deflection = 2 * stage - 1, 2 * stage
-        own = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
+        values = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
         stiffness, friction = self.stiffness / self.link_inertia, self.link_friction / self.link_inertia
-        return own | {f"a{deflection}": -stiffness, f"b{deflection}": -1.0, f"d{deflection}": 0.0 - friction}
+        return values | {f"a{deflection}": -stiffness, f"b{deflection}": -1.0, f"d{deflection}": 0.0 - friction}
 
 
 #: Named parameter sets, by joint number. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5.
@@ -332,10 +332,10 @@ def flexible_link(
         if law not in LAW_NAMES:
             raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
     if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
-        both = choose_text("laws=('orders', …)", "--laws orders")
+        order_law_text = choose_text("laws=('orders', …)", "--laws orders")
         raise ModelError(
             f"law 'velocities' ties two orders of {parameter('form', 'lagrange')} under the order law; use it with "
-            f"{both}"
+            f"{order_law_text}"
         )
     if cross_stage not in (False, True, "torques", "inertial"):
         raise ModelError(f"{setting('cross_stage')} {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
@@ -385,8 +385,8 @@ def flexible_link(
         orders = order_law(j, form=form, input_order=order_option, velocities="velocities" in laws)
         pair = _joint_equations(j, form, orders, laws, bool(friction) and coupling == "measured")
         if friction and coupling == "simulated":
-            near = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
-            pair = (replace(pair[0], coulomb=Friction(f"fc{j}", more=near)), pair[1])
+            stribeck = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
+            pair = (replace(pair[0], coulomb=Friction(f"fc{j}", more=stribeck)), pair[1])
         if cross_stage:
             pair = (
                 _add_cross_inertia(pair, j, laws, stage == "both")
@@ -400,10 +400,10 @@ def flexible_link(
         equations += pair if hub else pair[1:]
         h, d = 2 * j - 1, 2 * j
         ratio = f"j{j}" if form == "lagrange" else f"r{j}"
-        tied: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
+        law_terms: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
         if form == "published":
-            tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
-        coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
+            law_terms = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
+        coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in law_terms]
         if cross_stage == "inertial" and j == 2:
             # Both angles of joint 1 rotate joint 2, which is mounted on the tip of link 1.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
@@ -445,30 +445,30 @@ def _joint_equations(
     """
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
-    tied = "orders" in laws
+    has_order_law = "orders" in laws
 
     def order(name: str) -> Order:
-        return law[name] if tied else Order(0.0, ((name, 1.0),))
+        return law[name] if has_order_law else Order(0.0, ((name, 1.0),))
 
-    def extra(n: int) -> list[Term]:
+    def friction_terms(n: int) -> list[Term]:
         has_friction = friction and (n == h or form == "published")
         return [Term(f"coulomb_{hub}", Order(), f"c{n}")] if has_friction else []
 
-    def equation(output: str, n: int, drive: Order | None) -> Equation:
+    def equation(output: str, n: int, input_order: Order | None) -> Equation:
         terms = [
             Term(deflection, order(f"beta{n}"), f"a{n}"),
             Term(hub, order(f"gamma{n}"), f"b{n}"),
             Term(deflection, order(f"mu{n}"), f"d{n}"),
         ]
-        if drive is None and "coefficients" in laws:
+        if input_order is None and "coefficients" in laws:
             # The motion of the hub has the coefficient -1 for any parameters of the link.
             terms[1] = Term(hub, order(f"gamma{n}"), -1.0, name=f"b{n}")
-        if drive is not None:
-            terms.append(Term(current, drive, f"g{n}"))
-        return Equation(output, order(f"alpha{n}"), (*terms, *extra(n)))
+        if input_order is not None:
+            terms.append(Term(current, input_order, f"g{n}"))
+        return Equation(output, order(f"alpha{n}"), (*terms, *friction_terms(n)))
 
-    drive = None if form == "lagrange" else law["input"] if tied else Order()
-    return equation(hub, h, Order()), equation(deflection, d, drive)
+    input_order = None if form == "lagrange" else law["input"] if has_order_law else Order()
+    return equation(hub, h, Order()), equation(deflection, d, input_order)
 
 
 def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
@@ -501,8 +501,8 @@ def _add_cross_inertia(
     the other joint is modeled too.
     """
     h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
-    oh, od = 2 * other - 1, 2 * other
-    rates = (f"mu{od}" if "velocities" in laws else f"gamma{oh}", f"mu{od}")
+    other_hub, other_deflection = 2 * other - 1, 2 * other
+    rates = (f"mu{other_deflection}" if "velocities" in laws else f"gamma{other_hub}", f"mu{other_deflection}")
     law = both and "orders" in laws
 
     def terms(n: int, damping: str) -> list[Term]:
@@ -511,8 +511,8 @@ def _add_cross_inertia(
 
     hub, deflection = pair
     # The derivative from rate to acceleration has the order alpha_3 - gamma_3 for a hub and alpha_2 - mu_2 for a link.
-    own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
-    return hub if stage == 1 else _append_terms(hub, terms(h, own)), _append_terms(deflection, terms(d, f"mu{d}"))
+    hub_rate = f"mu{d}" if "velocities" in laws else f"gamma{h}"
+    return hub if stage == 1 else _append_terms(hub, terms(h, hub_rate)), _append_terms(deflection, terms(d, f"mu{d}"))
 
 
 def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equation:
@@ -599,8 +599,8 @@ def link_model(
     values = dict(structure.reference)
     if not isinstance(parameters, str):
         for j, link in parameters.items():
-            own = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
-            values |= {n: v for n, v in own.items() if n in structure.coefficient_names}
+            link_values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+            values |= {n: v for n, v in link_values.items() if n in structure.coefficient_names}
     values |= dict(coefficients or {})
     free = {name: integer_order(name) for name in structure.order_names} | dict(orders or {})
     return Model(

@@ -91,7 +91,7 @@ class RunArguments:
         """
         self._check_names()
         units = check_units(self.units, (*self.inputs, *self.outputs))
-        behavior: dict[str, Intersample] = {
+        intersample: dict[str, Intersample] = {
             **dict.fromkeys(self.inputs, ZERO_ORDER_HOLD),
             **check_intersample(self.intersample, tuple(self.inputs)),
         }
@@ -101,15 +101,15 @@ class RunArguments:
             s: as_vector(v, self.label_of(s), gaps=missing != "refuse" and (missing == "hold" or s in self.outputs))[0]
             for s, v in {**self.inputs, **self.outputs}.items()
         }
-        clock = self._time_axis(vectors)
-        first, last = self._rows(clock.times)
-        if last - first < clock.times.size:
+        time_axis = self._time_axis(vectors)
+        first, last = self._rows(time_axis.times)
+        if last - first < time_axis.times.size:
             # A view would keep the other rows in memory, and would be writable through its base array.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
         data = self._values(vectors, units, first, missing)
-        times, all_notes = clock.times[first:last], self.notes + clock.notes
-        if clock.step is not None:
-            step, start = clock.step, float(f"{first * clock.step:.12g}")
+        times, all_notes = time_axis.times[first:last], self.notes + time_axis.notes
+        if time_axis.step is not None:
+            step, start = time_axis.step, float(f"{first * time_axis.step:.12g}")
         else:
             check_values(times, self.time_label, first)
             check_increasing(times, self.time_label, first)
@@ -117,19 +117,19 @@ class RunArguments:
             if new_step is None:
                 if missing != "refuse":
                     times, data = self._insert_missing_samples(times, data, missing, first)
-                step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
+                step, jitter = regular_step(times, self.time_label, first, time_axis.resolution, self.known_step)
                 all_notes += jitter
-        data, notes = self._fill_input_gaps(data, behavior)
+        data, notes = self._fill_input_gaps(data, intersample)
         all_notes += notes
         nonuniform_samples = None
         if new_step is not None:
-            step, since = new_step, times - times[0]
-            whole = not any(np.isnan(data[s]).any() for s in self.outputs)
-            if not (whole and rows_coincide(since, new_step)):
-                nonuniform_samples = NonuniformSamples(since, data)
-            data = resample_uniform(since, data, behavior, new_step)
-            how = describe_resampled_signals(behavior, keep_times=nonuniform_samples is not None)
-            all_notes += (describe_resampling(since, new_step, first, how),)
+            step, times = new_step, times - times[0]
+            is_complete = not any(np.isnan(data[s]).any() for s in self.outputs)
+            if not (is_complete and rows_coincide(times, new_step)):
+                nonuniform_samples = NonuniformSamples(times, data)
+            data = resample_uniform(times, data, intersample, new_step)
+            method = describe_resampled_signals(intersample, keep_times=nonuniform_samples is not None)
+            all_notes += (describe_resampling(times, new_step, first, method),)
         return dict(
             name=self.name,
             step=step,
@@ -138,7 +138,7 @@ class RunArguments:
             outputs=tuple(self.outputs),
             _data=data,
             _units={s: unit for s, (unit, _) in units.items()},
-            _intersample=behavior,
+            _intersample=intersample,
             notes=tuple(dict.fromkeys(all_notes)),
             _metadata=dict(self.metadata),
             sample_times=nonuniform_samples,
@@ -155,26 +155,26 @@ class RunArguments:
         grid = grid_positions(times)
         if grid is None or grid[0].size == grid[0][-1] + 1:
             return times, data
-        places, step = grid
-        count = int(places[-1]) + 1 - places.size
+        indices, step = grid
+        count = int(indices[-1]) + 1 - indices.size
         if self.inputs and missing != "hold":
-            row = first + int(np.flatnonzero(np.diff(places) > 1)[0]) + 1
+            row = first + int(np.flatnonzero(np.diff(indices) > 1)[0]) + 1
             raise DataError(
                 f"{self.time_label}: {plural(count, 'row', 'are')} missing in a regular grid of {step:.6g} s, the "
                 f"first before row "
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or, "
                 f"only if no input changed there, hold the inputs over them with {parameter('missing', 'hold')}"
             )
-        whole = times[0] + uniform_times(int(places[-1]) + 1, step)
-        whole[places] = times
+        grid_times = times[0] + uniform_times(int(indices[-1]) + 1, step)
+        grid_times[indices] = times
         out = {}
         for name, values in data.items():
-            out[name] = np.full(whole.size, np.nan)
-            out[name][places] = values
-        return whole, out
+            out[name] = np.full(grid_times.size, np.nan)
+            out[name][indices] = values
+        return grid_times, out
 
     def _fill_input_gaps(
-        self, data: dict[str, Floats], behavior: Mapping[str, Intersample]
+        self, data: dict[str, Floats], intersample: Mapping[str, Intersample]
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
         """Return data with missing input samples filled, and notes on the missing samples of all signals.
 
@@ -188,8 +188,8 @@ class RunArguments:
             if name in self.outputs:
                 count = int((~is_missing).sum())
                 if count < MIN_RUN_SAMPLES:
-                    what = f"{count} values, but {MIN_RUN_SAMPLES} are needed"
-                    raise bad_rows(self.label_of(name), what, 0, int(is_missing.sum()), "use a longer record")
+                    problem = f"{count} values, but {MIN_RUN_SAMPLES} are needed"
+                    raise bad_rows(self.label_of(name), problem, 0, int(is_missing.sum()), "use a longer record")
                 notes.append(
                     describe_missing(
                         f"output {name}", is_missing, "they have no weight in output-error fits and figures"
@@ -197,23 +197,25 @@ class RunArguments:
                 )
                 continue
             if is_missing[0]:
-                what, remedy = (
+                problem, remedy = (
                     "no value, and there is no earlier value to hold",
                     "begin where the input is known, with ",
                 )
-                raise masked_rows_error(self.label_of(name), what, is_missing, remedy + parameter("window"))
-            out[name] = fill_input_gaps(values, behavior[name])
-            how = "its last value was held" if behavior[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
-            notes.append(describe_missing(f"input {name}", is_missing, f"{how}, which is a guess"))
+                raise masked_rows_error(self.label_of(name), problem, is_missing, remedy + parameter("window"))
+            out[name] = fill_input_gaps(values, intersample[name])
+            text = "its last value was held" if intersample[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
+            notes.append(describe_missing(f"input {name}", is_missing, f"{text}, which is a guess"))
         return out, tuple(notes)
 
     def _check_names(self) -> None:
         check_run_name(self.name)
         for signal in (*self.inputs, *self.outputs):
             check_signal_name(signal)
-        both = [signal for signal in self.inputs if signal in self.outputs]
-        if both:
-            raise DataError(f"signal {both[0]!r} is both an input and an output, {len(both)} in all; give it two names")
+        common = [signal for signal in self.inputs if signal in self.outputs]
+        if common:
+            raise DataError(
+                f"signal {common[0]!r} is both an input and an output, {len(common)} in all; give it two names"
+            )
         if not self.outputs:
             raise DataError(f"{parameter('outputs')}: no output is given; name at least one output")
         if (self.step is None) == (self.time is None):
@@ -230,31 +232,31 @@ class RunArguments:
                     f"given; leave it out, because {parameter('step')} is in s"
                 )
             step = check_step(self.step, "step")
-            clock = _TimeAxis(uniform_times(min(lengths.values()), step), step, 0.0)
+            time_axis = _TimeAxis(uniform_times(min(lengths.values()), step), step, 0.0)
         else:
             if not isinstance(self.time_unit, str) or self.time_unit not in TIME_UNITS:
                 raise DataError(
                     f"{parameter('time_unit', self.time_unit)} is unknown; the known ones are {join_names(TIME_UNITS)}"
                 )
-            dated = as_seconds(self.time, self.time_label)
-            if dated is not None and self.time_unit != "s":
+            dates = as_seconds(self.time, self.time_label)
+            if dates is not None and self.time_unit != "s":
                 raise DataError(
                     f"{parameter('time_unit', self.time_unit)} is the unit of numbers, but {self.time_label} has "
                     f"dates; omit {parameter('time_unit')}"
                 )
             gaps = check_missing_policy(self.missing) != "refuse"
-            times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label, gaps=gaps)
+            times, dtype = as_vector(self.time if dates is None else dates[0], self.time_label, gaps=gaps)
             lengths = {self.time_label: times.size, **lengths}
             times = times * TIME_UNITS[self.time_unit]
-            single = dtype.kind == "f" and dtype.itemsize < 8
-            precision = float(np.finfo(dtype if single else np.float64).eps)
-            notes: tuple[str, ...] = (dated[1],) if dated is not None and dated[1] else ()
-            if gaps and (unknown := missing_mask(times)).any() and not (unknown[0] or unknown[-1]):
+            is_single = dtype.kind == "f" and dtype.itemsize < 8
+            precision = float(np.finfo(dtype if is_single else np.float64).eps)
+            notes: tuple[str, ...] = (dates[1],) if dates is not None and dates[1] else ()
+            if gaps and (is_missing := missing_mask(times)).any() and not (is_missing[0] or is_missing[-1]):
                 times = interpolate_gaps(times)
-                notes += (describe_missing(self.time_label, unknown, "they were interpolated"),)
-            clock = _TimeAxis(times, None, precision * float(np.abs(times).max()), notes)
+                notes += (describe_missing(self.time_label, is_missing, "they were interpolated"),)
+            time_axis = _TimeAxis(times, None, precision * float(np.abs(times).max()), notes)
         check_lengths(lengths)
-        return clock
+        return time_axis
 
     def _rows(self, times: Floats) -> tuple[int, int]:
         """Return the index of the first row inside the data window, and the index after its last row.
@@ -265,9 +267,9 @@ class RunArguments:
         if self.window is not None:
             first, last = window_rows(times, self.window, self.time_label)
         if last - first < MIN_RUN_SAMPLES:
-            thing = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
+            label = self.label_of((*self.inputs, *self.outputs)[0]) if self.time is None else self.time_label
             raise DataError(
-                f"{thing}: {plural(last - first, 'row')}{' in the window' if self.window is not None else ''}, "
+                f"{label}: {plural(last - first, 'row')}{' in the window' if self.window is not None else ''}, "
                 f"{MIN_RUN_SAMPLES} are needed; use a longer record"
             )
         return first, last
@@ -284,11 +286,11 @@ class RunArguments:
         for signal, vector in vectors.items():
             unit, scale = units[signal]
             gaps = missing == "hold" or (missing == "weight" and signal in self.outputs)
-            instead = f"give them no weight with {parameter('missing', 'weight')}"
+            remedy = f"give them no weight with {parameter('missing', 'weight')}"
             if signal in self.inputs:
-                instead = f"hold the last value before them with {parameter('missing', 'hold')}"
-            instead += f", or avoid them with {parameter('window')}"
-            check_values(vector, self.label_of(signal), first, gaps=gaps, instead=instead)
+                remedy = f"hold the last value before them with {parameter('missing', 'hold')}"
+            remedy += f", or avoid them with {parameter('window')}"
+            check_values(vector, self.label_of(signal), first, gaps=gaps, remedy=remedy)
             data[signal] = vector
             if scale != 1.0:
                 with np.errstate(over="ignore"):
@@ -307,13 +309,13 @@ class _TimeAxis:
     notes: tuple[str, ...] = ()
 
 
-def describe_resampling(since: Floats, step: float, first: int, how: str) -> str:
+def describe_resampling(times: Floats, step: float, first: int, method: str) -> str:
     """Return a sentence on a resampling to `step` [s]: range of the original intervals, widest interval and method.
 
-    `since` are the original sample times [s]. Rows are counted from `first`, and `how` describes the method.
+    `times` are the original sample times [s]. Rows are counted from `first`, and `method` describes the method.
     """
-    intervals = np.diff(since)
+    intervals = np.diff(times)
     return (
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "
-        f"after row {first + int(intervals.argmax())} ({how})"
+        f"after row {first + int(intervals.argmax())} ({method})"
     )

@@ -35,31 +35,31 @@ def arguments_from_frame(
     outputs: object,
     units: Mapping[str, str] | None,
     time_unit: str | None,
-    **more: Any,
+    **options: Any,
 ) -> RunArguments:
     """Return the arguments of a run from the columns of a frame; see :meth:`ftlm.Run.from_frame`."""
     columns, index = _columns_of(frame), _index_of(frame)
 
-    def pick(column: Hashable, thing: str) -> object:
+    def pick(column: Hashable, role: str) -> object:
         count = columns.count(column)
         if count == 0 and index is not None and column == index[0]:
             return index[1]
         if count == 0:
             raise DataError(
-                f"column {column!r} ({thing}) is not in the frame{nearest(column, columns)}; "
+                f"column {column!r} ({role}) is not in the frame{nearest(column, columns)}; "
                 f"the columns are {join_names(columns)}; for the index of a pandas frame use frame.reset_index()"
             )
         if count > 1:
-            raise DataError(f"column {column!r} ({thing}) occurs {count} times; rename all but one")
+            raise DataError(f"column {column!r} ({role}) occurs {count} times; rename all but one")
         return cast("Mapping[Any, object]", frame)[column]
 
-    label, clock = "time" if time is None else f"time (column {time!r})", None
+    label, times = "time" if time is None else f"time (column {time!r})", None
     if time is not None:
-        clock = pick(time, "time")
+        times = pick(time, "time")
     elif index is not None and _is_time_index(*index):
         name = "time (the index)" if index[0] is None else f"time (the index {index[0]!r})"
         if step is None:
-            label, (time, clock) = name, index
+            label, (time, times) = name, index
         else:
             _check_index_step(step, name, index)
     columns_by_role = [
@@ -67,22 +67,22 @@ def arguments_from_frame(
     ]
     units = _stated_units(frame, columns_by_role[0] | columns_by_role[1]) | dict(units or {})
     labels = {s: f"signal {s!r} (column {column!r})" for part in columns_by_role for s, column in part.items()}
-    given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in columns_by_role)
+    input_values, output_values = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in columns_by_role)
     if isinstance(time, str):
         unit, notes = time_unit_of(time, label, time_unit)
     else:
         unit, notes = time_unit or "s", ()
     return RunArguments(
-        given_inputs,
-        given_outputs,
+        input_values,
+        output_values,
         step=step,
-        time=clock,
+        time=times,
         units=units,
         time_unit=unit,
         labels=labels,
         notes=notes,
         time_label=label,
-        **more,
+        **options,
     )
 
 
@@ -97,12 +97,12 @@ def _check_index_step(step: float, label: str, index: tuple[Hashable, object]) -
 
 def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:
     """Return the units in the attributes of a frame or of its columns, by signal; unknown units are omitted."""
-    whole = getattr(frame, "attrs", {}).get("units")
-    units_by_column = dict(whole) if isinstance(whole, Mapping) else {}
+    frame_units = getattr(frame, "attrs", {}).get("units")
+    units_by_column = dict(frame_units) if isinstance(frame_units, Mapping) else {}
     for column in set(columns.values()).intersection(_columns_of(frame)):
         with contextlib.suppress(KeyError, TypeError, ValueError, IndexError):
-            own = getattr(cast("Mapping[Any, object]", frame)[column], "attrs", {})
-            stated_unit = own.get("units", own.get("unit"))
+            column_attributes = getattr(cast("Mapping[Any, object]", frame)[column], "attrs", {})
+            stated_unit = column_attributes.get("units", column_attributes.get("unit"))
             # A column of a pandas frame has the attributes of the frame.
             units_by_column[column] = stated_unit if isinstance(stated_unit, str) else units_by_column.get(column)
     units = {name: parse_unit(str(units_by_column.get(column) or "")) for name, column in columns.items()}
@@ -129,8 +129,8 @@ def _index_of(frame: object) -> tuple[Hashable, object] | None:
     """Return name and values of the row index of a frame, or of the only dimension of an xarray dataset; else None."""
     sizes = getattr(frame, "sizes", None)
     if isinstance(frame, Mapping) and isinstance(sizes, Mapping):
-        only = next(iter(sizes), None)
-        return (only, cast("Any", frame)[only]) if len(sizes) == 1 and only in getattr(frame, "coords", ()) else None
+        axis = next(iter(sizes), None)
+        return (axis, cast("Any", frame)[axis]) if len(sizes) == 1 and axis in getattr(frame, "coords", ()) else None
     index = getattr(frame, "index", None)
     if index is None or callable(index) or getattr(index, "nlevels", 1) != 1:
         return None
@@ -158,8 +158,8 @@ def dataset_of(run: Run) -> Any:
     for name in run.signals:
         role = {"role": "input", "intersample": run.intersample[name]} if name in run.inputs else {"role": "output"}
         signals[name] = (CSV_TIME, run[name].copy(), {"units": run.units[name], **role})
-    clock = (CSV_TIME, run.start + run.time, {"units": "s"})
-    return xarray.Dataset(signals, coords={CSV_TIME: clock}, attrs=_frame_attributes(run))
+    time = (CSV_TIME, run.start + run.time, {"units": "s"})
+    return xarray.Dataset(signals, coords={CSV_TIME: time}, attrs=_frame_attributes(run))
 
 
 def _frame_attributes(run: Run) -> dict[str, Any]:
@@ -212,9 +212,9 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
 
     def text(self) -> str:
         """Return the header as text, ``VERSION JSON``."""
-        words = json.dumps(msgspec.to_builtins(self), ensure_ascii=False, allow_nan=False)
+        fields = json.dumps(msgspec.to_builtins(self), ensure_ascii=False, allow_nan=False)
         # A lone surrogate cannot be encoded in UTF-8 and is written as a JSON escape.
-        return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
+        return f"{CSV_VERSION} {fields.encode('utf-8', 'backslashreplace').decode()}"
 
     def line(self) -> str:
         """Return the header as the first line of a text file; raise DataError if it is too long."""
@@ -228,16 +228,16 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
         return line
 
     @classmethod
-    def read(cls, path: Path, where: str, text: str) -> Header:
+    def read(cls, path: Path, location: str, text: str) -> Header:
         """Return the header from its text; raise DataError if it is corrupt or has another version.
 
-        `where` is the position of the header in the file, for messages. The start time is set to 0, because it follows
-        from the samples.
+        `location` is the position of the header in the file, for messages. The start time is set to 0, because it
+        follows from the samples.
         """
         version, _, body = text.partition(" ")
         if version.strip() != str(CSV_VERSION):
             raise DataError(
-                f"{path.name}: {where}: the format ftlm-run {version.strip()[:20]!r} is not known here; use a newer "
+                f"{path.name}: {location}: the format ftlm-run {version.strip()[:20]!r} is not known here; use a newer "
                 "ftlm, or remove the line and name the columns"
             )
         try:
@@ -248,8 +248,8 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
             return header
         except (ValueError, TypeError, RecursionError) as error:
             raise DataError(
-                f"{path.name}: {where} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line "
-                "and name the columns"
+                f"{path.name}: {location} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the "
+                "line and name the columns"
             ) from None
 
 

@@ -150,14 +150,14 @@ class FrequencyData:
         DataError
             If a limit is not a number, or there are no data between the limits.
         """
-        ends = [
-            default if end is None else real_number(name, end)
-            for name, end, default in (("low", low, 0.0), ("high", high, math.inf))
+        limits = [
+            default if limit is None else real_number(name, limit)
+            for name, limit, default in (("low", low, 0.0), ("high", high, math.inf))
         ]
-        is_inside = (self.frequency >= ends[0]) & (self.frequency <= ends[1])
+        is_inside = (self.frequency >= limits[0]) & (self.frequency <= limits[1])
         if not is_inside.any():
             raise DataError(
-                f"{self.name}: there are no data from {ends[0]:g} to {ends[1]:g} rad/s; the data cover "
+                f"{self.name}: there are no data from {limits[0]:g} to {limits[1]:g} rad/s; the data cover "
                 f"{self.frequency.min():.5g} to {self.frequency.max():.5g} rad/s"
             )
         deviation = None if self.deviation is None else self.deviation[is_inside]
@@ -172,7 +172,7 @@ class FrequencyData:
 
     def __str__(self) -> str:
         low, high = float(self.frequency.min()), float(self.frequency.max())
-        size = np.abs(self.response)
+        magnitude = np.abs(self.response)
         unit = f" {self.unit}" if self.unit else ""
         pair = f" of {self.output} from {self.input}" if self.output and self.input else ""
         with_or_without = "with" if self.deviation is not None else "without"
@@ -180,7 +180,7 @@ class FrequencyData:
             [
                 f"{self.name}: frequency response{pair}, {self.frequency.size} frequencies from {low:.5g} to "
                 f"{high:.5g} rad/s ({low / (2 * math.pi):.4g} to {high / (2 * math.pi):.4g} Hz)",
-                f"  size {size.min():.5g} to {size.max():.5g}{unit}, {with_or_without} standard deviations",
+                f"  size {magnitude.min():.5g} to {magnitude.max():.5g}{unit}, {with_or_without} standard deviations",
                 *(f"  note: {w}" for w in self.warnings),
             ]
         )

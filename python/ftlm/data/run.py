@@ -186,9 +186,9 @@ class Run:
             large; if lengths differ; if a name is invalid or used twice; if a unit or intersample behavior is unknown;
             if time is not finite, repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
-        own, measured = as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs)
+        inputs, outputs = as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs)
         arguments = RunArguments(
-            own, measured, step, time, units, intersample, name, resample, window, time_unit, missing=missing
+            inputs, outputs, step, time, units, intersample, name, resample, window, time_unit, missing=missing
         )
         return cls._from_checked(**arguments.checked_fields())
 
@@ -242,8 +242,8 @@ class Run:
         """
         from ftlm.data.export import arguments_from_frame
 
-        more = {"intersample": intersample, "name": name, "resample": resample, "window": window, "missing": missing}
-        arguments = arguments_from_frame(frame, time, step, inputs, outputs, units, time_unit, **more)
+        options = {"intersample": intersample, "name": name, "resample": resample, "window": window, "missing": missing}
+        arguments = arguments_from_frame(frame, time, step, inputs, outputs, units, time_unit, **options)
         return cls._from_checked(**arguments.checked_fields())
 
     @property
@@ -371,11 +371,11 @@ class Run:
             )
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
-        begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
+        start_time = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
         nonuniform = self.sample_times
         if nonuniform is not None:
             nonuniform = nonuniform.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
-        return self._with(_data=data, start=begin, sample_times=nonuniform)
+        return self._with(_data=data, start=start_time, sample_times=nonuniform)
 
     def split(self, duration: float) -> list[Run]:
         """Split this run into consecutive runs whose lengths differ by at most one row.
@@ -428,14 +428,14 @@ class Run:
             If `step` is not positive, or gives fewer than three rows or more than 50 million.
         """
         new_step = check_step(step, "resample")
-        since, nonuniform = uniform_times(self.length, self.step), self.sample_times
-        if nonuniform is None and (self.missing_samples or not rows_coincide(since, new_step)):
-            nonuniform = NonuniformSamples(since, self._data)
-        source = nonuniform or NonuniformSamples(since, self._data)
+        times, nonuniform = uniform_times(self.length, self.step), self.sample_times
+        if nonuniform is None and (self.missing_samples or not rows_coincide(times, new_step)):
+            nonuniform = NonuniformSamples(times, self._data)
+        source = nonuniform or NonuniformSamples(times, self._data)
         data = resample_uniform(source.times, source.data, self._intersample, new_step)
         how = describe_resampled_signals(self._intersample, keep_times=nonuniform is not None)
-        fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
-        return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=nonuniform)
+        note = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
+        return self._with(_data=data, step=new_step, notes=(*self.notes, note), sample_times=nonuniform)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of signals subtracted from them.
@@ -467,11 +467,11 @@ class Run:
             raise self._unknown_signal_error(unknown)
         data, run_notes, nonuniform = dict(self._data), list(self.notes), self.sample_times
         for name in names:
-            trend, words = fit_trend(self._data[name], self.step, linear=kind == "linear")
+            trend, text = fit_trend(self._data[name], self.step, linear=kind == "linear")
             data[name] = self._data[name] - trend(self.time)
             if nonuniform is not None:
                 nonuniform = nonuniform.replace_signals(**{name: nonuniform.data[name] - trend(nonuniform.times)})
-            run_notes.append(f"detrended: {words} subtracted from {name}")
+            run_notes.append(f"detrended: {text} subtracted from {name}")
         return self._with(_data=data, notes=tuple(run_notes), sample_times=nonuniform)
 
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
@@ -501,8 +501,8 @@ class Run:
         checked = self._checked_samples("samples", samples, self.length)
         nonuniform = self.sample_times
         if nonuniform is not None:
-            own = {} if read is None else read
-            nonuniform = nonuniform.replace_signals(**self._checked_samples("read", own, nonuniform.times.size))
+            values = {} if read is None else read
+            nonuniform = nonuniform.replace_signals(**self._checked_samples("read", values, nonuniform.times.size))
         return self._with(_data={**self._data, **checked}, sample_times=nonuniform)
 
     def with_unmasked_run(self, run: Run) -> Run:
@@ -515,10 +515,10 @@ class Run:
         for name, values in as_mapping(argument, values_by_name).items():
             if name not in self:
                 raise self._unknown_signal_error(name)
-            what, gaps = f"signal {name!r}", name in self.outputs
-            checked[name] = as_vector(values, what, gaps=gaps)[0]
-            check_lengths({f"run {self.name!r}": length, what: checked[name].size})
-            check_values(checked[name], what, 0, gaps=gaps)
+            label, gaps = f"signal {name!r}", name in self.outputs
+            checked[name] = as_vector(values, label, gaps=gaps)[0]
+            check_lengths({f"run {self.name!r}": length, label: checked[name].size})
+            check_values(checked[name], label, 0, gaps=gaps)
         return checked
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
@@ -577,9 +577,9 @@ class Run:
         DataError
             If a name is not an input or a value is neither "zoh" nor "foh".
         """
-        behaviour = {**self._intersample, **check_intersample(mapping, self.inputs)}
-        data = self._data if self.sample_times is None else self.sample_times.resample(behaviour, self.step)
-        return self._with(_intersample=behaviour, _data={n: v[: self.length] for n, v in data.items()})
+        intersample = {**self._intersample, **check_intersample(mapping, self.inputs)}
+        data = self._data if self.sample_times is None else self.sample_times.resample(intersample, self.step)
+        return self._with(_intersample=intersample, _data={n: v[: self.length] for n, v in data.items()})
 
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
         """Return this run with additional or replaced outputs.
@@ -671,12 +671,12 @@ class Run:
                     "of the record in which it was measured"
                 )
             if is_constant(values):
-                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(samples[0])!r}"
-                way_out = (
+                label, fault = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(samples[0])!r}"
+                remedy = (
                     "check the sensor and the column, or load a part of the record in which it moves with "
                     f"{parameter('window')}"
                 )
-                raise bad_rows(thing, what, 0, values.size, way_out)
+                raise bad_rows(label, fault, 0, values.size, remedy)
 
     def plot(self, *signals: str) -> Figures:
         """Return plots of the given signals (default all) over time, outputs first; see also ``ftlm.plot.run``.

@@ -19,16 +19,16 @@ def check_compatible(runs: Iterable[Run]) -> None:
 
     Runs may differ in step, length, intersample behavior, and the sequence of their signals.
     """
-    every = list(runs)
-    if not every:
+    run_list = list(runs)
+    if not run_list:
         raise DataError("runs: there is none; pass at least one run")
-    first = every[0]
-    for index, run in enumerate(every[1:], start=1):
-        who = f"run {index} ({run.name!r}) and run 0 ({first.name!r})"
+    first = run_list[0]
+    for index, run in enumerate(run_list[1:], start=1):
+        subject = f"run {index} ({run.name!r}) and run 0 ({first.name!r})"
         for role, first_names, other in (("inputs", first.inputs, run.inputs), ("outputs", first.outputs, run.outputs)):
             if set(first_names) != set(other):
                 raise DataError(
-                    f"{who} have different {role}: {join_names(other)} and {join_names(first_names)}; "
+                    f"{subject} have different {role}: {join_names(other)} and {join_names(first_names)}; "
                     "use rename() and select() so that the names agree"
                 )
         units, first_units = run.units, first.units
@@ -36,7 +36,7 @@ def check_compatible(runs: Iterable[Run]) -> None:
         if differing:
             name = differing[0]
             raise DataError(
-                f"{who} have different units: signal {name!r} is in {units[name]!r} and {first_units[name]!r}, "
+                f"{subject} have different units: signal {name!r} is in {units[name]!r} and {first_units[name]!r}, "
                 f"{len(differing)} in all; give the same {parameter('units')} when loading"
             )
 
@@ -49,33 +49,33 @@ class Runs(tuple[Run, ...]):
     def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
         """Return the tuple of validated runs; raise DataError as :func:`as_runs` does."""
         try:
-            every = [runs] if isinstance(runs, Run) else list(runs)
+            run_list = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
             raise DataError(
                 f"runs is {type(runs).__name__}; give a Run or a list of them (identify_frequency takes frequency "
                 "data: fit each circuit or equation, and compare their information.aicc)"
             ) from None
-        if not every:
+        if not run_list:
             raise DataError("no run is given; give at least one")
-        for i, run in enumerate(every):
+        for i, run in enumerate(run_list):
             if not isinstance(run, Run):
                 raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
-        check_compatible(every)
-        checked = super().__new__(cls, every)
+        check_compatible(run_list)
+        checked = super().__new__(cls, run_list)
         checked._cache = {}
         return checked
 
     def __reduce__(self) -> tuple[object, ...]:
         return Runs, (tuple(self),)
 
-    def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
+    def get_or_compute(self, key: str, compute: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
         """Return the cached items for a key; if there are none, collect the items of ``make()`` and cache them.
 
         The oldest result is removed when the cache is full.
         """
         entry = self._cache.get(key)
         if entry is None:
-            entry = self._cache[key] = tuple(make())
+            entry = self._cache[key] = tuple(compute())
             for old in list(self._cache)[:-MAX_CACHED_RESULTS]:
                 self._cache.pop(old, None)
         return entry

@@ -90,83 +90,83 @@ def as_number(value: object) -> float | None:
         return math.inf
 
 
-def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
+def as_vector(values: object, label: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
     """Return a float64 copy of a vector and its original dtype; raise DataError if it is not a vector of numbers.
 
-    With `gaps`, masked values and None become NaN. `thing` names the vector in error messages.
+    With `gaps`, masked values and None become NaN. `label` names the vector in error messages.
     """
     if gaps and isinstance(values, (list, tuple)):
         values = [np.nan if value is None else value for value in values]
-    array = as_array(thing, values, gaps=gaps)
+    array = as_array(label, values, gaps=gaps)
     # pandas columns that allow missing values come as objects although they hold numbers.
     if array.dtype.kind == "O" and getattr(getattr(values, "dtype", None), "kind", "O") in "biuf":
         array = cast("Any", values).to_numpy(dtype=np.float64, na_value=np.nan)
     if array.dtype.kind in "USTO" or (array.ndim == 1 and array.dtype.kind in "MmV"):
-        raise _not_numbers(values, array, thing)
+        raise _not_numbers(values, array, label)
     if array.ndim != 1:
         raise DataError(
-            f"{thing}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
+            f"{label}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
         )
     if array.size == 0:
-        raise DataError(f"{thing}: empty, 0 rows; {MIN_RUN_SAMPLES} are needed")
+        raise DataError(f"{label}: empty, 0 rows; {MIN_RUN_SAMPLES} are needed")
     if array.dtype.kind == "c":
         rows = np.flatnonzero(np.imag(array) != 0)
         first, count = (int(rows[0]), rows.size) if rows.size else (0, array.size)
-        raise bad_rows(thing, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
+        raise bad_rows(label, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
     if array.dtype.kind not in "biuf":
-        raise _not_numbers(values, array, thing)
+        raise _not_numbers(values, array, label)
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C"), array.dtype
 
 
-def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
+def as_seconds(values: object, label: str) -> tuple[Floats, str] | None:
     """Return dates or time differences as seconds, and a note on the subtracted date; None for other types.
 
     The first date is subtracted from all dates; time differences are only converted, with an empty note. Missing dates
-    and spans above 292 years raise DataError. `thing` names the time in error messages.
+    and spans above 292 years raise DataError. `label` names the time in error messages.
     """
     try:
-        array = as_array(thing, values)
+        array = as_array(label, values)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
         if isinstance(first, datetime.date):
             # Dates with a time zone become UTC: a pandas series converts itself, other objects are converted here.
-            plain = getattr(values, "dtype", None) is not None and array.dtype != getattr(values, "dtype", None)
+            is_series = getattr(values, "dtype", None) is not None and array.dtype != getattr(values, "dtype", None)
             array = np.asarray(
-                values if plain else [_to_universal_time(moment) for moment in array.tolist()], "datetime64[ns]"
+                values if is_series else [_to_universal_time(date) for date in array.tolist()], "datetime64[ns]"
             )
     except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"{thing}: not one date per row ({error}); pass datetime64, or seconds") from None
+        raise DataError(f"{label}: not one date per row ({error}); pass datetime64, or seconds") from None
     if array.dtype.kind not in "mM" or array.ndim != 1 or array.size == 0:
         return None
     if np.isnat(array).any():
-        raise masked_rows_error(thing, "no date", np.isnat(array), "remove or fill these rows yourself")
-    lapses = array - array[0] if array.dtype.kind == "M" else array
-    nanoseconds = lapses.astype("timedelta64[ns]")
-    if (nanoseconds.astype(lapses.dtype) != lapses).any():
-        raise DataError(f"{thing}: from {array.min()} to {array.max()} is more than 292 years; split the record")
-    words = f"time counted from {array[0]} on" if array.dtype.kind == "M" else ""
-    return nanoseconds.astype(np.int64) / 1e9, words
+        raise masked_rows_error(label, "no date", np.isnat(array), "remove or fill these rows yourself")
+    differences = array - array[0] if array.dtype.kind == "M" else array
+    nanoseconds = differences.astype("timedelta64[ns]")
+    if (nanoseconds.astype(differences.dtype) != differences).any():
+        raise DataError(f"{label}: from {array.min()} to {array.max()} is more than 292 years; split the record")
+    note = f"time counted from {array[0]} on" if array.dtype.kind == "M" else ""
+    return nanoseconds.astype(np.int64) / 1e9, note
 
 
-def _to_universal_time(moment: Any) -> Any:
+def _to_universal_time(date: Any) -> Any:
     """Return a date with a time zone as UTC without a time zone; return other values unchanged."""
-    zone = getattr(moment, "tzinfo", None)
-    return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
+    zone = getattr(date, "tzinfo", None)
+    return date if zone is None else date.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
-def _not_numbers(values: object, array: npt.NDArray[Any], thing: str) -> DataError:
+def _not_numbers(values: object, array: npt.NDArray[Any], label: str) -> DataError:
     if array.dtype.kind in "Mm":
-        return bad_rows(thing, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
+        return bad_rows(label, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
     if array.ndim == 0:
-        return DataError(f"{thing}: {_short(array.item())} is not an array; pass one number per row")
+        return DataError(f"{label}: {_short(array.item())} is not an array; pass one number per row")
     # NumPy turns a list of numbers and text into an array of text; the list still distinguishes them.
     flat = list(values) if isinstance(values, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
-        what = f"objects, not numbers (dtype {array.dtype})"
-        return bad_rows(thing, what, 0, len(flat), "use np.asarray(x, dtype=float)")
-    what = "missing value None" if flat[bad[0]] is None else f"{_short(flat[bad[0]])} is not a number"
-    return bad_rows(thing, what, bad[0], len(bad), "convert it to numbers first")
+        problem = f"objects, not numbers (dtype {array.dtype})"
+        return bad_rows(label, problem, 0, len(flat), "use np.asarray(x, dtype=float)")
+    problem = "missing value None" if flat[bad[0]] is None else f"{_short(flat[bad[0]])} is not a number"
+    return bad_rows(label, problem, bad[0], len(bad), "convert it to numbers first")
 
 
 def _short(value: object) -> str:
@@ -178,12 +178,12 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
     """Raise DataError if lengths differ; the message names the first column without the most frequent length."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
-    wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
-    if wrong:
-        thing, count = wrong[0]
+    mismatches = [(label, count) for label, count in lengths.items() if count != expected]
+    if mismatches:
+        label, count = mismatches[0]
         raise DataError(
-            f"{thing}: {plural(count, 'row')} where {expected} are expected, {len(wrong)} of {len(lengths)} columns "
-            "differ; give every column one number per row of the same record"
+            f"{label}: {plural(count, 'row')} where {expected} are expected, {len(mismatches)} of {len(lengths)} "
+            "columns differ; give every column one number per row of the same record"
         )
 
 
@@ -196,74 +196,74 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
     mean = float(np.mean(values[is_present]))
     if not linear:
         return (lambda t: np.full(t.size, mean)), f"{mean:.6g}"
-    clock = np.arange(values.size) * step
-    middle = float(np.mean(clock[is_present]))
-    centered_times = clock[is_present] - middle
+    times = np.arange(values.size) * step
+    mean_time = float(np.mean(times[is_present]))
+    centered_times = times[is_present] - mean_time
     slope = float(centered_times @ (values[is_present] - mean)) / float(centered_times @ centered_times)
     sign = "-" if slope < 0 else "+"
-    return (lambda t: mean + slope * (t - middle)), f"{mean - slope * middle:.6g} {sign} {abs(slope):.6g} t"
+    return (lambda t: mean + slope * (t - mean_time)), f"{mean - slope * mean_time:.6g} {sign} {abs(slope):.6g} t"
 
 
-def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str | None = None) -> None:
+def check_values(values: Floats, label: str, offset: int, *, gaps: bool = False, remedy: str | None = None) -> None:
     """Raise DataError if values are not finite, or above 1e150 in magnitude, where squares overflow.
 
-    In the message, `thing` names the signal, rows are counted from `offset`, and `instead` is a remedy for NaN. With
+    In the message, `label` names the signal, rows are counted from `offset`, and `remedy` is a remedy for NaN. With
     `gaps`, NaN is accepted.
     """
     with np.errstate(invalid="ignore"):
         if values.size == 0 or (values.min() >= -MAX_SAMPLE_VALUE and values.max() <= MAX_SAMPLE_VALUE):
             return
-        good = np.abs(values) <= MAX_SAMPLE_VALUE
+        is_valid = np.abs(values) <= MAX_SAMPLE_VALUE
     if gaps:
-        good |= np.isnan(values)
-    if good.all():
+        is_valid |= np.isnan(values)
+    if is_valid.all():
         return
-    rows = np.flatnonzero(~good)
+    rows = np.flatnonzero(~is_valid)
     value = float(values[rows[0]])
     first, count = offset + int(rows[0]), rows.size
     advice = f"avoid them with {parameter('window')}"
     if math.isnan(value):
-        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead or advice}")
+        raise bad_rows(label, "NaN", first, count, f"remove or fill these rows yourself, or {remedy or advice}")
     if math.isinf(value):
         raise bad_rows(
-            thing, f"infinity ({value})", first, count, f"correct these rows, or avoid them with {parameter('window')}"
+            label, f"infinity ({value})", first, count, f"correct these rows, or avoid them with {parameter('window')}"
         )
-    what = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
+    problem = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
     raise bad_rows(
-        thing, what, first, count, f"correct these rows, scale the signal, or avoid them with {parameter('window')}"
+        label, problem, first, count, f"correct these rows, scale the signal, or avoid them with {parameter('window')}"
     )
 
 
-def masked_rows_error(thing: str, what: str, is_bad: NDArray[np.bool_], remedy: str, offset: int = 0) -> DataError:
+def masked_rows_error(label: str, problem: str, is_bad: NDArray[np.bool_], remedy: str, offset: int = 0) -> DataError:
     """Return a DataError that names the first row where `is_bad` is True; rows are counted from `offset`."""
     rows = np.flatnonzero(is_bad)
-    return bad_rows(thing, what, offset + int(rows[0]), rows.size, remedy)
+    return bad_rows(label, problem, offset + int(rows[0]), rows.size, remedy)
 
 
-def check_increasing(clock: Floats, thing: str, offset: int) -> None:
+def check_increasing(times: Floats, label: str, offset: int) -> None:
     """Raise DataError if sample times are not strictly increasing; rows are counted from `offset`."""
-    steps = np.diff(clock)
+    steps = np.diff(times)
     if (steps > 0).all():
         return
     row_before = int(np.flatnonzero(~(steps > 0))[0])
-    row, (earlier, later) = offset + row_before + 1, clock[row_before : row_before + 2].tolist()
+    row, (earlier, later) = offset + row_before + 1, times[row_before : row_before + 2].tolist()
     if steps[row_before] == 0:
-        way_out = "remove the repeated rows, or write the time with more digits"
-        raise bad_rows(thing, f"repeated time {later!r} s", row, int((steps == 0).sum()), way_out)
-    way_out = "sort the rows, or split the file where the clock starts again"
-    raise bad_rows(thing, f"decreasing time, {later!r} s after {earlier!r} s", row, int((steps < 0).sum()), way_out)
+        remedy = "remove the repeated rows, or write the time with more digits"
+        raise bad_rows(label, f"repeated time {later!r} s", row, int((steps == 0).sum()), remedy)
+    remedy = "sort the rows, or split the file where the clock starts again"
+    raise bad_rows(label, f"decreasing time, {later!r} s after {earlier!r} s", row, int((steps < 0).sum()), remedy)
 
 
 def regular_step(
-    clock: Floats, thing: str, offset: int, resolution: float, stated_step: float | None
+    times: Floats, label: str, offset: int, resolution: float, stated_step: float | None
 ) -> tuple[float, tuple[str, ...]]:
     """Return the step [s] of regular sample times, rounded to a short decimal, and notes on their jitter.
 
     Parameters
     ----------
-    clock
+    times
         Sample times [s], strictly increasing.
-    thing, offset
+    label, offset
         Name of the time in messages, and number of the first row.
     resolution
         Rounding error of the times [s].
@@ -275,79 +275,80 @@ def regular_step(
     DataError
         If there is a gap, the jitter exceeds 2 % of a step, or the mean step contradicts the stated step.
     """
-    count = clock.size - 1
-    since = clock - clock[0]
-    mean = float(since[-1]) / count
+    count = times.size - 1
+    elapsed = times - times[0]
+    mean = float(elapsed[-1]) / count
     if not _MIN_STEP_S <= mean <= _MAX_STEP_S:
-        raise DataError(f"{thing}: the mean step {mean!r} s cannot be used; check the unit of the time")
-    deviation = np.abs(since - uniform_times(clock.size, mean))
-    worst = float(deviation.max())
-    if worst > _MAX_JITTER_SHARE * mean:
-        steps = np.diff(clock)
-        usual = float(np.median(steps))
-        gaps = np.flatnonzero(steps > _GAP_STEP_RATIO * usual)
+        raise DataError(f"{label}: the mean step {mean!r} s cannot be used; check the unit of the time")
+    deviation = np.abs(elapsed - uniform_times(times.size, mean))
+    max_deviation = float(deviation.max())
+    if max_deviation > _MAX_JITTER_SHARE * mean:
+        steps = np.diff(times)
+        median_step = float(np.median(steps))
+        gaps = np.flatnonzero(steps > _GAP_STEP_RATIO * median_step)
         if gaps.size:
-            what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
-            way_out = (
+            problem = f"gap of {steps[gaps[0]]:.6g} s where {median_step:.6g} s is usual"
+            remedy = (
                 f"load the part before or after it with {parameter('window')}; or add its rows, with the inputs and "
                 f"empty outputs, and use {parameter('missing', 'weight')}; or, only if no input changed there, "
                 f"{parameter('missing', 'hold')} or {parameter('resample', Placeholder('STEP'))}"
             )
-            raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
-        share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
-        way_out = (
+            raise bad_rows(label, problem, offset + int(gaps[0]) + 1, gaps.size, remedy)
+        problem = f"jitter of up to {100.0 * max_deviation / mean:.3g} % of the mean step {mean:.6g} s"
+        problem += f" ({100 * _MAX_JITTER_SHARE:g} % allowed)"
+        remedy = (
             f"put the inputs on a regular grid with {parameter('resample', Placeholder('STEP'))}; outputs are "
             "then compared at their original times"
         )
         is_late = deviation > _MAX_JITTER_SHARE * mean
-        raise masked_rows_error(thing, f"jitter of up to {share}", is_late, way_out, offset)
-    fact: tuple[str, ...] = ()
-    if worst > _MIN_REPORTED_JITTER_SHARE * mean:
+        raise masked_rows_error(label, problem, is_late, remedy, offset)
+    notes: tuple[str, ...] = ()
+    if max_deviation > _MIN_REPORTED_JITTER_SHARE * mean:
         row = offset + int(deviation.argmax())
-        share = f"{100.0 * worst / mean:.2g} % of a step, the most at row {row}"
-        fact = (f"time jitters by up to {share}; the sampling was assumed uniform",)
+        jitter = f"{100.0 * max_deviation / mean:.2g} % of a step, the most at row {row}"
+        notes = (f"time jitters by up to {jitter}; the sampling was assumed uniform",)
     if stated_step is not None:
-        if not abs(stated_step - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
+        if not abs(stated_step - mean) * count <= max(4.0 * resolution, 2.0 * max_deviation, 1e-8 * mean):
             raise DataError(
-                f"{thing}: the mean step is {mean!r} s where the file's header says {stated_step!r} s; "
+                f"{label}: the mean step is {mean!r} s where the file's header says {stated_step!r} s; "
                 "correct the header, or remove its first line and name the columns"
             )
-        return stated_step, fact
-    return _short_decimal(mean, count, 4.0 * resolution, 2.0 * worst), fact
+        return stated_step, notes
+    return _short_decimal(mean, count, 4.0 * resolution, 2.0 * max_deviation), notes
 
 
-def check_step_agrees(step: object, clock: Floats, thing: str) -> None:
+def check_step_agrees(step: object, times: Floats, label: str) -> None:
     """Raise DataError if a given step [s] contradicts the sample times [s] of the same rows.
 
     The step agrees if it differs by at most 2 % from the mean or the median interval. Times that do not increase are no
     time axis and are not compared.
     """
-    seconds, steps = check_step(step, "step"), np.diff(clock[np.isfinite(clock)])
+    seconds, steps = check_step(step, "step"), np.diff(times[np.isfinite(times)])
     if not steps.size or not np.all(steps > 0):
         return
     intervals = float(np.mean(steps)), float(np.median(steps))
     if min(abs(interval / seconds - 1.0) for interval in intervals) > _MAX_JITTER_SHARE:
         raise DataError(
-            f"{parameter('step', step)}, but {thing} has a step of {intervals[1]:.6g} s; omit {parameter('step')}, "
+            f"{parameter('step', step)}, but {label} has a step of {intervals[1]:.6g} s; omit {parameter('step')}, "
             f"with {parameter('time_unit')} if the times have another unit, or rename the column if it is not the time"
         )
 
 
-def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
+def _short_decimal(mean: float, count: int, rounding: float, jitter: float) -> float:
     """Return the decimal with the fewest digits that agrees with the mean step, or the mean step if there is none.
 
     A decimal agrees if `count` such steps and `count` mean steps differ by at most `rounding` [s]. A decimal within a
-    relative difference of 1e-9 of the mean step also agrees if they differ by at most `observed` [s].
+    relative difference of 1e-9 of the mean step also agrees if they differ by at most `jitter` [s].
     """
     for digits in range(12):
-        short = float(f"{mean:.{digits}e}")
-        drift = abs(short - mean) * count
-        if drift <= rounding or (drift <= observed and abs(short - mean) <= 1e-9 * mean):
-            return short
+        decimal = float(f"{mean:.{digits}e}")
+        error = abs(decimal - mean) * count
+        if error <= rounding or (error <= jitter and abs(decimal - mean) <= 1e-9 * mean):
+            return decimal
     return mean
 
 
-def window_rows(clock: Floats, window: object, thing: str = "time") -> tuple[int, int]:
+def window_rows(times: Floats, window: object, label: str = "time") -> tuple[int, int]:
     """Return the index of the first row inside a data window, and the index after its last row.
 
     `window` is a pair of times [s] since the first row; a time of None marks an open end. Raise DataError if the window
@@ -368,68 +369,69 @@ def window_rows(clock: Floats, window: object, thing: str = "time") -> tuple[int
             raise DataError(f"{parameter('window')}: limit {value!r} is not finite; use None for an open end")
         limits.append(value)
     start, stop = limits
-    ends = clock[[0, -1]]
-    if not np.isfinite(ends).all():
-        row, count = 0 if not np.isfinite(ends[0]) else clock.size - 1, int((~np.isfinite(clock)).sum())
-        way_out = f"remove these rows; {parameter('window')} counts from the first time"
-        raise bad_rows(thing, "the first or last time is not finite", row, count, way_out)
+    end_times = times[[0, -1]]
+    if not np.isfinite(end_times).all():
+        row, count = 0 if not np.isfinite(end_times[0]) else times.size - 1, int((~np.isfinite(times)).sum())
+        remedy = f"remove these rows; {parameter('window')} counts from the first time"
+        raise bad_rows(label, "the first or last time is not finite", row, count, remedy)
     with np.errstate(over="ignore", invalid="ignore"):
-        since = clock - clock[0]
-        steps = np.diff(since)
+        elapsed = times - times[0]
+        steps = np.diff(elapsed)
         # The median interval is robust against gaps and repeated or missing times.
         steps = steps[np.isfinite(steps) & (steps > 0)]
         step = float(np.median(steps)) if steps.size else 0.0
-        whole = float(since[-1]) + step
-    way_out = f"{thing} has times from 0 to {whole:.12g} s since its first row"
+        duration = float(elapsed[-1]) + step
+    remedy = f"{label} has times from 0 to {duration:.12g} s since its first row"
     for limit in (start, stop):
-        if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= whole + _EDGE_TOLERANCE_STEPS * step:
-            raise DataError(f"{parameter('window')}: limit {limit!r} s is out of range; {way_out}")
+        if limit is not None and not -_EDGE_TOLERANCE_STEPS * step <= limit <= duration + _EDGE_TOLERANCE_STEPS * step:
+            raise DataError(f"{parameter('window')}: limit {limit!r} s is out of range; {remedy}")
     low = 0.0 if start is None else start
     high = math.inf if stop is None else stop
     if low >= high:
-        raise DataError(f"{parameter('window')}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
+        raise DataError(f"{parameter('window')}: the limits {start!r} and {stop!r} s do not increase; {remedy}")
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(
-            (since >= low - _EDGE_TOLERANCE_STEPS * step) & (since < high - _EDGE_TOLERANCE_STEPS * step)
+            (elapsed >= low - _EDGE_TOLERANCE_STEPS * step) & (elapsed < high - _EDGE_TOLERANCE_STEPS * step)
         )
     if rows.size == 0:
-        raise DataError(f"window: no row lies between {start!r} and {stop!r} s; {way_out}")
+        raise DataError(f"window: no row lies between {start!r} and {stop!r} s; {remedy}")
     return int(rows[0]), int(rows[-1]) + 1
 
 
-def rows_coincide(since: Floats, step: float) -> bool:
-    """Whether the sample times `since` [s] are regular and every row at the new step [s] is an original sample."""
-    own = float(since[-1]) / (since.size - 1)
-    regular = np.abs(since - uniform_times(since.size, own)).max() <= _MAX_JITTER_SHARE * own
-    return bool(regular) and abs(step / own - round(step / own)) * since.size <= _MAX_JITTER_SHARE and step > 0.5 * own
+def rows_coincide(times: Floats, step: float) -> bool:
+    """Whether the sample times `times` [s] are regular and every row at the new step [s] is an original sample."""
+    mean_step = float(times[-1]) / (times.size - 1)
+    is_regular = np.abs(times - uniform_times(times.size, mean_step)).max() <= _MAX_JITTER_SHARE * mean_step
+    ratio = step / mean_step
+    return bool(is_regular) and abs(ratio - round(ratio)) * times.size <= _MAX_JITTER_SHARE and step > 0.5 * mean_step
 
 
 def resample_uniform(
-    since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
+    times: Floats, data: Mapping[str, Floats], intersample: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Return signals with sample times `since` [s], resampled to a uniform step [s].
+    """Return signals with sample times `times` [s], resampled to a uniform step [s].
 
-    Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `behaviour` has the
+    Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `intersample` has the
     intersample behavior by input. Raise DataError if there would be fewer than three samples, or more than 50 million.
     """
-    spans = float(since[-1]) / step
-    if spans + 1 > _MAX_RUN_SAMPLES:
+    intervals = float(times[-1]) / step
+    if intervals + 1 > _MAX_RUN_SAMPLES:
         raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
-    rows = math.floor(spans + _EDGE_TOLERANCE_STEPS) + 1
+    rows = math.floor(intervals + _EDGE_TOLERANCE_STEPS) + 1
     if rows < MIN_RUN_SAMPLES:
         raise DataError(
             f"{parameter('resample', step)} leaves {plural(rows, 'row')}, {MIN_RUN_SAMPLES} are needed; use a "
             f"smaller step"
         )
-    return NonuniformSamples(since, dict(data)).resample(behaviour, step)
+    return NonuniformSamples(times, dict(data)).resample(intersample, step)
 
 
-def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_times: bool) -> str:
+def describe_resampled_signals(intersample: Mapping[str, Intersample], *, keep_times: bool) -> str:
     """Return text on how each signal is resampled.
 
     `keep_times` states whether output-error fits use the original output samples at their own times.
     """
-    signals = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
+    signals = [signal for signal, kind in intersample.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
     if keep_times:
         return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"
@@ -486,19 +488,19 @@ def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
 
 def grid_positions(times: Floats) -> tuple[NDArray[np.intp], float] | None:
     """Return the grid index of each sample and the step [s] of a regular grid with gaps; None without such a grid."""
-    since = times - times[0]
-    usual = float(np.median(np.diff(since)))
-    step = usual
+    elapsed = times - times[0]
+    median_step = float(np.median(np.diff(elapsed)))
+    step = median_step
     # The median interval is affected by rounding; each pass refines the step by least squares.
     for _ in range(4):
-        places = np.rint(since / step).astype(np.intp)
-        if places[-1] <= 0:
+        indices = np.rint(elapsed / step).astype(np.intp)
+        if indices[-1] <= 0:
             return None
-        step = float(since @ places) / float(places @ places)
-    off = np.abs(since - places * step)
-    if off.max() > GRID_TOLERANCE_STEPS * step or (np.diff(places) <= 0).any():
+        step = float(elapsed @ indices) / float(indices @ indices)
+    deviation = np.abs(elapsed - indices * step)
+    if deviation.max() > GRID_TOLERANCE_STEPS * step or (np.diff(indices) <= 0).any():
         return None
-    return places, step
+    return indices, step
 
 
 @dataclass(frozen=True, eq=False)
@@ -520,39 +522,39 @@ class NonuniformSamples:
         """Return the indices of the samples with times of at most `duration` [s], up to rounding."""
         return np.flatnonzero(self.times <= duration * (1.0 + _RELATIVE_TIME_TOLERANCE))
 
-    def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
+    def resample(self, intersample: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
         """Return the signals resampled to a regular grid with the given step [s].
 
-        Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `behaviour` has the
+        Zero-order-hold inputs take interval means, and other signals are interpolated linearly. `intersample` has the
         intersample behavior by input.
         """
         rows = int(np.floor(float(self.times[-1]) / step + 1e-6)) + 1
         grid = uniform_times(rows, step)
         return {
             name: _core.nonuniform_means(self.times, values, rows, step, True)
-            if behaviour.get(name) == ZERO_ORDER_HOLD
+            if intersample.get(name) == ZERO_ORDER_HOLD
             else np.interp(grid, self.times[~np.isnan(values)], drop_missing(values))
             for name, values in self.data.items()
         }
 
     def cut_window(
-        self, behaviour: Mapping[str, Intersample], start: float, stop: float, step: float
+        self, intersample: Mapping[str, Intersample], start: float, stop: float, step: float
     ) -> NonuniformSamples:
         """Return the samples with times from `start` to `stop` + `step` [s]; the new times are counted from `start`.
 
         If there is no sample at `start`, a sample is added there, with NaN for the outputs, and with values for the
-        inputs by their intersample `behaviour`.
+        inputs by their intersample `intersample`.
         """
-        tiny = 1e-9 * step
-        rows = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
+        tolerance = 1e-9 * step
+        rows = np.flatnonzero((self.times >= start - tolerance) & (self.times <= stop + step))
         times, data = np.maximum(self.times[rows] - start, 0.0), {n: v[rows] for n, v in self.data.items()}
-        if rows.size == 0 or times[0] > tiny:
+        if rows.size == 0 or times[0] > tolerance:
             times = np.append(0.0, times)
             # Times that differ from a switching instant only by rounding count as equal.
             limit_time = start + _RELATIVE_TIME_TOLERANCE * float(self.times[-1])
             row = max(int(np.searchsorted(self.times, limit_time, side="right")) - 1, 0)
             for name, values in self.data.items():
-                kind = behaviour.get(name)
+                kind = intersample.get(name)
                 is_constant = kind == ZERO_ORDER_HOLD
                 first = np.nan if kind is None else values[row] if is_constant else np.interp(start, self.times, values)
                 data[name] = np.append(first, data[name])
@@ -563,11 +565,11 @@ class NonuniformSamples:
         return NonuniformSamples(self.times, {**self.data, **changes})
 
 
-def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
-    """Return a sentence on the number of missing samples of the signal `thing`, with their treatment `what`."""
+def describe_missing(label: str, is_missing: NDArray[np.bool_], treatment: str) -> str:
+    """Return a sentence on the number of missing samples of the signal `label`, with their treatment `treatment`."""
     first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
     verb = "has" if count == 1 else "have"
-    return f"{thing}: {count} of {is_missing.size} rows {verb} no value, the first is row {first}; {what}"
+    return f"{label}: {count} of {is_missing.size} rows {verb} no value, the first is row {first}; {treatment}"
 
 
 #: Maximum delay of a default search: in samples, and as a fraction of the length of the run.

@@ -49,10 +49,10 @@ def split_time_header(name: str) -> tuple[str, str | None]:
     bracketed = _BRACKETED_UNIT_PATTERN.fullmatch(folded)
     if bracketed and bracketed[2]:
         return bracketed[1], _TIME_UNIT_ALIASES.get(bracketed[2].rstrip("."), bracketed[2])
-    otherwise = _UNBRACKETED_UNIT_PATTERN.fullmatch(folded)
-    unit_text = "" if otherwise is None else next((part for part in otherwise.groups()[1:] if part), "")
+    unbracketed = _UNBRACKETED_UNIT_PATTERN.fullmatch(folded)
+    unit_text = "" if unbracketed is None else next((part for part in unbracketed.groups()[1:] if part), "")
     unit = _TIME_UNIT_ALIASES.get(unit_text.rstrip("."))
-    return (folded, None) if otherwise is None or unit is None else (otherwise[1], unit)
+    return (folded, None) if unbracketed is None or unit is None else (unbracketed[1], unit)
 
 
 def parse_unit(word: str) -> str | None:
@@ -153,11 +153,11 @@ def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal
     time = "" if seconds == 0 else f"s^{seconds:g}"
     if signal == output or units.get(signal) == units.get(output) != "":
         return time
-    above, below = units.get(output, ""), units.get(signal, "")
-    if not above or not below:
+    output_unit, signal_unit = units.get(output, ""), units.get(signal, "")
+    if not output_unit or not signal_unit:
         return ""
-    below = f"({below})" if "/" in below or "·" in below else below
-    ratio = above if below == "1" else f"{above}/{below}"
+    signal_unit = f"({signal_unit})" if "/" in signal_unit or "·" in signal_unit else signal_unit
+    ratio = output_unit if signal_unit == "1" else f"{output_unit}/{signal_unit}"
     return f"{time} {ratio}".strip()
 
 
@@ -171,20 +171,20 @@ def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[st
             return {}
         case "channel":
             unit = units.get(expression.signal, "")
-            own = {} if unit == "1" else {unit: 1.0}
-            return _multiply_units(own, {"s": -expression.value}) if unit else None
+            exponents = {} if unit == "1" else {unit: 1.0}
+            return _multiply_units(exponents, {"s": -expression.value}) if unit else None
         case "add":
             return expression_unit(units, next(a for a in expression.arguments if a.channels))
         case "multiply":
             powers: dict[str, float] | None = {}
             for argument in expression.arguments:
-                more = expression_unit(units, argument)
-                powers = None if powers is None or more is None else _multiply_units(powers, more)
+                factor = expression_unit(units, argument)
+                powers = None if powers is None or factor is None else _multiply_units(powers, factor)
             return powers
         case "power" | "abs" | "sqrt":
             exponent = {"power": expression.value, "abs": 1.0, "sqrt": 0.5}[expression.operation]
-            inner = expression_unit(units, expression.arguments[0])
-            return None if inner is None else {unit: exponent * power for unit, power in inner.items()}
+            powers = expression_unit(units, expression.arguments[0])
+            return None if powers is None else {unit: exponent * power for unit, power in powers.items()}
     return {}
 
 
@@ -202,19 +202,19 @@ def nonlinear_coefficient_unit(
     The term is D^order of an expression, in the equation of D^alpha output. The result is empty if the unit of a signal
     is unknown or the coefficient is dimensionless.
     """
-    own, inner = units.get(output, ""), expression_unit(units, expression)
-    if not own or inner is None:
+    output_unit, exponents = units.get(output, ""), expression_unit(units, expression)
+    if not output_unit or exponents is None:
         return ""
-    above = {"s": order - alpha} | ({} if own == "1" else {own: 1.0})
-    powers = _multiply_units(above, {unit: -power for unit, power in inner.items()})
+    target = {"s": order - alpha} | ({} if output_unit == "1" else {output_unit: 1.0})
+    powers = _multiply_units(target, {unit: -power for unit, power in exponents.items()})
     time = powers.pop("s", 0.0)
-    top = [_unit_power(unit, power) for unit, power in powers.items() if power > 0]
-    bottom = [_unit_power(unit, -power) for unit, power in powers.items() if power < 0]
-    if top and bottom:
-        below = "·".join(bottom)
-        ratio = f"{'·'.join(top)}/{f'({below})' if len(bottom) > 1 else below}"
+    numerator = [_unit_power(unit, power) for unit, power in powers.items() if power > 0]
+    denominator = [_unit_power(unit, -power) for unit, power in powers.items() if power < 0]
+    if numerator and denominator:
+        divisor = "·".join(denominator)
+        ratio = f"{'·'.join(numerator)}/{f'({divisor})' if len(denominator) > 1 else divisor}"
     else:
-        ratio = "·".join(top) or "·".join(_unit_power(unit, power) for unit, power in powers.items())
+        ratio = "·".join(numerator) or "·".join(_unit_power(unit, power) for unit, power in powers.items())
     seconds = f"s^{round(time, 4):g}" if round(time, 4) else ""
     return f"{seconds} {ratio}".strip()
 

@@ -53,21 +53,21 @@ def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed
     sines = multisine(spectrum, inputs, rows, step, rng)
     yield "multisine", sines
     yield "binary by multisine", np.where(sines >= 0, 1.0, -1.0)
-    low, middle, high = power_quantiles(spectrum, rows * step)
+    low, median, high = power_quantiles(spectrum, rows * step)
     time = np.asarray(step * np.arange(rows), dtype=np.float64)
     sweep = _chirp(time, low, max(high, 1.5 * low))
     signs = np.where(np.arange(inputs) % 2 == 0, 1.0, -1.0)[:, None]
     yield f"chirp {low:.3g} to {max(high, 1.5 * low):.3g} Hz", signs * sweep
     yield "binary by chirp", signs * np.where(sweep >= 0, 1.0, -1.0)
-    for f in np.unique([low, math.sqrt(low * middle), middle, math.sqrt(middle * high), high]):
-        period = max(2, round(1.0 / f / step))
+    for frequency in np.unique([low, math.sqrt(low * median), median, math.sqrt(median * high), high]):
+        period = max(2, round(1.0 / frequency / step))
         ratios = np.arange(inputs)
         yield f"square, period {period * step:.3g} s", np.stack([square_wave(rows, period << int(k)) for k in ratios])
-    for f in np.unique([math.sqrt(low * middle), middle, math.sqrt(middle * high)]):
-        clock = max(1, round(0.4 / f / step))
-        every = -(-rows // clock)
-        levels = rng.choice([-1.0, 1.0], (inputs, every))
-        yield f"random binary, clock {clock * step:.3g} s", np.repeat(levels, clock, axis=1)[:, :rows]
+    for frequency in np.unique([math.sqrt(low * median), median, math.sqrt(median * high)]):
+        hold = max(1, round(0.4 / frequency / step))
+        holds = -(-rows // hold)
+        levels = rng.choice([-1.0, 1.0], (inputs, holds))
+        yield f"random binary, clock {hold * step:.3g} s", np.repeat(levels, hold, axis=1)[:, :rows]
 
 
 def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
@@ -80,11 +80,11 @@ def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, 
     total = np.cumsum(power)
     if not total[-1] > 0:
         return 1 / duration, 3 / duration, 10 / duration
-    low, middle, high = (
+    low, median, high = (
         float(frequencies[np.searchsorted(total, q * total[-1])])
         for q in (LOW_POWER_QUANTILE, MEDIAN_POWER_QUANTILE, HIGH_POWER_QUANTILE)
     )
-    return low, middle, high
+    return low, median, high
 
 
 def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.random.Generator) -> Floats:
@@ -94,22 +94,22 @@ def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.r
     the power spectrum (Van der Ouderaa, Schoukens & Renneboog, 1988). An input without power gets a random binary
     signal. `step` is the sampling interval [s].
     """
-    points = len(spectrum.power)
-    of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)
-    numbers = np.round(spectrum.lines.frequencies * rows * step).astype(np.int64)
+    count = len(spectrum.power)
+    input_indices = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if count else np.zeros(0, int)
+    harmonics = np.round(spectrum.lines.frequencies * rows * step).astype(np.int64)
     out = np.zeros((inputs, rows))
     for k in range(inputs):
-        own = (of_input == k) & (spectrum.power > 1e-6 * np.max(spectrum.power, initial=0.0))
-        if not own.any():
+        is_used = (input_indices == k) & (spectrum.power > 1e-6 * np.max(spectrum.power, initial=0.0))
+        if not is_used.any():
             out[k] = rng.choice([-1.0, 1.0], rows)
             continue
-        sizes = np.zeros(rows // 2 + 1)
-        sizes[numbers[own]] = np.sqrt(spectrum.power[own])
-        share = sizes**2 / np.sum(sizes**2)
-        phases = -2 * math.pi * np.cumsum(np.cumsum(share)) + rng.uniform(0, 2 * math.pi, sizes.size) * 1e-3
+        levels = np.zeros(rows // 2 + 1)
+        levels[harmonics[is_used]] = np.sqrt(spectrum.power[is_used])
+        fractions = levels**2 / np.sum(levels**2)
+        phases = -2 * math.pi * np.cumsum(np.cumsum(fractions)) + rng.uniform(0, 2 * math.pi, levels.size) * 1e-3
         best, crest = np.zeros(rows), math.inf
         for _ in range(CREST_ITERATIONS):
-            wave = np.fft.irfft(sizes * np.exp(1j * phases), rows)
+            wave = np.fft.irfft(levels * np.exp(1j * phases), rows)
             peak = float(np.max(np.abs(wave)))
             if peak < crest:
                 best, crest = wave, peak
@@ -119,8 +119,8 @@ def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.r
 
 
 def _chirp(time: Floats, low: float, high: float) -> Floats:
-    growth, duration = math.log(high / low), float(time[-1])
-    return np.asarray(np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * time / duration)))
+    log_ratio, duration = math.log(high / low), float(time[-1])
+    return np.asarray(np.sin(2 * math.pi * low * duration / log_ratio * np.expm1(log_ratio * time / duration)))
 
 
 #: Minimum and maximum number of samples of a designed run.
@@ -210,43 +210,43 @@ def design_input(
     """
     if progress is not None and not callable(progress):
         raise ModelError(f"progress is {type_name(progress)}; give a function of (done, total)")
-    solved = model.model if isinstance(model, Identification) else model
-    check_model(solved)
-    check_linear(solved.equations, "a design of the next experiment")
-    check_no_input_nonlinearity(solved, "a design of the next experiment")
+    plant = model.model if isinstance(model, Identification) else model
+    check_model(plant)
+    check_linear(plant.equations, "a design of the next experiment")
+    check_no_input_nonlinearity(plant, "a design of the next experiment")
     if reference_run is None and isinstance(model, Identification) and model.task is not None:
         reference_run = model.task.runs[0]
     if reference_run is not None and not isinstance(reference_run, Run):
         raise ModelError(f"reference_run is {type(reference_run).__name__}, not a Run; give a run of the machine")
-    free = parameter_set_of(solved)
-    fit = ModelFit.of(solved, per_signal_values("noise", noise, solved.outputs, free.noise))
+    free = parameter_set_of(plant)
+    fit = ModelFit.of(plant, per_signal_values("noise", noise, plant.outputs, free.noise))
     _check_signals(fit, reference_run)
     if free.covariance is None:
         _raise_too_uncertain(fit, "some of its parameters have infinite intervals", None)
-    stated = (solved.about.get("step"), None) if reference_run is None else (reference_run.step, reference_run.duration)
-    time = _positive("step", stated[0] if step is None else step, "a step [s]")
-    length = _positive("duration", stated[1] if duration is None else duration, "a length [s]")
-    rows = round(min(length / time, 1e9)) + 1
+    default = (plant.about.get("step"), None) if reference_run is None else (reference_run.step, reference_run.duration)
+    step = _positive("step", default[0] if step is None else step, "a step [s]")
+    duration = _positive("duration", default[1] if duration is None else duration, "a length [s]")
+    rows = round(min(duration / step, 1e9)) + 1
     if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
         raise ModelError(
-            f"{setting('duration')} {length:g} s in steps of {time:g} s are {rows} rows; give a run of "
+            f"{setting('duration')} {duration:g} s in steps of {step:g} s are {rows} rows; give a run of "
             f"{MIN_RUN_SAMPLES} to {MAX_RUN_SAMPLES} rows"
         )
     bounds = _bounds_of(fit, reference_run, peak, slew, limits)
-    _check_slew(bounds, time, rows)
+    _check_slew(bounds, step, rows)
     _check_stable(fit, bounds)
-    _check_uncertainty(fit, time, length)
-    at = _parameter_indices(fit, parameters)
+    _check_uncertainty(fit, step, duration)
+    indices = _parameter_indices(fit, parameters)
     if not isinstance(criterion, str) or criterion not in ("D", "E"):
         raise ModelError(
             f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
         )
     # Standard errors of orders are absolute in the criterion, those of other parameters are relative to their values.
-    units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
-    goal = Criterion(criterion, at, tuple(units))
+    units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in indices]
+    goal = Criterion(criterion, indices, tuple(units))
     seed = check_seed(seed)
-    wave = _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]")
-    period_rows = round(wave / time)
+    square_period = _positive("period", duration / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]")
+    period_rows = round(square_period / step)
     if not 2 <= period_rows <= 2 * rows:
         raise ModelError(
             f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
@@ -255,34 +255,34 @@ def design_input(
         size = len(fit.names) * len(fit.outputs) * rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
     tracker = ShareTracker(progress)
-    sensitivities = Sensitivities.of(fit, time, rows - 1, bounds.ramp_samples(time))
+    sensitivities = Sensitivities.of(fit, step, rows - 1, bounds.ramp_samples(step))
     tracker.advance_to(0.05)
-    spectrum = best_spectrum(spectral_lines(fit, bounds, time, rows - 1), goal)
+    spectrum = best_spectrum(spectral_lines(fit, bounds, step, rows - 1), goal)
     tracker.advance_to(0.15)
     designs = _design_candidates(sensitivities, goal, bounds, spectrum, seed, tracker)
-    plain = np.stack([p * square_wave(rows - 1, period_rows) for p in bounds.peaks.values()])
-    reference = fit.run(sensitivities.rig_commands(plain), time, f"square of period {period_rows * time:.4g} s")
-    base = float(goal.score(sensitivities.information(sensitivities.derivatives(plain))))
+    square = np.stack([p * square_wave(rows - 1, period_rows) for p in bounds.peaks.values()])
+    reference = fit.run(sensitivities.rig_commands(square), step, f"square of period {period_rows * step:.4g} s")
+    square_score = float(goal.score(sensitivities.information(sensitivities.derivatives(square))))
     best = designs[0]
     commands = best.commands * _robust_scale(sensitivities, bounds, best.commands)
-    run = fit.run(sensitivities.rig_commands(commands), time, "designed")
+    run = fit.run(sensitivities.rig_commands(commands), step, "designed")
     errors = _errors(fit, reference, run)
-    ratios = np.log(errors["square"][list(at)]) - np.log(errors["designed"][list(at)])
+    ratios = np.log(errors["square"][list(indices)]) - np.log(errors["designed"][list(indices)])
     tracker.advance_to(1.0)
     return DesignedInput(
         run=run,
         reference=reference,
         shape=_shape_text(best, run, sensitivities),
         criterion=goal.kind,
-        parameters=tuple(fit.names[i] for i in at),
+        parameters=tuple(fit.names[i] for i in indices),
         values=dict(zip(fit.names, fit.values, strict=True)),
         errors={k: dict(zip(fit.names, v.tolist(), strict=True)) for k, v in errors.items()},
         gain=float(np.exp(np.sum(ratios))),
-        gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in designs),
+        gains=tuple((d.name, math.exp(min(goal.count * (d.score - square_score), 700.0))) for d in designs),
         predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
-        findings=_prediction_findings(solved, noise_given=noise is not None),
+        findings=_prediction_findings(plant, noise_given=noise is not None),
     )
 
 
@@ -307,25 +307,25 @@ def _design_candidates(
             "from the other parameters; name fewer parameters, or make the run longer"
         )
     # The best initial input of each kind is used, because different kinds lead to different local optima.
-    kinds: dict[str, Design] = {}
+    best_by_kind: dict[str, Design] = {}
     for design in sorted(feasible, key=lambda d: -d.score):
-        kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
-    starts = sorted(kinds.values(), key=lambda d: -d.score)[:MAX_EXCHANGE_STARTS]
-    coarse = max(sensitivities.ramp, 1, -(-rows // COARSE_HOLDS))
-    ends = []
-    for place, design in enumerate(starts):
-        ends.append(exchange_holds(design, coarse, sensitivities, goal, bounds))
-        tracker.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
-    best = max(ends, key=lambda d: d.score)
-    for place, finer in enumerate(HOLD_DIVISORS[1:]):
-        hold = max(sensitivities.ramp, 1, coarse // finer)
-        if coarse % hold:
+        best_by_kind.setdefault(design.name.split(",")[0].split(" by")[0], design)
+    starts = sorted(best_by_kind.values(), key=lambda d: -d.score)[:MAX_EXCHANGE_STARTS]
+    coarse_hold = max(sensitivities.ramp, 1, -(-rows // COARSE_HOLDS))
+    optima = []
+    for index, design in enumerate(starts):
+        optima.append(exchange_holds(design, coarse_hold, sensitivities, goal, bounds))
+        tracker.advance_to(0.15 + 0.55 * (index + 1) / len(starts))
+    best = max(optima, key=lambda d: d.score)
+    for index, divisor in enumerate(HOLD_DIVISORS[1:]):
+        hold = max(sensitivities.ramp, 1, coarse_hold // divisor)
+        if coarse_hold % hold:
             continue
-        further = exchange_holds(best, hold, sensitivities, goal, bounds)
-        best = further if further.score > best.score else best
-        tracker.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
-    ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]
-    return sorted([*feasible, *ends], key=lambda d: -d.score)
+        candidate = exchange_holds(best, hold, sensitivities, goal, bounds)
+        best = candidate if candidate.score > best.score else best
+        tracker.advance_to(0.7 + 0.25 * (index + 1) / len(HOLD_DIVISORS[1:]))
+    optima = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in optima if e.name != best.name), best)]
+    return sorted([*feasible, *optima], key=lambda d: -d.score)
 
 
 def _bounds_of(
@@ -361,10 +361,10 @@ def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
     """
     ramp = bounds.ramp_samples(step)
     if ramp > rows // 4:
-        slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
+        slowest = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
-            f"slew of {slow} = {bounds.slews[slow]:g} per second needs {ramp * step:.3g} s from one peak to the other, "
-            f"but the run lasts only {(rows - 1) * step:g} s; lower "
+            f"slew of {slowest} = {bounds.slews[slowest]:g} per second needs {ramp * step:.3g} s from one peak to the "
+            f"other, but the run lasts only {(rows - 1) * step:g} s; lower "
             f"{parameter('peak')}, or raise {parameter('slew')} or {parameter('duration')}"
         )
 
@@ -379,10 +379,10 @@ def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, .
     finding = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
     if finding is not None:
         return (make_finding("prediction_in_doubt", output=finding.output, text=finding.text),)
-    colour = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
-    if colour is None or noise_given:
+    noise_finding = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
+    if noise_finding is None or noise_given:
         return ()
-    return (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
+    return (make_finding("designed_for_white_noise", output=noise_finding.output, text=noise_finding.text),)
 
 
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
@@ -396,22 +396,22 @@ def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
         )
     if reference_run is None:
         return
-    lacking = [n for n in fit.inputs if n not in reference_run.inputs]
-    if lacking:
+    missing = [n for n in fit.inputs if n not in reference_run.inputs]
+    if missing:
         raise DataError(
-            f"run {reference_run.name!r} has no input {lacking[0]!r}{nearest(lacking[0], reference_run.inputs)}, which "
+            f"run {reference_run.name!r} has no input {missing[0]!r}{nearest(missing[0], reference_run.inputs)}, which "
             f"the model requires; give the run of that machine, or leave {parameter('reference_run')} out"
         )
 
 
-def _positive(name: str, value: object, what: str) -> float:
+def _positive(name: str, value: object, expected: str) -> float:
     if value is None:
         raise ModelError(
-            f"{name} is not given; give {what} as {parameter(name)}, or a run as {parameter('reference_run')}"
+            f"{name} is not given; give {expected} as {parameter(name)}, or a run as {parameter('reference_run')}"
         )
     number = real_number(name, value)
     if not (number > 0 and math.isfinite(number)):
-        raise ModelError(f"{setting(name)} {number:g} is not {what} above 0; give a positive number")
+        raise ModelError(f"{setting(name)} {number:g} is not {expected} above 0; give a positive number")
     return number
 
 
@@ -424,9 +424,9 @@ def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict
     for name in names:
         if name in run:
             values = drop_missing(run[name])
-            size = float(np.max(np.abs(values - (values[0] if from_start else 0.0))))
-            if size > 0:
-                out[name] = size
+            largest = float(np.max(np.abs(values - (values[0] if from_start else 0.0))))
+            if largest > 0:
+                out[name] = largest
     return out
 
 
@@ -444,9 +444,9 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
     name_list = list(names)
     for k, name in enumerate(name_list):
         if not isinstance(name, str) or name not in fit.names:
-            near = nearest(name, fit.names) if isinstance(name, str) else ""
+            hint = nearest(name, fit.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"parameters[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
+                f"parameters[{k}] = {short_repr(name)} is not a free parameter of the model{hint}; it has "
                 f"{', '.join(fit.names)}"
             )
         if name in name_list[:k]:
@@ -464,10 +464,10 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
             f"the model is {poles}, and inputs are designed for stable models; identify the machine with a stabilizing "
             "controller, or check the model"
         )
-    drifting = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
-    if poles.origin_order > 0 and drifting:
+    unlimited = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
+    if poles.origin_order > 0 and unlimited:
         raise ModelError(
-            f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift without "
+            f"the model integrates its input (order {poles.origin_order:g}), so that {unlimited[0]} may drift without "
             f"limit; give its maximum acceptable value with {parameter('limits')}, or give "
             f"{parameter('reference_run')} a run"
         )
@@ -479,8 +479,8 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
     This is so if an order has a large standard error, or if parameter uncertainty has a large effect on an output.
     `step` [s] and `length` [s] are the sampling interval and the duration of the run.
     """
-    spread = fit.covariance
-    errors = np.sqrt(np.diag(spread))
+    covariance = fit.covariance
+    errors = np.sqrt(np.diag(covariance))
     uncertain = [
         f"{n} = {v:.3g} ± {e:.2g}"
         for n, v, e in zip(fit.names, fit.values, errors, strict=True)
@@ -489,36 +489,38 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
     if uncertain:
         _raise_too_uncertain(fit, f"order {uncertain[0]}", (step, length))
     rows = min(max(round(length / step), MIN_RUN_SAMPLES), 2000)
-    coarse = length / rows
-    probe = np.stack([np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(fit.inputs))])
-    run = fit.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
-    rows_of = fit.jacobian(run)
-    variances = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
-    for output, part in zip(fit.outputs, np.split(variances, len(fit.outputs)), strict=True):
-        size = float(np.sqrt(np.mean((run[output] / fit.noise[output]) ** 2)))
-        share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
-        if not share <= MAX_RELATIVE_UNCERTAINTY:
+    interval = length / rows
+    inputs = np.stack(
+        [np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(fit.inputs))]
+    )
+    run = fit.run(np.cumsum(inputs, axis=1) / math.sqrt(rows) + inputs, interval, "probe")
+    jacobian = fit.jacobian(run)
+    variances = np.einsum("pt,pq,qt->t", jacobian, covariance, jacobian)
+    for output, variance in zip(fit.outputs, np.split(variances, len(fit.outputs)), strict=True):
+        rms = float(np.sqrt(np.mean((run[output] / fit.noise[output]) ** 2)))
+        ratio = float(np.sqrt(np.mean(np.maximum(variance, 0.0)))) / max(rms, 1e-300)
+        if not ratio <= MAX_RELATIVE_UNCERTAINTY:
             _raise_too_uncertain(
-                fit, f"its uncertainty changes the response of {output} by {100 * share:.0f} %", (step, length)
+                fit, f"its uncertainty changes the response of {output} by {100 * ratio:.0f} %", (step, length)
             )
 
 
-def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | None) -> None:
-    """Raise ModelError for a model that is too uncertain, with the reason `why` and a recommended first experiment.
+def _raise_too_uncertain(fit: ModelFit, reason: str, times: tuple[float, float] | None) -> None:
+    """Raise ModelError for a model that is too uncertain, with the reason `reason` and a recommended first experiment.
 
     `times` are (sampling interval, duration) of the run [s], or None.
     """
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
-        own = [abs(m.pole) / (2 * math.pi) for m in modes(fit.model)]
-        if own:
-            low, high = max(low, min(own) / 10), min(high, 10 * max(own))
+        frequencies = [abs(m.pole) / (2 * math.pi) for m in modes(fit.model)]
+        if frequencies:
+            low, high = max(low, min(frequencies) / 10), min(high, 10 * max(frequencies))
     except FtlmError:
         # If the modes of the model are unknown, the band of the run is used.
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(
-        f"the intervals are too wide to design on ({why}): an input that is optimal for this model may be poor for "
+        f"the intervals are too wide to design on ({reason}): an input that is optimal for this model may be poor for "
         f"the machine. First record a run that excites the whole band, such as a multisine of {band} Hz (ftlm record "
         f"--input multisine --band {band}), and identify again from both runs"
     )
@@ -529,11 +531,11 @@ def _robust_scale(sensitivities: Sensitivities, bounds: Bounds, commands: Floats
 
     The bands represent the uncertainty of the parameters.
     """
-    fit, outputs, slopes = sensitivities.fit, sensitivities.outputs(commands), sensitivities.derivatives(commands)
-    spread = np.einsum("pot,pq,qot->ot", slopes, fit.covariance, slopes)
+    fit, outputs, derivatives = sensitivities.fit, sensitivities.outputs(commands), sensitivities.derivatives(commands)
+    variances = np.einsum("pot,pq,qot->ot", derivatives, fit.covariance, derivatives)
     noise = np.array([fit.noise[o] for o in fit.outputs])[:, None]
-    reach = np.abs(outputs) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
-    return bounds.scale(commands, reach)
+    largest = np.abs(outputs) + NORMAL_95 * noise * np.sqrt(np.maximum(variances, 0.0))
+    return bounds.scale(commands, largest)
 
 
 def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
@@ -542,12 +544,12 @@ def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
     The cases are, in this sequence: the model; a fit to the square wave (`reference`); a fit to the designed run
     (`run`); a fit to the designed run together with the estimation runs. The last three are predictions.
     """
-    now, new = fit.covariance, fit.predicted_covariance(run)
-    size = np.sqrt(np.diag(now))
-    covariance = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
-    both = np.linalg.inv(covariance) * np.outer(size, size)
-    every = {"now": now, "square": fit.predicted_covariance(reference), "designed": new, "both": both}
-    return {k: np.sqrt(np.diag(v)) for k, v in every.items()}
+    current, predicted = fit.covariance, fit.predicted_covariance(run)
+    scale = np.sqrt(np.diag(current))
+    information = np.linalg.inv(current / np.outer(scale, scale)) + np.linalg.inv(predicted / np.outer(scale, scale))
+    both = np.linalg.inv(information) * np.outer(scale, scale)
+    covariances = {"now": current, "square": fit.predicted_covariance(reference), "designed": predicted, "both": both}
+    return {k: np.sqrt(np.diag(v)) for k, v in covariances.items()}
 
 
 def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...]:

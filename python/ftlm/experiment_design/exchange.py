@@ -56,71 +56,71 @@ def scaled_design(
 
 
 def exchange_holds(
-    begin: Design, hold: int, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
+    initial: Design, hold: int, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
 ) -> Design:
-    """Return the candidate input to which the exchange algorithm improves the candidate input `begin`.
+    """Return the candidate input to which the exchange algorithm improves the candidate input `initial`.
 
-    A hold is an interval of `hold` samples with constant input. First, `begin` is rounded to the levels -1, 0 and 1
+    A hold is an interval of `hold` samples with constant input. First, `initial` is rounded to the levels -1, 0 and 1
     times the peak. An exchange then changes the level of one hold, or of two holds by opposite amounts. The Fisher
     information is quadratic in the commands, so convolutions give its change by every exchange exactly. The best
     feasible exchange is made until none improves the score, which gives a local optimum. Source: Fedorov, Theory of
     Optimal Experiments, 1972.
     """
-    inputs, rows = begin.commands.shape
+    inputs, rows = initial.commands.shape
     starts = np.arange(0, rows, hold)
     peaks = np.array(list(bounds.peaks.values()))[:, None]
     limits = np.array(list(bounds.output_limits.values()))[:, None]
-    means = np.add.reduceat(begin.commands, starts, axis=1) / np.diff(np.append(starts, rows))
-    level = _nearest_level(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
+    means = np.add.reduceat(initial.commands, starts, axis=1) / np.diff(np.append(starts, rows))
+    levels = _nearest_level(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
     holds = [Hold.of(sensitivities, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
 
     def commands() -> Floats:
-        return np.asarray(np.repeat(level, hold, axis=1)[:, :rows] * peaks)
+        return np.asarray(np.repeat(levels, hold, axis=1)[:, :rows] * peaks)
 
     derivatives, outputs = sensitivities.derivatives(commands()), sensitivities.outputs(commands())
     information = sensitivities.information(derivatives)
     score = float(criterion.score(information)) - _log_limit_excess(outputs, limits)
-    ended = stop_flag()
+    stop = stop_flag()
     for _ in range(MAX_EXCHANGES):
-        if ended is not None and ended.is_set:
+        if stop is not None and stop.is_set:
             raise KeyboardInterrupt
         slope = None if score == -math.inf else criterion.gradient(information) / 2
         moves: list[tuple[float, int, int, int, float, Floats]] = []
-        for k, one in enumerate(holds):
-            for gap, shared, own in one.information_changes(sensitivities, derivatives):
+        for k, hold_response in enumerate(holds):
+            for gap, linear, quadratic in hold_response.information_changes(sensitivities, derivatives):
                 for step in LEVEL_CHANGES:
-                    is_feasible = _feasible_starts(level[k], step, gap)
-                    gain = np.zeros(len(shared))
+                    is_feasible = _feasible_starts(levels[k], step, gap)
+                    gain = np.zeros(len(linear))
                     if slope is not None:
-                        gain = np.einsum("spq,pq->s", step * shared + step**2 * own, slope)
-                    for at in np.argsort(np.where(is_feasible, -gain, np.inf))[
+                        gain = np.einsum("spq,pq->s", step * linear + step**2 * quadratic, slope)
+                    for i in np.argsort(np.where(is_feasible, -gain, np.inf))[
                         : min(MAX_EVALUATED_EXCHANGES, int(np.sum(is_feasible)))
                     ]:
-                        moves.append((float(gain[at]), k, int(at), gap, step, step * shared[at] + step**2 * own[at]))
+                        moves.append((float(gain[i]), k, int(i), gap, step, step * linear[i] + step**2 * quadratic[i]))
         moves = sorted(moves, key=lambda m: -m[0])[:MAX_EVALUATED_EXCHANGES]
         if not moves:
             break
         scores = criterion.score(information + np.stack([m[5] for m in moves]))
-        best, then = score + MIN_SCORE_GAIN, outputs
+        best, best_outputs = score + MIN_SCORE_GAIN, outputs
         exchange: tuple[int, int, int, float] | None = None
-        for place in np.argsort(-scores):
-            if not scores[place] > best:
+        for rank in np.argsort(-scores):
+            if not scores[rank] > best:
                 break
-            _, k, at, gap, step, _ = moves[place]
-            outputs_after = holds[k].apply_exchange(outputs, at, gap, step, of_response=True)
-            reached = float(scores[place]) - _log_limit_excess(outputs_after, limits)
-            if reached > best:
-                best, then, exchange = reached, outputs_after, (k, at, gap, step)
+            _, k, i, gap, step, _ = moves[rank]
+            outputs_after = holds[k].apply_exchange(outputs, i, gap, step, of_response=True)
+            candidate_score = float(scores[rank]) - _log_limit_excess(outputs_after, limits)
+            if candidate_score > best:
+                best, best_outputs, exchange = candidate_score, outputs_after, (k, i, gap, step)
         if exchange is None:
             break
-        k, at, gap, step = exchange
-        score, outputs = best, then
-        level[k, at] += step
+        k, i, gap, step = exchange
+        score, outputs = best, best_outputs
+        levels[k, i] += step
         if gap:
-            level[k, at + gap] -= step
-        derivatives = holds[k].apply_exchange(derivatives, at, gap, step, of_response=False)
+            levels[k, i + gap] -= step
+        derivatives = holds[k].apply_exchange(derivatives, i, gap, step, of_response=False)
         information = sensitivities.information(derivatives)
-    return scaled_design(begin.name, commands(), sensitivities, criterion, bounds)
+    return scaled_design(initial.name, commands(), sensitivities, criterion, bounds)
 
 
 def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
@@ -131,14 +131,14 @@ def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
     return math.log(max(1.0, float(np.max(np.abs(outputs) / limits))))
 
 
-def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
+def _feasible_starts(levels: Floats, step: float, gap: int) -> NDArray[np.bool_]:
     """Return a mask of the holds whose level can change by `step`, shape (holds,).
 
     With `gap` above 0, the level of the hold that is `gap` holds later must also be able to change by -`step`.
     """
-    is_feasible: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
+    is_feasible: NDArray[np.bool_] = np.abs(levels + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
-        is_feasible[:-gap] &= np.abs(level[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
+        is_feasible[:-gap] &= np.abs(levels[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
         is_feasible[-gap:] = False
     return is_feasible
 
@@ -174,29 +174,29 @@ class Hold:
     own: Mapping[int, Floats]
 
     @classmethod
-    def of(cls, sensitivities: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
-        """Return the response to a hold of `hold` samples of the input with index `place` at its peak value `peak`."""
+    def of(cls, sensitivities: Sensitivities, index: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
+        """Return the response to a hold of `hold` samples of the input with index `index` at its peak value `peak`."""
         block, response = (
-            _hold_response(sensitivities.kernels[place], hold) * peak,
-            _hold_response(sensitivities.responses[place], hold) * peak,
+            _hold_response(sensitivities.kernels[index], hold) * peak,
+            _hold_response(sensitivities.responses[index], hold) * peak,
         )
         spectrum = np.fft.rfft(block, sensitivities.length)
         offsets = _correlate_at_starts(
             sensitivities, sensitivities.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts
         )
-        alone = _inner_products(sensitivities, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
-        own = {0: alone}
+        single = _inner_products(sensitivities, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
+        quadratic = {0: single}
         for gap in PAIR_GAPS_HOLDS:
             if gap >= len(starts):
                 break
-            late = np.zeros_like(block)
-            late[..., gap * hold :] = block[..., : sensitivities.rows - gap * hold]
-            mixed = _inner_products(sensitivities, block, late, starts)[:-gap]
-            mixed = mixed - np.einsum("spr,sqr->spq", offsets[:-gap], offsets[gap:])
-            pair = np.zeros_like(alone)
-            pair[:-gap] = alone[:-gap] + alone[gap:] - mixed - np.swapaxes(mixed, -1, -2)
-            own[gap] = pair
-        return cls(starts, block, response, spectrum, offsets, own)
+            delayed_block = np.zeros_like(block)
+            delayed_block[..., gap * hold :] = block[..., : sensitivities.rows - gap * hold]
+            cross_products = _inner_products(sensitivities, block, delayed_block, starts)[:-gap]
+            cross_products = cross_products - np.einsum("spr,sqr->spq", offsets[:-gap], offsets[gap:])
+            pair = np.zeros_like(single)
+            pair[:-gap] = single[:-gap] + single[gap:] - cross_products - np.swapaxes(cross_products, -1, -2)
+            quadratic[gap] = pair
+        return cls(starts, block, response, spectrum, offsets, quadratic)
 
     def information_changes(
         self, sensitivities: Sensitivities, derivatives: Floats
@@ -208,27 +208,27 @@ class Hold:
         times the first-order plus s^2 times the second-order change. `derivatives` are the derivatives of the outputs
         with respect to the parameters for the current input.
         """
-        shared = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
+        linear = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
         if len(sensitivities.nuisance):
-            flat = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
-            shared = shared - np.einsum("spr,qr->spq", self.offsets, flat)
-        shared = shared + np.swapaxes(shared, -1, -2)
-        for gap, own in self.own.items():
-            pair = shared
+            rows = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
+            linear = linear - np.einsum("spr,qr->spq", self.offsets, rows)
+        linear = linear + np.swapaxes(linear, -1, -2)
+        for gap, quadratic in self.own.items():
+            pair = linear
             if gap:
-                pair = np.zeros_like(shared)
-                pair[:-gap] = shared[:-gap] - shared[gap:]
-            yield gap, pair, own
+                pair = np.zeros_like(linear)
+                pair[:-gap] = linear[:-gap] - linear[gap:]
+            yield gap, pair, quadratic
 
-    def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
+    def apply_exchange(self, series: Floats, index: int, gap: int, step: float, *, of_response: bool) -> Floats:
         """Return the output derivatives or, with `of_response`, the outputs after an exchange.
 
-        `series` are the values before the exchange. The level of the hold with index `at` changes by `step`. With `gap`
-        above 0, the level of the hold that starts `gap` holds later changes by -`step`.
+        `series` are the values before the exchange. The level of the hold with index `index` changes by `step`. With
+        `gap` above 0, the level of the hold that starts `gap` holds later changes by -`step`.
         """
         block, out = self.response if of_response else self.block, series.copy()
-        for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
-            out[..., begins:] += size * block[..., : block.shape[-1] - begins]
+        for start, change in ((self.starts[index], step), *(((self.starts[index + gap], -step),) if gap else ())):
+            out[..., start:] += change * block[..., : block.shape[-1] - start]
         return out
 
 
@@ -245,15 +245,15 @@ def _hold_response(kernel: Floats, hold: int) -> Floats:
     return total
 
 
-def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
+def _inner_products(sensitivities: Sensitivities, first: Floats, second: Floats, starts: NDArray[np.int64]) -> Floats:
     """Return, for each start, the inner products of responses that begin at this sample and end with the run.
 
-    The responses `one` and `other` have shapes (p, outputs, rows) and (q, outputs, rows), the result (starts, p, q).
+    The responses `first` and `second` have shapes (p, outputs, rows) and (q, outputs, rows), the result (starts, p, q).
     """
-    products = np.zeros((len(starts), len(one), len(other)))
-    for p, row in enumerate(one):
-        total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
-        products[:, p] = total[:, sensitivities.rows - 1 - starts].T
+    products = np.zeros((len(starts), len(first), len(second)))
+    for p, row in enumerate(first):
+        cumulative = np.cumsum(np.einsum("ot,qot->qt", row, second), axis=-1)
+        products[:, p] = cumulative[:, sensitivities.rows - 1 - starts].T
     return products
 
 
@@ -266,7 +266,7 @@ def _correlate_at_starts(
     result has shape (starts, parameters, series).
     """
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
-    for place, one in enumerate(np.fft.rfft(series, sensitivities.length)):
-        product = np.einsum("of,pof->pf", one, np.conj(spectrum))
-        out[..., place] = np.fft.irfft(product, sensitivities.length)[:, starts].T
+    for index, transform in enumerate(np.fft.rfft(series, sensitivities.length)):
+        product = np.einsum("of,pof->pf", transform, np.conj(spectrum))
+        out[..., index] = np.fft.irfft(product, sensitivities.length)[:, starts].T
     return out

@@ -62,15 +62,15 @@ class Criterion:
 
         A score is -inf if the parameters of interest are not identifiable.
         """
-        spread = self._inverse(information)
+        covariance = self._inverse(information)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "D":
-                sign, size = np.linalg.slogdet(spread)
-                scores = np.where(sign > 0, -0.5 * size / self.count, -np.inf)
+                sign, log_determinant = np.linalg.slogdet(covariance)
+                scores = np.where(sign > 0, -0.5 * log_determinant / self.count, -np.inf)
             else:
-                axes = np.linalg.eigvalsh(np.where(np.isfinite(spread), spread, 0.0))
+                axes = np.linalg.eigvalsh(np.where(np.isfinite(covariance), covariance, 0.0))
                 scores = np.where(axes[..., 0] > 0, -0.5 * np.log(axes[..., -1]), -np.inf)
-        return np.where(np.isfinite(spread[..., 0, 0]), scores, -np.inf)
+        return np.where(np.isfinite(covariance[..., 0, 0]), scores, -np.inf)
 
     def smooth_score(self, information: Floats) -> float:
         """Return a differentiable upper bound of the score of an information matrix, shape (p, p).
@@ -94,16 +94,16 @@ class Criterion:
         Its inner product with the information matrix is 1.
         """
         p = len(information)
-        size = np.sqrt(np.diag(information))
-        whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
-        covariance_rows = whole[:, self.indices] / np.asarray(self.units)
+        scale = np.sqrt(np.diag(information))
+        covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+        covariance_rows = covariance[:, self.indices] / np.asarray(self.units)
         block = covariance_rows[list(self.indices)] / np.asarray(self.units)[:, None]
-        axes, turn = np.linalg.eigh(0.5 * (block + block.T))
+        axes, eigenvectors = np.linalg.eigh(0.5 * (block + block.T))
         axes = np.maximum(axes, np.finfo(np.float64).tiny)
         power = KIEFER_MEAN_EXPONENT if self.kind == "E" else 0
-        share = (axes / axes[-1]) ** power
-        weights = share / axes / np.sum(share)
-        rotated_rows = covariance_rows @ turn
+        ratios = (axes / axes[-1]) ** power
+        weights = ratios / axes / np.sum(ratios)
+        rotated_rows = covariance_rows @ eigenvectors
         return np.asarray((rotated_rows * weights) @ rotated_rows.T).reshape(p, p)
 
     def _inverse(self, information: Floats) -> Floats:
@@ -113,16 +113,16 @@ class Criterion:
         """
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
         is_positive = np.all(diagonal > 0, axis=-1)
-        size = np.sqrt(np.where(is_positive[..., None], diagonal, 1.0))
-        scaled = information / (size[..., :, None] * size[..., None, :])
+        scale = np.sqrt(np.where(is_positive[..., None], diagonal, 1.0))
+        scaled = information / (scale[..., :, None] * scale[..., None, :])
         scaled = np.where(is_positive[..., None, None], scaled, np.eye(scaled.shape[-1]))
         sign, determinant = np.linalg.slogdet(scaled)
-        good = is_positive & (sign > 0) & (determinant > math.log(MIN_SCALED_DETERMINANT) * 2)
-        scaled = np.where(good[..., None, None], scaled, np.eye(scaled.shape[-1]))
-        at = list(self.indices)
-        unit = size[..., at] * np.asarray(self.units)
-        inverse = np.linalg.inv(scaled)[..., at, :][..., at] / (unit[..., :, None] * unit[..., None, :])
-        return np.where(good[..., None, None], inverse, np.inf)
+        is_regular = is_positive & (sign > 0) & (determinant > math.log(MIN_SCALED_DETERMINANT) * 2)
+        scaled = np.where(is_regular[..., None, None], scaled, np.eye(scaled.shape[-1]))
+        indices = list(self.indices)
+        unit = scale[..., indices] * np.asarray(self.units)
+        inverse = np.linalg.inv(scaled)[..., indices, :][..., indices] / (unit[..., :, None] * unit[..., None, :])
+        return np.where(is_regular[..., None, None], inverse, np.inf)
 
 
 #: Range of finite limits of signals. Outside it, squares of ratios overflow.
@@ -165,11 +165,11 @@ class Bounds:
 
 
 def per_signal_values(
-    what: str, values: object, names: Sequence[str], default: Mapping[str, float] | None
+    argument: str, values: object, names: Sequence[str], default: Mapping[str, float] | None
 ) -> dict[str, float]:
     """Return one positive number for each of `names`, from a number, a mapping by name, or the default.
 
-    `what` is the argument in error messages.
+    `argument` is the argument in error messages.
 
     Raises
     ------
@@ -179,9 +179,9 @@ def per_signal_values(
     if isinstance(values, Mapping):
         for name in values:
             if name not in names:
-                near = nearest(name, names) if isinstance(name, str) else ""
+                hint = nearest(name, names) if isinstance(name, str) else ""
                 raise ModelError(
-                    f"{what} names {short_repr(name)}{near}, which is not one of {', '.join(names) or 'nothing'}; "
+                    f"{argument} names {short_repr(name)}{hint}, which is not one of {', '.join(names) or 'nothing'}; "
                     "name one of them"
                 )
     elif values is not None:
@@ -192,17 +192,17 @@ def per_signal_values(
         if stated_value is None:
             if default is None or name not in default:
                 raise ModelError(
-                    f"{what} of {name} is not given; give {parameter(what)} a number, or one by name, or "
+                    f"{argument} of {name} is not given; give {parameter(argument)} a number, or one by name, or "
                     f"{parameter('reference_run')} a run"
                 )
             out[name] = default[name]
             continue
-        value = real_number(f"{what} of {name}", stated_value)
+        value = real_number(f"{argument} of {name}", stated_value)
         if not value > 0:
-            raise ModelError(f"{what} of {name} = {value:g} is not above 0; give its largest absolute value")
+            raise ModelError(f"{argument} of {name} = {value:g} is not above 0; give its largest absolute value")
         if not LIMIT_RANGE[0] <= value <= LIMIT_RANGE[1] and not math.isinf(value):
             raise ModelError(
-                f"{what} of {name} = {value:g} is not between {LIMIT_RANGE[0]:g} and {LIMIT_RANGE[1]:g}; use other "
+                f"{argument} of {name} = {value:g} is not between {LIMIT_RANGE[0]:g} and {LIMIT_RANGE[1]:g}; use other "
                 "units"
             )
         out[name] = value
@@ -241,8 +241,8 @@ class ModelFit:
     def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
         """Return the fit of an output-error model; `noise` has the noise standard deviation of each output."""
         problem, values = problem_of(model)
-        whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
-        return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
+        simulated_model = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
+        return cls(simulated_model, problem, tuple(values), noise, parameter_set_of(model).refinement)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -263,23 +263,23 @@ class ModelFit:
     def covariance(self) -> Floats:
         """Covariance matrix of the free parameters in the fit, shape (p, p)."""
         parameters = parameter_set_of(self.model)
-        at = [parameters.names.index(n) for n in self.names]
-        return np.asarray(parameters.covariance)[np.ix_(at, at)]
+        indices = [parameters.names.index(n) for n in self.names]
+        return np.asarray(parameters.covariance)[np.ix_(indices, indices)]
 
     def run(self, commands: Floats, step: float, name: str) -> Run:
         """Return a run with commands, shape (inputs, rows), as inputs, and the simulated outputs of the model.
 
         `step` is the sampling interval [s], and `name` the name of the run.
         """
-        blank = Run.from_arrays(
+        empty_run = Run.from_arrays(
             step=step,
             inputs=dict(zip(self.inputs, commands, strict=True)),
             outputs={o: np.zeros(commands.shape[1]) for o in self.outputs},
             units={s: u for s, u in self.model.units.items() if u and s in (*self.inputs, *self.outputs)},
             name=name,
         )
-        answer = simulate(self.model, blank, tolerance=SIMULATION_TOLERANCE)
-        return blank.with_outputs({o: answer[o] for o in self.outputs})
+        simulated = simulate(self.model, empty_run, tolerance=SIMULATION_TOLERANCE)
+        return empty_run.with_outputs({o: simulated[o] for o in self.outputs})
 
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
         """Return derivatives of outputs with respect to parameters, divided by the noise, for a simulated run.
@@ -299,19 +299,21 @@ class ModelFit:
         variances are infinite.
         """
         rows = self.jacobian(run)
-        size = np.linalg.norm(rows, axis=1)
-        scaled = rows / np.where(size > 0, size, 1.0)[:, None]
-        _, sizes, right = thin_svd(scaled.T)
+        norms = np.linalg.norm(rows, axis=1)
+        scaled = rows / np.where(norms > 0, norms, 1.0)[:, None]
+        _, singular_values, vt = thin_svd(scaled.T)
         tolerance = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
-        if np.any(size == 0) or sizes[-1] <= tolerance * sizes[0]:
+        if np.any(norms == 0) or singular_values[-1] <= tolerance * singular_values[0]:
             return np.diag(np.full(len(rows), np.inf))
-        half = right.T / sizes / size[:, None]
-        return np.asarray(half @ half.T)
+        factor = vt.T / singular_values / norms[:, None]
+        return np.asarray(factor @ factor.T)
 
 
-def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
+def _derivatives(
+    problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], pulses: int
+) -> Floats:
     orders, coefficients, inputs = problem.split(values)
-    grid = Objective(problem, [run], weights, pulses_per_sample=every)
+    grid = Objective(problem, [run], weights, pulses_per_sample=pulses)
     point = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, linear_scale=True)
     return np.asarray(point.outcome["jacobian"])
 
@@ -352,7 +354,7 @@ class Sensitivities:
     @classmethod
     def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
         """Return the sensitivities of a fitted model, from one simulation per input; see the class for arguments."""
-        kernels, answers, inputs = [], [], len(fit.inputs)
+        kernels, responses, inputs = [], [], len(fit.inputs)
         for k in range(inputs):
             # A fit does not use the first sample of a run, so the pulse is at the second.
             commands = np.zeros((inputs, rows + 2))
@@ -360,9 +362,9 @@ class Sensitivities:
             run = fit.run(commands, step, "pulse")
             jacobian = fit.jacobian(run, offset=False)
             kernels.append(jacobian.reshape(len(fit.names), len(fit.outputs), rows))
-            answers.append(np.stack([run[o][1:-1] for o in fit.outputs]))
+            responses.append(np.stack([run[o][1:-1] for o in fit.outputs]))
         nuisance = _offset_responses(fit, step, rows)
-        return cls(fit, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
+        return cls(fit, step, rows, ramp, np.stack(kernels), np.stack(responses), nuisance)
 
     @cached_property
     def length(self) -> int:
@@ -379,8 +381,8 @@ class Sensitivities:
 
         `commands` has shape (inputs, rows).
         """
-        drive = np.fft.rfft(commands, self.length)
-        total = np.einsum("ipof,if->pof", self.spectra[0], drive)
+        spectrum = np.fft.rfft(commands, self.length)
+        total = np.einsum("ipof,if->pof", self.spectra[0], spectrum)
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def outputs(self, commands: Floats) -> Floats:
@@ -393,11 +395,11 @@ class Sensitivities:
 
         Responses to offsets are projected out.
         """
-        flat = derivatives.reshape(len(derivatives), -1)
-        information = flat @ flat.T
+        rows = derivatives.reshape(len(derivatives), -1)
+        information = rows @ rows.T
         if len(self.nuisance):
-            shared = flat @ self.nuisance.T
-            information = information - shared @ shared.T
+            overlaps = rows @ self.nuisance.T
+            information = information - overlaps @ overlaps.T
         return np.asarray(information)
 
     def rig_commands(self, commands: Floats) -> Floats:
@@ -415,15 +417,15 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     Raise ModelError if the kind of offset of the model is unknown.
     """
     structure = fit.problem.structure
-    drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
-    if drives is None:
+    count = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
+    if count is None:
         raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not resolved; identify it again")
-    if not drives:
+    if not count:
         return np.zeros((0, len(fit.outputs) * rows))
     names = {*structure.signals, *structure.coefficient_names, *structure.order_names}
-    one = next(n for n in (f"one{k}" for k in range(len(names) + 1)) if not any(t.startswith(n) for t in names))
+    prefix = next(n for n in (f"one{k}" for k in range(len(names) + 1)) if not any(t.startswith(n) for t in names))
     time = step * np.arange(rows + 2)
-    shapes = {f"{one}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(drives)}
+    shapes = {f"{prefix}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(count)}
     equations = tuple(
         replace(e, terms=(*e.terms, *(Term(s, Order(), f"{s}_{e.output}") for s in shapes)))
         for e in structure.equations
@@ -439,13 +441,13 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
         [1.0 / fit.noise[o] for o in fit.outputs],
         fit.refinement,
     )
-    own = [i for i, n in enumerate(problem.names) if n not in values]
+    rows_of_offsets = [i for i, n in enumerate(problem.names) if n not in values]
     # The first sample of a run from rest does not depend on an offset, so the responses start at the second one.
-    responses = derivatives[own].reshape(len(own), len(fit.outputs), rows)
+    responses = derivatives[rows_of_offsets].reshape(len(rows_of_offsets), len(fit.outputs), rows)
     responses = np.pad(responses, ((0, 0), (0, 0), (1, 0)))[..., :rows]
-    return orthonormal(responses.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
+    return orthonormal(responses.reshape(len(rows_of_offsets), -1).T, OFFSET_RANK_TOLERANCE).T
 
 
-def fast_length(least: int) -> int:
-    """Return the smallest number 2^a, 3·2^a, 5·2^a or 15·2^a that is at least `least`, for which an FFT is fast."""
-    return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))
+def fast_length(minimum: int) -> int:
+    """Return the smallest number 2^a, 3·2^a, 5·2^a or 15·2^a that is at least `minimum`, for which an FFT is fast."""
+    return min(f << max((minimum - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

@@ -182,10 +182,10 @@ class DesignedInput:
             f"  {'standard error of':<18}{'now':>12}{'square':>12}{'this':>12}{'with now':>12}{'square / this':>15}",
         ]
         for name, value in self.values.items():
-            now, square_error, then, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
+            now, square_error, new, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
             mark = "*" if name in self.parameters else " "
-            ratio = square_error / then if then > 0 else math.nan
-            cells = "".join(f"{format_bound(v):>12}" for v in (now, square_error, then, both))
+            ratio = square_error / new if new > 0 else math.nan
+            cells = "".join(f"{format_bound(v):>12}" for v in (now, square_error, new, both))
             lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>15.2f}")
         most, last = self.spectrum.gap, f"{100 * self.efficiency:.0f} %"
         lines += [

@@ -81,11 +81,11 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
     [s].
     """
     inputs = fit.inputs
-    most = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
-    numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
-    if len(numbers) > MAX_SPECTRAL_LINES:
-        numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES)).astype(np.int64))
-    frequencies = numbers / (rows * step)
+    max_harmonic = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
+    harmonics = np.unique(np.round(np.geomspace(1, max_harmonic, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
+    if len(harmonics) > MAX_SPECTRAL_LINES:
+        harmonics = np.unique(np.round(np.geomspace(1, max_harmonic, MAX_SPECTRAL_LINES)).astype(np.int64))
+    frequencies = harmonics / (rows * step)
     slopes, gains = _response_sensitivities(fit, 2 * math.pi * frequencies, step)
     peaks = np.array(list(bounds.peaks.values()))
     output_limits = np.array(list(bounds.output_limits.values()))
@@ -94,15 +94,15 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
         np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
     )
     count = len(inputs)
-    costs = np.zeros((count + len(output_limits), count, len(numbers)))
+    costs = np.zeros((count + len(output_limits), count, len(harmonics)))
     for k in range(count):
         costs[k, k] = 1.0
     costs[count:] = (np.abs(gains) * peaks[:, None] / output_limits[:, None, None]) ** 2
-    groups = [(k, np.arange(k, len(numbers), count)) for k in range(count)]
+    groups = [(k, np.arange(k, len(harmonics), count)) for k in range(count)]
     return SpectralLines(
-        np.concatenate([frequencies[at] for _, at in groups]),
-        np.concatenate([information[k, at] for k, at in groups]),
-        np.concatenate([costs[:, k, at] for k, at in groups], axis=1),
+        np.concatenate([frequencies[indices] for _, indices in groups]),
+        np.concatenate([information[k, indices] for k, indices in groups]),
+        np.concatenate([costs[:, k, indices] for k, indices in groups], axis=1),
     )
 
 
@@ -115,39 +115,39 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     hold_response = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(fit.model, w)
     coupling = fit.problem.structure.coupling
-    own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
+    coupled_model = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
     _, coefficients, _ = fit.problem.split(fit.values)
-    chain = fit.problem.model_parameter_jacobian(coefficients)
+    jacobian = fit.problem.model_parameter_jacobian(coefficients)
     # With measured coupling, the other outputs in an equation are inputs of the equation.
-    drives = (
+    responses = (
         gains
         if coupling == "simulated"
         else np.concatenate([gains, np.tile(np.eye(len(fit.inputs))[..., None], w.size)])
     )
     signals = fit.inputs if coupling == "simulated" else (*fit.outputs, *fit.inputs)
     slopes = np.zeros((*gains.shape, len(fit.names)), dtype=np.complex128)
-    for k, small, *models in shifted_models(own, np.any(chain != 0, axis=1), DERIVATIVE_STEP_RATIO):
-        above, below = (_output_responses(shifted, w, coupling, drives, signals) for shifted in models)
-        slopes += ((above - below) / (2 * small))[..., None] * chain[k]
-    for place, item in enumerate(fit.problem.inputs, start=len(fit.names) - len(fit.problem.inputs)):
-        at = fit.inputs.index(item.signal)
-        slopes[:, at, :, place] = -1j * w * gains[:, at]
+    for k, increment, *models in shifted_models(coupled_model, np.any(jacobian != 0, axis=1), DERIVATIVE_STEP_RATIO):
+        upper, lower = (_output_responses(shifted, w, coupling, responses, signals) for shifted in models)
+        slopes += ((upper - lower) / (2 * increment))[..., None] * jacobian[k]
+    for column, item in enumerate(fit.problem.inputs, start=len(fit.names) - len(fit.problem.inputs)):
+        index = fit.inputs.index(item.signal)
+        slopes[:, index, :, column] = -1j * w * gains[:, index]
     return slopes * hold_response[:, None], gains * hold_response
 
 
-def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
+def _output_responses(model: Model, w: Floats, coupling: str, responses: Complex, signals: Sequence[str]) -> Complex:
     """Return the frequency responses of the outputs to the inputs at w [rad/s], shape (outputs, inputs, W).
 
-    With measured coupling, an equation also has other outputs as inputs. `drives` are then the responses of all
+    With measured coupling, an equation also has other outputs as inputs. `responses` are then the responses of all
     `signals` to the inputs, shape (signals, inputs, W).
     """
     if coupling == "simulated":
         return frequency_response(model, w)
-    alone = frequency_response(model, w, coupling="measured")
+    direct = frequency_response(model, w, coupling="measured")
     from_signals = [s for s in model.structure.signals if s in signals]
-    read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
-    inputs = [s for s in from_signals if s in read]
-    return np.asarray(np.einsum("osw,siw->oiw", alone, drives[[list(signals).index(s) for s in inputs]]))
+    input_signals = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
+    inputs = [s for s in from_signals if s in input_signals]
+    return np.asarray(np.einsum("osw,siw->oiw", direct, responses[[list(signals).index(s) for s in inputs]]))
 
 
 def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
@@ -165,15 +165,15 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
     price = np.full(limits, 1.0 / limits)
     weights = np.full(points, 1.0 / points)
     best, power, bound = -math.inf, weights, math.inf
-    damp = 1.0 if criterion.kind == "D" else 0.2
-    for turn in range(MAX_PRICE_ITERATIONS):
+    exponent = 1.0 if criterion.kind == "D" else 0.2
+    for iteration in range(MAX_PRICE_ITERATIONS):
         cost = price @ lines.costs
         information = lines.information / cost[:, None, None]
         for _ in range(MAX_WEIGHT_ITERATIONS):
             gain = _gain_per_point(weights, information, criterion)
             if gain is None:
                 return Spectrum(lines, np.zeros(points), -math.inf, math.inf)
-            weights = weights * np.maximum(gain, 0.0) ** damp
+            weights = weights * np.maximum(gain, 0.0) ** exponent
             weights = weights / np.sum(weights)
             if np.max(gain) < 1 + OPTIMALITY_TOLERANCE:
                 break
@@ -190,7 +190,7 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
             best, power = score, feasible
         if bound - best < OPTIMALITY_TOLERANCE:
             break
-        price = price * usage ** (0.7 if turn < MAX_PRICE_ITERATIONS // 2 else 0.4)
+        price = price * usage ** (0.7 if iteration < MAX_PRICE_ITERATIONS // 2 else 0.4)
         price = np.maximum(price / np.sum(price), 1e-9)
     return Spectrum(lines, power, best, bound)
 

@@ -140,9 +140,9 @@ class Model:
             check_pulses(self.m)
         check_offset_resolved(self.structure.offset)
         if self.structure.free_inputs:
-            numbers = ", ".join(item.words for item in self.structure.free_inputs)
-            way = "with_delays" if self.structure.free_delays else "with_limits"
-            raise ModelError(f"the {numbers} is still free; identify it first, or set it by {way}")
+            names = ", ".join(item.words for item in self.structure.free_inputs)
+            method = "with_delays" if self.structure.free_delays else "with_limits"
+            raise ModelError(f"the {names} is still free; identify it first, or set it by {method}")
         for item in self.structure.equations:
             if not item.is_identified:
                 free = [*item.order_names, *item.coefficient_names]
@@ -439,7 +439,7 @@ class Model:
         """Return the result of an operator; NotImplemented for an operand that is neither a model nor a number."""
         from ftlm.analysis.model_algebra import combine
 
-        if not all(isinstance(side, (Model, Real)) for side in (left, right)):
+        if not all(isinstance(operand, (Model, Real)) for operand in (left, right)):
             return NotImplemented  # type: ignore[no-any-return]
         return combine(operator, left, right)
 

@@ -76,9 +76,9 @@ def parameter_estimates(
         Names of the estimated parameters; all other parameters are fixed.
     """
     units = model.units if isinstance(model, Circuit) else parameter_units(model)
-    none = (math.nan, math.nan)
+    undefined = (math.nan, math.nan)
     return {
-        n: Parameter(n, v, errors.get(n, math.nan), intervals.get(n, none), units.get(n, ""), n not in free)
+        n: Parameter(n, v, errors.get(n, math.nan), intervals.get(n, undefined), units.get(n, ""), n not in free)
         for n, v in values.items()
     }
 
@@ -98,14 +98,14 @@ def offset_estimates(
     out = {}
     for k, run in enumerate(offsets):
         for output, values in run.items():
-            own = model.units.get(output, "")
-            rates = {"constant": orders[output], "ramp": orders[output] + 1.0, "level": 0.0}
+            output_unit = model.units.get(output, "")
+            exponents = {"constant": orders[output], "ramp": orders[output] + 1.0, "level": 0.0}
             for kind, value in values.items():
                 name = f"{kind}_{output}{f'[{runs[k]}]' if len(offsets) > 1 else ''}"
                 error = errors[k][output][kind] if errors else math.nan
-                unit = f"s^-{rates[kind]:g} {own}" if own and rates[kind] else own
-                half = NORMAL_95 * error
-                out[name] = Parameter(name, value, error, (value - half, value + half), unit)
+                unit = f"s^-{exponents[kind]:g} {output_unit}" if output_unit and exponents[kind] else output_unit
+                half_width = NORMAL_95 * error
+                out[name] = Parameter(name, value, error, (value - half_width, value + half_width), unit)
     return out
 
 
@@ -134,19 +134,19 @@ def parameter_units(model: Model) -> dict[str, str]:
         alpha = item.order.constant
         for term in item.terms:
             if term.name is not None:
-                place, shape, order = (model.units, item.output, alpha), term.nonlinear, term.order.constant
+                context, expression, order = (model.units, item.output, alpha), term.nonlinear, term.order.constant
                 out[term.name] = (
-                    coefficient_unit(*place, term.signal, order)
-                    if shape is None
-                    else nonlinear_coefficient_unit(*place, shape, order)
+                    coefficient_unit(*context, term.signal, order)
+                    if expression is None
+                    else nonlinear_coefficient_unit(*context, expression, order)
                 )
         if item.friction is not None:
-            own = model.units.get(item.output, "")
-            force = f"s^-{alpha:g} {own}" if own else ""
-            near = item.friction.stribeck
+            unit = model.units.get(item.output, "")
+            force = f"s^-{alpha:g} {unit}" if unit else ""
+            stribeck = item.friction.stribeck
             units_by_name = [(item.friction.name, force)]
-            if near is not None:
-                units_by_name += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
+            if stribeck is not None:
+                units_by_name += [(stribeck.name, force), (stribeck.speed_name, f"{unit}/s" if unit else "")]
             out |= {name: unit for name, unit in units_by_name if name is not None}
     out |= {f"delay_{name}": "s" for name in model.structure.delay}
     out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}

@@ -41,13 +41,13 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
     @classmethod
     def of(cls, item: Term) -> TermFile:
         """Return the file form of a term."""
-        shape = None if item.nonlinear is None else str(item.nonlinear)
-        return cls(item.signal, item.order.constant, float(item.coefficient), item.factor, item.name, shape)
+        expression = None if item.nonlinear is None else str(item.nonlinear)
+        return cls(item.signal, item.order.constant, float(item.coefficient), item.factor, item.name, expression)
 
     def term(self) -> Term:
         """Return the term from its file form."""
-        shape = UNSET if self.expression is None else EquationParser(self.expression).parse_expression()
-        return Term(self.signal, Order(self.order), self.coefficient, self.factor, self.name, shape)
+        expression = UNSET if self.expression is None else EquationParser(self.expression).parse_expression()
+        return Term(self.signal, Order(self.order), self.coefficient, self.factor, self.name, expression)
 
 
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -198,9 +198,9 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         If the file does not exist, is not a model (the message has the position), has another schema version, or
         exceeds 1 MiB.
     """
-    read = MODEL_FORMAT.read(path)
+    file = MODEL_FORMAT.read(path)
     try:
-        return read.restore_model()
+        return file.restore_model()
     except ModelError as error:
         raise DataError(
             f"{path} contains no usable model: {error_text(error)}; give a file written by save()"

@@ -78,8 +78,8 @@ def comparison_charts(
 
 def _bands_of_lines(band: Band) -> list[Band]:
     """Return the bands of the measured and the simulated line of a chart; the first band is empty (NaN)."""
-    none = np.full(band[0].size, np.nan)
-    return [(none, none), band]
+    empty = np.full(band[0].size, np.nan)
+    return [(empty, empty), band]
 
 
 @check_arguments
@@ -366,7 +366,7 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     for name, (matrix,) in sensitivities.items():
         nominal = comparison.simulated[name][0]
         variance = np.einsum("kt,kl,lt->t", matrix, covariance[np.ix_(rows, rows)], matrix)
-        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
-        if np.all(np.isfinite(half)):
-            bands[name] = (nominal - half, nominal + half)
+        half_width = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        if np.all(np.isfinite(half_width)):
+            bands[name] = (nominal - half_width, nominal + half_width)
     return bands

@@ -79,18 +79,18 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     """
     if ax is None:
         return figure_of(rows, columns, **options)
-    axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
-    strange = [type(a).__name__ for a in axes_given if not hasattr(a, "plot") or not hasattr(a, "figure")]
-    if strange:
+    all_axes = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
+    wrong_types = [type(a).__name__ for a in all_axes if not hasattr(a, "plot") or not hasattr(a, "figure")]
+    if wrong_types:
         raise ModelError(
-            f"ax contains an object of type {strange[0]}, not matplotlib axes; give the axes that subplots returns"
+            f"ax contains an object of type {wrong_types[0]}, not matplotlib axes; give the axes that subplots returns"
         )
-    if axes_given.size != rows * columns:
+    if all_axes.size != rows * columns:
         raise ModelError(
-            f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {axes_given.size}; give as many, "
+            f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {all_axes.size}; give as many, "
             f"such as subplots({rows}, {columns})[1], or leave ax out"
         )
-    return axes_given[0].figure, axes_given.reshape(rows, columns)
+    return all_axes[0].figure, all_axes.reshape(rows, columns)
 
 
 def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> Any:
@@ -146,10 +146,10 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
             axis.plot(x[is_finite], np.asarray(values)[is_finite], "o", **dots)
         else:
             dash = (0, [float(length) for length in dashes.split()]) if dashes else "-"
-            drawn = {"drawstyle": "steps-post"} if chart.steps else {}
+            options = {"drawstyle": "steps-post"} if chart.steps else {}
             # The measured line is wider, so that it stays visible behind a simulated line that coincides with it.
             width = 2.2 if style == 0 and len(styles) > 1 else 1.0
-            axis.plot(x, values, color=color, linewidth=width, linestyle=dash, label=label, **drawn)
+            axis.plot(x, values, color=color, linewidth=width, linestyle=dash, label=label, **options)
     for (low, high), style in zip(chart.bands, styles, strict=False):
         axis.fill_between(x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
     left, right, bottom, top = chart.frame
@@ -203,16 +203,16 @@ def _draw_bars(axis: Any, chart: BarChart) -> None:
 
 
 def _draw_correlations(axis: Any, chart: CorrelationMap) -> None:
-    drawn = axis.imshow(chart.matrix, vmin=-1, vmax=1, cmap="RdBu_r")
+    image = axis.imshow(chart.matrix, vmin=-1, vmax=1, cmap="RdBu_r")
     labels = [escape_math(symbol(n)) for n in chart.names]
     axis.set_xticks(range(len(labels)), labels)
     axis.set_yticks(range(len(labels)), labels)
     for i, j in np.ndindex(chart.matrix.shape):
         if i != j:
             value = chart.matrix[i, j]
-            ink = "white" if abs(value) > 0.6 else "black"
-            axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize="x-small", color=ink)
-    axis.figure.colorbar(drawn, ax=axis, label="correlation")
+            text_color = "white" if abs(value) > 0.6 else "black"
+            axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize="x-small", color=text_color)
+    axis.figure.colorbar(image, ax=axis, label="correlation")
 
 
 #: Maximum number of characters in a line of the label of a color bar.
@@ -221,7 +221,7 @@ COLORBAR_LABEL_CHARACTERS = 40
 
 def _draw_landscape(axis: Any, chart: Landscape) -> None:
     norm = importlib.import_module("matplotlib.colors").LogNorm()
-    drawn = axis.pcolormesh(chart.x, chart.y, chart.valid_scores, norm=norm, cmap="viridis", shading="nearest")
+    mesh = axis.pcolormesh(chart.x, chart.y, chart.valid_scores, norm=norm, cmap="viridis", shading="nearest")
     axis.set_facecolor("0.8")
     row, column = chart.best
     ring = {"markersize": 9, "fillstyle": "none", "color": LINE_STYLES[1][0], "markeredgewidth": 2}
@@ -230,7 +230,7 @@ def _draw_landscape(axis: Any, chart: Landscape) -> None:
     axis.set(xlabel=xlabel, ylabel=ylabel)
     # A long label does not fit along the bar.
     label = textwrap.fill(f"{chart.score} (grey: no candidate, or diverged)", COLORBAR_LABEL_CHARACTERS)
-    axis.figure.colorbar(drawn, ax=axis, label=label)
+    axis.figure.colorbar(mesh, ax=axis, label=label)
 
 
 #: Height of a residual plot, as a fraction of the height of the fit plot above it.
@@ -288,10 +288,10 @@ def fit(
     pairs = zip(comparison_charts(comparison, units=units), residual_rows(comparison, units=units), strict=True)
     charts, heights = [], []
     for k in range(len(comparison.per_run)):
-        for fitted, (lower, *_) in islice(pairs, len(comparison.output_error)):
+        for fit_chart, (residual_chart, *_) in islice(pairs, len(comparison.output_error)):
             charts += [
-                replace(fitted, title=f"{fitted.title}. {fitted.caption}"),
-                replace(lower, title="", y_label="residual"),
+                replace(fit_chart, title=f"{fit_chart.title}. {fit_chart.caption}"),
+                replace(residual_chart, title="", y_label="residual"),
             ]
             heights += [1.0, RESIDUAL_HEIGHT_SHARE]
         input_charts = [signal_chart(runs_of_result[k], name) for name in runs_of_result[k].inputs] if inputs else []
@@ -361,8 +361,8 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     if results is None:
         raise ModelError("the runs were too short for residual tests; give longer runs to draw them")
     rows = [
-        [correlation_chart(*test_arguments, label=test_arguments[-1].verdict) for test_arguments in tests_of_one]
-        for _, tests_of_one in groupby(results.tests, key=lambda test_arguments: test_arguments[0])
+        [correlation_chart(*test, label=test[-1].verdict) for test in group]
+        for _, group in groupby(results.tests, key=lambda test: test[0])
     ]
     return draw_figure(rows, ax)
 
@@ -658,21 +658,21 @@ def _spectrum_chart(result: DesignedInput) -> LineChart:
     rows, lines = result.run.length - 1, result.spectrum.lines.frequencies
     all_frequencies = np.fft.rfftfreq(rows, result.step)
     is_shown = (all_frequencies >= lines.min()) & (all_frequencies <= lines.max())
-    drawn: list[tuple[str, ArrayLike]] = []
+    curves: list[tuple[str, ArrayLike]] = []
     for name, run in ((result.reference.name, result.reference), ("designed", result.run)):
         power = np.sum([np.abs(np.fft.rfft(run[n][:rows])) ** 2 for n in run.inputs], axis=0)
-        drawn.append((name, (np.cumsum(power[1:]) / np.sum(power[1:]))[is_shown[1:]]))
+        curves.append((name, (np.cumsum(power[1:]) / np.sum(power[1:]))[is_shown[1:]]))
     order = np.argsort(lines)
     cumulative_power = np.cumsum(result.spectrum.power[order])
     if cumulative_power[-1] > 0:
-        drawn.append(
+        curves.append(
             (
                 "best periodic",
                 np.interp(all_frequencies[is_shown], lines[order], cumulative_power / cumulative_power[-1]),
             )
         )
     return LineChart(
-        all_frequencies[is_shown], drawn, title="Spectrum", x_label="frequency [Hz]", y_label="power below", log_x=True
+        all_frequencies[is_shown], curves, title="Spectrum", x_label="frequency [Hz]", y_label="power below", log_x=True
     )
 
 

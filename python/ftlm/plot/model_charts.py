@@ -39,12 +39,12 @@ def response_frequencies(model: Model, step: float | None = None, duration: floa
     """
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
-    corner = []
+    corners = []
     for pairs in transfer_functions(model).denominator.values():
         (highest, high), (lowest, low) = pairs[0], pairs[-1]
-        corner.append(abs(lowest / highest) ** (1 / (high - low)) if high > low else 1.0)
-    middle = float(np.exp(np.mean(np.log(corner))))
-    return np.geomspace(middle / 100, middle * 100, 240)
+        corners.append(abs(lowest / highest) ** (1 / (high - low)) if high > low else 1.0)
+    mean_corner = float(np.exp(np.mean(np.log(corners))))
+    return np.geomspace(mean_corner / 100, mean_corner * 100, 240)
 
 
 @check_arguments
@@ -243,17 +243,17 @@ def response_charts(result: Response, *, units: Mapping[str, str] | None = None)
 def response_chart(response: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
     """Return the chart of the response of output i to input j (indices), with its 95 % band if it is known."""
     output, values = response.outputs[i], response.values[i, j]
-    bands, shade = [], "No covariance, so there is no band."
+    bands, caption = [], "No covariance, so there is no band."
     if response.deviation is not None:
         half = NORMAL_95 * response.deviation[i, j]
-        bands, shade = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
+        bands, caption = [(values - half, values + half)], "Shade: 95 % band, from the covariance of the fit."
     return LineChart(
         response.time,
         [("", values)],
         title=f"{symbol(output)} after a unit {response.kind} of {symbol(response.inputs[j])}",
         x_label="time [s]",
         y_label=with_unit(symbol(output), units, output),
-        caption=shade,
+        caption=caption,
         bands=bands,
         width=SMALL_WIDTH_PX,
         height=220,
@@ -286,7 +286,7 @@ class TimeResponse(Response):
         for i, output in enumerate(self.outputs):
             for j, signal in enumerate(self.inputs):
                 values = self.values[i, j]
-                at = int(np.argmax(np.abs(values)))
+                peak = int(np.argmax(np.abs(values)))
                 final_value, error = values[-1], None if self.deviation is None else self.deviation[i, j, -1]
                 name = f"value at {self.time[-1]:.4g} s"
                 if (output, signal) in self.final_values:
@@ -294,7 +294,7 @@ class TimeResponse(Response):
                 uncertainty = f" ± {error:.2g}" if error else ""
                 lines.append(
                     f"  {output} from {signal}: {name} {final_value:.5g}{uncertainty}, "
-                    f"peak {values[at]:.5g} at {self.time[at]:.4g} s"
+                    f"peak {values[peak]:.5g} at {self.time[peak]:.4g} s"
                 )
         return "\n".join(lines)
 

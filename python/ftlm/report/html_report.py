@@ -73,15 +73,13 @@ MAX_RESPONSE_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
-def verdict_box(shown_verdict: Verdict, subject: str = "") -> Markup:
+def verdict_box(verdict: Verdict, subject: str = "") -> Markup:
     """Return a verdict as an HTML box for the top of a page; the prefix `subject` names one of several models."""
-    remedy = (
-        Markup(' <span class="todo">→ {}</span>').format(typeset(shown_verdict.remedy)) if shown_verdict.remedy else ""
-    )
+    remedy = Markup(' <span class="todo">→ {}</span>').format(typeset(verdict.remedy)) if verdict.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LEVEL_CSS_CLASSES[shown_verdict.level],
-        f"{subject}{shown_verdict.level}" if subject else shown_verdict.level.capitalize(),
-        typeset(shown_verdict.reason),
+        _LEVEL_CSS_CLASSES[verdict.level],
+        f"{subject}{verdict.level}" if subject else verdict.level.capitalize(),
+        typeset(verdict.reason),
         remedy,
     )
 
@@ -97,8 +95,8 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
         if k >= MAX_SUMMARY_FINDINGS:
             further += texts(group.findings)
             continue
-        todo = Markup(' <span class="todo">→ {}</span>').format(typeset(group.remedy)) if group.remedy else Markup("")
-        main.append(Markup("{}{}{}").format(typeset(group.first_finding.text), group.count, todo))
+        remedy = Markup(' <span class="todo">→ {}</span>').format(typeset(group.remedy)) if group.remedy else Markup("")
+        main.append(Markup("{}{}{}").format(typeset(group.first_finding.text), group.count, remedy))
         further += texts(group.findings[1:])
     return main, further
 
@@ -348,8 +346,8 @@ def first_sections(
     if not validated:
         verdict_texts.append("No validation run was given, so the prediction of other data is unknown.")
     distinct_findings = unique(findings)
-    warned, notes = ([f for f in distinct_findings if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
-    findings_shown, further_findings = first_findings(warned)
+    alerts, notes = ([f for f in distinct_findings if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
+    main_findings, further_findings = first_findings(alerts)
     verdict_texts += [f"{note}." for note in texts(notes)]
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # A chart has two lines, each drawn once for wide screens and once with half the points for narrow screens.
@@ -374,7 +372,7 @@ def first_sections(
         )
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint, offsets)]),
-        Section("Warnings", verdict_texts[bool(warned) :], findings_shown, more=further_findings),
+        Section("Warnings", verdict_texts[bool(alerts) :], main_findings, more=further_findings),
     ]
     if figures := behavior_figures(model):
         tables = behavior_tables(model)
@@ -546,11 +544,11 @@ def _recursion_error_charts(result: Identification) -> list[LineChart]:
         single_equation = result.task.structure.equation(identified.output)
         order_pairs = zip(single_equation.equations[0].orders, identified.orders, strict=True)
         orders = {o.names[0]: n.constant for o, n in order_pairs if o.names}
-        at_orders = single_equation.with_orders(orders)
-        if not at_orders.coefficient_names:
+        structure = single_equation.with_orders(orders)
+        if not structure.coefficient_names:
             continue
         traces = [
-            (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=stride, **options))
+            (f"p = {p}", multi_innovation_trace(run, structure, innovation_length=p, every=stride, **options))
             for p in sorted({*COMPARED_INNOVATION_LENGTHS, int(settings["innovation_length"])})
         ]
         figures.append(trace_chart(traces, title=f"Error (45) of {symbol(identified.output)}, run {run.name}"))
@@ -567,7 +565,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     return " ".join(sentences)
 
 
-def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
+def estimates_table(result: Identification | None, true_values: Mapping[str, float] | None = None) -> Table:
     """Return a table of orders and coefficients of a joint fit with 95 % intervals, and true values by name if given.
 
     The table has no rows without a joint fit.
@@ -576,13 +574,13 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
     if result is not None and result.joint is not None:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
-            true_value = [truth.get(name)] if truth else []
+            true_cells = [true_values.get(name)] if true_values else []
             error_and_interval = [
                 v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)
             ]
-            rows.append([symbol_html(name), value, *error_and_interval, *true_value])
+            rows.append([symbol_html(name), value, *error_and_interval, *true_cells])
     columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
-    if truth:
+    if true_values:
         columns, groups = [*columns, "true value"], [*groups, ("", 1)]
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
 
@@ -703,13 +701,13 @@ def _model_content(model: Model, validation_runs: Sequence[Run], validated: Sequ
     estimate = model.estimate
     findings = [] if estimate is None else list(estimate.findings)
     for run, comparison in zip(validation_runs, validated, strict=True):
-        findings_there = [*comparison.findings, *data_notes(run)]
+        run_findings = [*comparison.findings, *data_notes(run)]
         if estimate is not None:
-            findings_there += validation_fit_findings(
+            run_findings += validation_fit_findings(
                 {n: f for n, f in estimate.fit.items() if f is not None}, comparison
             )
-            findings_there += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
-        findings += on_validation(findings_there, run.name)
+            run_findings += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
+        findings += on_validation(run_findings, run.name)
     compared = [("validation", comparison) for comparison in validated]
     bands = [confidence_bands(model, run, c) for run, c in zip(validation_runs, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(validation_runs), None, validation_runs, bands)

@@ -72,8 +72,8 @@ def equation_html(
         minus, sign = Markup('<mo form="infix">−</mo>'), Markup("<mi>sgn</mi><mo>(</mo>{}<mo>)</mo>").format(speed)
         parts.append(_math(minus + _number_math(fc) + THIN_SPACE + sign, "term"))
         if equation.friction.stribeck is not None:
-            fall = _GAUSSIAN_DECAY.format(speed, _number_math(vs))
-            parts.append(_math(minus + _number_math(fs) + THIN_SPACE + fall + THIN_SPACE + sign, "term"))
+            decay = _GAUSSIAN_DECAY.format(speed, _number_math(vs))
+            parts.append(_math(minus + _number_math(fs) + THIN_SPACE + decay + THIN_SPACE + sign, "term"))
     if isinstance(offset, str):
         offset_text = offset.removeprefix(" + ")
         parts += (
@@ -119,8 +119,8 @@ def _number_math(value: float | Exact) -> Markup:
         return mantissa_math
     exponent = power.translate(_PLAIN_DIGITS)
     sign = Markup("<mo>−</mo>") if exponent.startswith("-") else Markup("")
-    raised = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
-    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(mantissa_math, raised)
+    exponent_math = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
+    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(mantissa_math, exponent_math)
 
 
 def _rounded_number(value: float) -> Exact:
@@ -161,12 +161,12 @@ def _operator_math(order: Order) -> Markup:
 
 def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
     """Return a term without its coefficient as MathML: a derivative of a signal or of an expression."""
-    shape = term.nonlinear
-    if shape is None:
+    expression = term.nonlinear
+    if expression is None:
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
-    text = _expression_math(shape, delay, limits)
+    text = _expression_math(expression, delay, limits)
     operator = _operator_math(term.order)
-    return operator + (_IN_PARENTHESES.format(text) if operator or shape.operation == "add" else text)
+    return operator + (_IN_PARENTHESES.format(text) if operator or expression.operation == "add" else text)
 
 
 def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
@@ -254,8 +254,8 @@ def parameter_table(
 
     def row(name: str, value: float, reference_value: float | None, description: str) -> list[Cell]:
         error = errors.get(name)
-        half = None if error is None else NORMAL_95 * error
-        interval: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        half_width = None if error is None else NORMAL_95 * error
+        interval: list[Cell] = [None, None] if half_width is None else [value - half_width, value + half_width]
         if name in profiles:
             interval = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
         return [symbol_html(name), value, error, *interval, reference_value, units.get(name, ""), description]
@@ -318,11 +318,11 @@ def parameter_table(
     omitted_columns = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
         note += " Stated values belong to the integer orders of the manufacturer's model."
-    columns_kept = [i for i in range(len(columns)) if i not in omitted_columns]
-    groups = (("", 3), ("95 % interval", 2), ("", len(columns_kept) - 5)) if has_errors else ()
-    shown_rows = [[cells[i] for i in columns_kept] for cells in rows]
+    column_indices = [i for i in range(len(columns)) if i not in omitted_columns]
+    groups = (("", 3), ("95 % interval", 2), ("", len(column_indices) - 5)) if has_errors else ()
+    shown_rows = [[cells[i] for i in column_indices] for cells in rows]
     return Table(
-        "Orders and coefficients", tuple(columns[i] for i in columns_kept), shown_rows, groups=groups, note=note
+        "Orders and coefficients", tuple(columns[i] for i in column_indices), shown_rows, groups=groups, note=note
     )
 
 

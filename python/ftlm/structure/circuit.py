@@ -26,17 +26,17 @@ MAX_DIFFUSION_ARGUMENT = 40.0
 _TOKEN_PATTERN = re.compile(r"p\(|[(),-]|[A-Za-z]+_?\d*")
 
 
-def _diffusion(s: Complex, p: Sequence[float], *, blocked: bool) -> Response:
+def _diffusion(s: Complex, p: Sequence[float], *, reflecting: bool) -> Response:
     """Return the impedance of a finite diffusion layer with p = (R, tau), and its derivatives by ln R and ln tau.
 
-    With `blocked`, the end of the layer reflects; otherwise it transmits.
+    With `reflecting`, the end of the layer reflects; otherwise it transmits.
     """
     x = np.sqrt(s * p[1])
     x = np.where(x.real > MAX_DIFFUSION_ARGUMENT, MAX_DIFFUSION_ARGUMENT * (1 + 1j), x)
     tanh, root = np.tanh(x), np.sqrt(s * p[1])
-    z = p[0] / (root * tanh) if blocked else p[0] * tanh / root
-    bend = x / np.sinh(2 * x)
-    return z, [z, z * ((-bend if blocked else bend) - 0.5)]
+    z = p[0] / (root * tanh) if reflecting else p[0] * tanh / root
+    slope = x / np.sinh(2 * x)
+    return z, [z, z * ((-slope if reflecting else slope) - 0.5)]
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,12 @@ CIRCUIT_ELEMENTS = {
     "Wo": Element(
         "open Warburg: finite diffusion, reflecting end",
         (("_R", "Ω"), ("_tau", "s")),
-        lambda s, p: _diffusion(s, p, blocked=True),
+        lambda s, p: _diffusion(s, p, reflecting=True),
     ),
     "Ws": Element(
         "short Warburg: finite diffusion, transmitting end",
         (("_R", "Ω"), ("_tau", "s")),
-        lambda s, p: _diffusion(s, p, blocked=False),
+        lambda s, p: _diffusion(s, p, reflecting=False),
     ),
     "G": Element("Gerischer element", (("_R", "Ω"), ("_tau", "s")), _gerischer),
 }
@@ -199,8 +199,8 @@ class Circuit:
         """(letters, name) of every element, such as ("CPE", "CPE1"), from left to right."""
 
         def walk(node: Node) -> list[tuple[str, str]]:
-            kind, rest = node
-            return [item for part in rest for item in walk(part)] if kind in ("series", "parallel") else [(kind, rest)]
+            kind, body = node
+            return [item for part in body for item in walk(part)] if kind in ("series", "parallel") else [(kind, body)]
 
         return walk(self.tree)
 
@@ -243,25 +243,25 @@ class Circuit:
         """
 
         def add_ratios(parts: Sequence[tuple[Polynomial, Polynomial]]) -> tuple[Polynomial, Polynomial]:
-            (top, bottom), *others = parts
-            for above, below in others:
-                top = multiply_polynomials(top, below)
-                add_polynomial(top, multiply_polynomials(above, bottom))
-                bottom = multiply_polynomials(bottom, below)
-            return top, bottom
+            (numerator, denominator), *others = parts
+            for other_numerator, other_denominator in others:
+                numerator = multiply_polynomials(numerator, other_denominator)
+                add_polynomial(numerator, multiply_polynomials(other_numerator, denominator))
+                denominator = multiply_polynomials(denominator, other_denominator)
+            return numerator, denominator
 
         def ratio(node: Node) -> tuple[Polynomial, Polynomial]:
-            kind, rest = node
+            kind, body = node
             if kind in ("series", "parallel"):
-                parts = [ratio(part) for part in rest]
+                parts = [ratio(part) for part in body]
                 return add_ratios(parts) if kind == "series" else add_ratios([(b, a) for a, b in parts])[::-1]
             element = CIRCUIT_ELEMENTS[kind]
             if element.ratio is None:
                 raise ModelError(
-                    f"{rest} ({element.meaning}) has no equation with powers of s; use .circuit.impedance(w) for the "
+                    f"{body} ({element.meaning}) has no equation with powers of s; use .circuit.impedance(w) for the "
                     "response, or approximate it by p(R,CPE) for a model over time"
                 )
-            return element.ratio([self.values[rest + suffix] for suffix, _ in element.parameters])
+            return element.ratio([self.values[body + suffix] for suffix, _ in element.parameters])
 
         return ratio(self.tree)
 
@@ -270,7 +270,7 @@ class Circuit:
 
 
 def impedance_and_derivatives(
-    circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
+    circuit: Circuit, w: Floats, parameters: Mapping[str, float], node: Node | None = None
 ) -> tuple[Complex, dict[str, Complex]]:
     """Return the complex impedance [Ω] of a circuit or a part of it, and its derivatives by parameter name.
 
@@ -282,24 +282,24 @@ def impedance_and_derivatives(
         Circuit with values.
     w
         Angular frequencies [rad/s].
-    more
+    parameters
         Parameter values by name, in addition to the values in the circuit.
     node
         Part of the circuit's tree; None for the whole circuit.
     """
-    kind, rest = node or circuit.tree
+    kind, body = node or circuit.tree
     if kind not in ("series", "parallel"):
-        names = [rest + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
-        values = {**circuit.values, **more}
+        names = [body + suffix for suffix, _ in CIRCUIT_ELEMENTS[kind].parameters]
+        values = {**circuit.values, **parameters}
         z, derivatives = CIRCUIT_ELEMENTS[kind].impedance(
             np.asarray(1j * w, dtype=np.complex128), [values[n] for n in names]
         )
         return z, dict(zip(names, derivatives, strict=True))
-    parts = [impedance_and_derivatives(circuit, w, more, part) for part in rest]
+    parts = [impedance_and_derivatives(circuit, w, parameters, part) for part in body]
     if kind == "series":
         total = np.asarray(np.sum([z for z, _ in parts], axis=0), dtype=np.complex128)
         return total, {n: derivative for _, derivatives in parts for n, derivative in derivatives.items()}
-    beside = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
-    return beside, {
-        n: (beside / z) ** 2 * derivative for z, derivatives in parts for n, derivative in derivatives.items()
+    total = np.asarray(1.0 / np.sum([1.0 / z for z, _ in parts], axis=0), dtype=np.complex128)
+    return total, {
+        n: (total / z) ** 2 * derivative for z, derivatives in parts for n, derivative in derivatives.items()
     }

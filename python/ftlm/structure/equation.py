@@ -81,19 +81,19 @@ class Term:
 
     def format_operand(self, inputs: Mapping[str, str]) -> str:
         """Return the term as text without its coefficient; `inputs` is as in :meth:`format`."""
-        shape = self.nonlinear
-        if shape is None:
+        expression = self.nonlinear
+        if expression is None:
             return derivative(self.order, inputs.get(self.signal, self.signal))
-        text = shape.as_text(inputs)
+        text = expression.as_text(inputs)
         if self.order.names or self.order.constant != 0:
             return derivative(self.order, f"({text})")
-        if shape.operation == "add":
+        if expression.operation == "add":
             # The parser multiplies a number into a sum without a constant; a second pair of parentheses prevents this.
-            bare = isinstance(self.coefficient, str) or shape.arguments[-1].operation == "constant"
-            return f"({text})" if bare else f"(({text}))"
-        first = shape.arguments[0]
-        product = shape.operation == "multiply" and (first.operation, first.value) == ("channel", 0.0)
-        if product and not isinstance(self.coefficient, str):
+            is_unambiguous = isinstance(self.coefficient, str) or expression.arguments[-1].operation == "constant"
+            return f"({text})" if is_unambiguous else f"(({text}))"
+        first = expression.arguments[0]
+        is_product = expression.operation == "multiply" and (first.operation, first.value) == ("channel", 0.0)
+        if is_product and not isinstance(self.coefficient, str):
             # The parser reads the first of two names in a product as a coefficient; parentheses prevent this.
             return text.replace(first.as_text(inputs), f"({first.as_text(inputs)})", 1)
         return text
@@ -124,8 +124,8 @@ def derivative(order: Order, signal: str) -> str:
     if not order.names and order.constant == 0:
         return signal
     text = str(order)
-    plain = re.fullmatch(r"[\w.]+", text)
-    return f"D^{text if plain else f'({text})'} {signal}"
+    is_simple = re.fullmatch(r"[\w.]+", text)
+    return f"D^{text if is_simple else f'({text})'} {signal}"
 
 
 @check_arguments
@@ -206,8 +206,8 @@ class Friction:
         Parameters must be fixed. Without a Stribeck term, fs is 0 and vs is 1.
         """
         stribeck_term = self.stribeck
-        near = (0.0, 1.0) if stribeck_term is None else (stribeck_term.strength or 0.0, float(stribeck_term.speed))
-        return (self.strength or 0.0, *near)
+        stribeck = (0.0, 1.0) if stribeck_term is None else (stribeck_term.strength or 0.0, float(stribeck_term.speed))
+        return (self.strength or 0.0, *stribeck)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -230,13 +230,13 @@ class Friction:
 
     @property
     def _parameters(self) -> list[str | float]:
-        own = self.stribeck
-        return [self.coefficient, *([] if own is None else [own.coefficient, own.speed])]
+        stribeck = self.stribeck
+        return [self.coefficient, *([] if stribeck is None else [stribeck.coefficient, stribeck.speed])]
 
     def with_numbers(self, values: Sequence[float]) -> Friction:
         """Return the friction with new parameter values, given in the sequence of :attr:`numbers`."""
-        coefficient, *near = values
-        stribeck_term = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
+        coefficient, *rest = values
+        stribeck_term = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=rest[0], speed=rest[1])
         return replace(self, coefficient=coefficient, more=stribeck_term)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
@@ -248,8 +248,8 @@ class Friction:
 
     def as_text(self, output: str) -> str:
         """Return the friction terms in the equation of an output as text."""
-        near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
-        return f"- {_format_coefficient(self.coefficient, self.factor)} sign(D {output}){near}"
+        stribeck = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
+        return f"- {_format_coefficient(self.coefficient, self.factor)} sign(D {output}){stribeck}"
 
 
 def _format_coefficient(coefficient: str | float, factor: float) -> str:
@@ -294,17 +294,17 @@ class Equation:
         if not self.terms:
             raise ModelError(f"the equation of {self.output} has no term; add at least one")
         names = list(self.coefficient_names)
-        twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
-        if twice is not None:
+        duplicate = next((n for i, n in enumerate(names) if n in names[:i]), None)
+        if duplicate is not None:
             raise ModelError(
-                f"coefficient {twice} occurs twice in the equation of {self.output}; give each its own name"
+                f"coefficient {duplicate} occurs twice in the equation of {self.output}; give each its own name"
             )
-        both = set(names) & set(self.order_names)
-        if both:
-            raise ModelError(f"{min(both)} names an order and a coefficient; rename one")
-        both = {self.output, *(signal for term in self.terms for signal in term.signals)} & set(self.order_names)
-        if both:
-            raise ModelError(f"{min(both)} names an order and a signal; rename the order")
+        duplicates = set(names) & set(self.order_names)
+        if duplicates:
+            raise ModelError(f"{min(duplicates)} names an order and a coefficient; rename one")
+        duplicates = {self.output, *(signal for term in self.terms for signal in term.signals)} & set(self.order_names)
+        if duplicates:
+            raise ModelError(f"{min(duplicates)} names an order and a signal; rename the order")
         if not self.order.names and not 0 < self.order.constant <= MAX_ORDER:
             raise ModelError(
                 f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 10]; choose another"
@@ -325,57 +325,57 @@ class Equation:
                 continue
             if term.order.names or self.order.names:
                 continue
-            own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
-            if own and not 0 <= order < alpha:
+            is_output, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
+            if is_output and not 0 <= order < alpha:
                 raise ModelError(
                     f"order {order:g} of a term of the output {self.output} is outside [0, {alpha:g}); lower it"
                 )
-            if not own and order < MIN_INPUT_ORDER:
+            if not is_output and order < MIN_INPUT_ORDER:
                 raise ModelError(f"order {order:g} of {term.signal} is below {MIN_INPUT_ORDER:g}; raise it")
-            if not own and order > MAX_ORDER:
+            if not is_output and order > MAX_ORDER:
                 raise ModelError(f"order {order:g} of {term.signal} is above {MAX_ORDER:g}; lower it")
 
         if self.friction is not None:
             self._check_friction(self.friction)
 
-    def _check_expression(self, term: Term, shape: Expression) -> None:
+    def _check_expression(self, term: Term, expression: Expression) -> None:
         """Raise ModelError if the order of a non-linear term, or of an output derivative in it, is out of range."""
-        words = f"{term} in the equation of {self.output}"
+        subject = f"{term} in the equation of {self.output}"
         if term.order.names or self.order.names:
             return
         alpha, order = self.order.constant, term.order.constant
         lowest = 0.0 if self.output in term.signals else MIN_INPUT_ORDER
         if not lowest <= order <= alpha:
             raise ModelError(
-                f"order {order:g} of the non-linear term {words} is outside [{lowest:g}, {alpha:g}]; change it"
+                f"order {order:g} of the non-linear term {subject} is outside [{lowest:g}, {alpha:g}]; change it"
             )
-        for signal, inner in shape.channels:
-            if signal == self.output and inner > alpha - order + ORDER_RESOLUTION:
+        for signal, inner_order in expression.channels:
+            if signal == self.output and inner_order > alpha - order + ORDER_RESOLUTION:
                 raise ModelError(
-                    f"{words} has the derivative of order {inner:g} of {signal}, above {alpha - order:g}: with the "
-                    f"order of the term, {order:g}, it exceeds alpha = {alpha:g}; lower it"
+                    f"{subject} has the derivative of order {inner_order:g} of {signal}, above {alpha - order:g}: with "
+                    f"the order of the term, {order:g}, it exceeds alpha = {alpha:g}; lower it"
                 )
 
     def _check_friction(self, friction: Friction) -> None:
         """Raise ModelError if friction adds energy, a parameter of it is out of range, or alpha is outside (1, 2]."""
-        words = f"friction in the equation of {self.output}"
+        subject = f"friction in the equation of {self.output}"
         terms: list[Friction | Stribeck] = [friction] if friction.stribeck is None else [friction, friction.stribeck]
         for term in terms:
             if not (math.isfinite(term.factor) and term.factor < 0):
                 raise ModelError(
-                    f"{words} has the factor {term.factor:g}, but friction dissipates energy: write "
+                    f"{subject} has the factor {term.factor:g}, but friction dissipates energy: write "
                     f"'- fc*sign(D {self.output})'"
                 )
             if term.strength is not None and not 0 <= term.strength < math.inf:
                 raise ModelError(
-                    f"{words} has the coefficient {term.coefficient!r}; give a value of at least 0: the term has the "
+                    f"{subject} has the coefficient {term.coefficient!r}; give a value of at least 0: the term has the "
                     "minus sign"
                 )
         if friction.stribeck is not None and not isinstance(friction.stribeck.speed, str):
             speed = friction.stribeck.speed
             if not 0 < speed < math.inf:
                 raise ModelError(
-                    f"{words} has the Stribeck speed vs = {speed:g}; give a positive one, in units of {self.output} "
+                    f"{subject} has the Stribeck speed vs = {speed:g}; give a positive one, in units of {self.output} "
                     "per s"
                 )
         if self.order.names:
@@ -383,8 +383,8 @@ class Equation:
         alpha = self.order.constant
         if not 1 < alpha <= 2:
             raise ModelError(
-                f"{words} requires an order alpha in (1, 2], not {alpha:g}, because it depends on the velocity; choose "
-                f"another order, or write '- fc*tanh(100 {self.output})' if {self.output} is itself a velocity"
+                f"{subject} requires an order alpha in (1, 2], not {alpha:g}, because it depends on the velocity; "
+                f"choose another order, or write '- fc*tanh(100 {self.output})' if {self.output} is itself a velocity"
             )
 
     def check_input_orders(self, outputs: Sequence[str]) -> None:
@@ -403,10 +403,10 @@ class Equation:
             is_fixed = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
             if is_fixed and item.order.constant >= self.order.constant - 1e-9:
                 terms = self.nonlinear_terms
-                follows, what = (f"the non-linear term {terms[0]}", "motion") if terms else ("friction", "velocity")
+                subject, quantity = (f"the non-linear term {terms[0]}", "motion") if terms else ("friction", "velocity")
                 raise ModelError(
                     f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, but "
-                    f"{follows} in the equation of {self.output} requires a continuous {what}; lower it"
+                    f"{subject} in the equation of {self.output} requires a continuous {quantity}; lower it"
                 )
 
     @property
@@ -470,9 +470,9 @@ class Equation:
 
     def as_text(self, inputs: Mapping[str, str]) -> str:
         """Return the equation as text; `inputs` maps the name of an input to its text with delay and non-linearity."""
-        right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
+        right_side = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
-        return f"{derivative(self.order, self.output)} = {right}{friction}"
+        return f"{derivative(self.order, self.output)} = {right_side}{friction}"
 
     def __str__(self) -> str:
         return self.as_text({})
@@ -485,10 +485,10 @@ def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> 
     """
     texts = inputs or {}
     parts = [f"{t.fixed or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]
-    right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
+    right_side = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
         fc, fs, vs = item.friction.law
-        right += f" - {fc:.6g} sign(D {item.output})"
+        right_side += f" - {fc:.6g} sign(D {item.output})"
         if item.friction.stribeck is not None:
-            right += f" - {fs:.6g} exp(-(D {item.output}/{vs:.6g})^2) sign(D {item.output})"
-    return f"{derivative(item.order, item.output)} = {right}"
+            right_side += f" - {fs:.6g} exp(-(D {item.output}/{vs:.6g})^2) sign(D {item.output})"
+    return f"{derivative(item.order, item.output)} = {right_side}"

@@ -174,8 +174,8 @@ class Expression:
             case "power":
                 base = self.arguments[0]
                 text = base.as_text(texts)
-                bare = base.operation in EXPRESSION_FUNCTIONS or (base.operation == "channel" and base.value == 0)
-                return f"{text if bare else f'({text})'}^{format_shortest(self.value)}"
+                is_atomic = base.operation in EXPRESSION_FUNCTIONS or (base.operation == "channel" and base.value == 0)
+                return f"{text if is_atomic else f'({text})'}^{format_shortest(self.value)}"
         return f"{self.operation}({self.arguments[0].as_text(texts)})"
 
     def _as_factor(self, texts: Mapping[str, str]) -> str:

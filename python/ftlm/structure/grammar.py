@@ -170,8 +170,8 @@ class EquationParser(TokenReader):
         Signals that are differentiated on the left-hand side are outputs.
         """
         outputs = {item.signal for item in self.left if item.order.names or item.order.constant}
-        late = next((signal for signal in self.delays if self.delays[signal] != 0.0 and signal in outputs), None)
-        signal = self._twice_delayed if late is None else late
+        output = next((signal for signal in self.delays if self.delays[signal] != 0.0 and signal in outputs), None)
+        signal = self._twice_delayed if output is None else output
         if signal is None:
             return
         reason = f"{signal} has two delays; give the input with the longer delay its own name"
@@ -205,11 +205,11 @@ class EquationParser(TokenReader):
         name: str | None = None
         if self._next_is("(") and not self._is_expression_group():
             self._take()
-            inner = self._sum(closed=True)
+            terms = self._sum(closed=True)
             self._expect(")")
             factor = self._divisors(factor)
-            return [replace(item, factor=factor * item.factor) for item in inner]
-        kind, value, at = self._peek()
+            return [replace(item, factor=factor * item.factor) for item in terms]
+        kind, value, position = self._peek()
         if kind == "name" and value != "D" and self._leibniz() is None and self._continues_after_name():
             name = value
             self._take()
@@ -220,27 +220,27 @@ class EquationParser(TokenReader):
                     "numbers first"
                 )
             if self._next_is("(") and self._is_plain_sum():
-                raise self._multiplied_sum(name, at)
-        begin = self._peek()[2]
+                raise self._multiplied_sum(name, position)
+        start = self._peek()[2]
         order, operand = self._operand()
         if isinstance(operand, str):
             return [ParsedTerm(self._divisors(factor), name, order, operand)]
-        scale, shape = operand.split_factor()
+        scale, expression = operand.split_factor()
         factor = self._divisors(factor * scale)
-        if shape.operation == "channel":
-            return [ParsedTerm(factor, name, order + Order(shape.value), shape.signal)]
-        if shape.is_linear:
-            if not shape.channels:
-                raise self._error(f"the term at character {begin + 1} is a constant without a signal; leave it out")
-            raise self._multiplied_sum(name or f"{factor:g}", at)
-        if len(shape.program({c: 0 for c in shape.channels})) > MAX_INSTRUCTIONS:
-            raise self._error(f"the non-linear term at character {begin + 1} has too many operations; shorten it")
-        return [ParsedTerm(factor, name, order, shape.channels[0][0], shape)]
+        if expression.operation == "channel":
+            return [ParsedTerm(factor, name, order + Order(expression.value), expression.signal)]
+        if expression.is_linear:
+            if not expression.channels:
+                raise self._error(f"the term at character {start + 1} is a constant without a signal; leave it out")
+            raise self._multiplied_sum(name or f"{factor:g}", position)
+        if len(expression.program({c: 0 for c in expression.channels})) > MAX_INSTRUCTIONS:
+            raise self._error(f"the non-linear term at character {start + 1} has too many operations; shorten it")
+        return [ParsedTerm(factor, name, order, expression.channels[0][0], expression)]
 
-    def _multiplied_sum(self, name: str, at: int) -> ModelError:
+    def _multiplied_sum(self, name: str, position: int) -> ModelError:
         return self._error(
-            f"{name} at character {at + 1} multiplies a sum; multiply it out, with a coefficient of its own in each "
-            "term"
+            f"{name} at character {position + 1} multiplies a sum; multiply it out, with a coefficient of its own in "
+            "each term"
         )
 
     def _numeric_factor(self, factor: float) -> float:
@@ -267,23 +267,23 @@ class EquationParser(TokenReader):
 
     def _is_offset(self) -> bool:
         """Whether the next term is an unknown constant (offset); raise ModelError for a known constant."""
-        (kind, value, at), (kind_after, symbol, _) = self._peek(), self._peek(1)
+        (kind, value, position), (kind_after, symbol, _) = self._peek(), self._peek(1)
         if not (kind_after == "end" or (kind_after == "symbol" and symbol in "+-=")):
             return False
         if kind == "number":
             raise self._error(
-                f"{value} at character {at + 1} is a constant without a signal; an offset is unknown: write '+ c' and "
-                "it is estimated, or subtract a known one from the run"
+                f"{value} at character {position + 1} is a constant without a signal; an offset is unknown: write '+ "
+                "c' and it is estimated, or subtract a known one from the run"
             )
         return kind == "name" and _OFFSET_PATTERN.fullmatch(value) is not None
 
     def _take_offset(self, sign: float, *, is_lhs: bool) -> None:
-        _, value, at = self._peek()
+        _, value, position = self._peek()
         if self.offset or sign < 0 or is_lhs:
             reason = "occurs twice" if self.offset else "has a sign, but the estimate of the constant includes the sign"
             reason = "is on the left-hand side" if is_lhs else reason
             raise self._error(
-                f"the offset {value!r} at character {at + 1} {reason}; write '+ c' once, on the right-hand side"
+                f"the offset {value!r} at character {position + 1} {reason}; write '+ c' once, on the right-hand side"
             )
         self.offset = "constant"
         self._take()
@@ -313,18 +313,18 @@ class EquationParser(TokenReader):
             if not depth or kind == "end":
                 return offset
 
-    def _has_power_or_function(self, end: int) -> bool:
-        """Whether the next `end` tokens contain a power or a function."""
-        return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
+    def _has_power_or_function(self, count: int) -> bool:
+        """Whether the next `count` tokens contain a power or a function."""
+        return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(count))
 
     def _is_plain_sum(self) -> bool:
         """Whether the next parentheses contain a sum without powers and functions, and no ``^`` or ``*`` follows."""
-        end, depth, signs = self._closing_distance(), 0, 0
-        for k in range(end):
+        count, depth, signs = self._closing_distance(), 0, 0
+        for k in range(count):
             value = self._peek(k)[1]
             depth += (value == "(") - (value == ")")
             signs += depth == 1 and k > 1 and value in "+-"
-        return signs > 0 and not self._has_power_or_function(end) and self._peek(end)[1] not in ("^", "*")
+        return signs > 0 and not self._has_power_or_function(count) and self._peek(count)[1] not in ("^", "*")
 
     def _is_expression_group(self) -> bool:
         """Whether parentheses after a number are a factor of a non-linear term, not a sum to multiply out.
@@ -332,45 +332,45 @@ class EquationParser(TokenReader):
         They are a factor if ``^`` or ``*`` follows. They are also a factor if they contain a power or function, and
         either a constant term or a second pair of parentheses around the whole sum.
         """
-        end = self._closing_distance()
-        if self._peek(end)[1] in ("^", "*"):
+        count = self._closing_distance()
+        if self._peek(count)[1] in ("^", "*"):
             return True
-        if not self._has_power_or_function(end):
+        if not self._has_power_or_function(count):
             return False
-        if self._next_is("(", "(") and self._closing_distance(1) == end - 1:
+        if self._next_is("(", "(") and self._closing_distance(1) == count - 1:
             return True
-        depth, pure = 0, False
-        for k in range(end):
+        depth, is_number = 0, False
+        for k in range(count):
             kind, value, _ = self._peek(k)
             depth += value == "("
-            if depth == 1 and (value in "(+-" or k == end - 1):
-                if pure and self._peek(k - 1)[0] == "number":
+            if depth == 1 and (value in "(+-" or k == count - 1):
+                if is_number and self._peek(k - 1)[0] == "number":
                     return True
-                pure = True
+                is_number = True
             else:
-                pure = pure and (kind == "number" or value in "^*/")
+                is_number = is_number and (kind == "number" or value in "^*/")
             depth -= value == ")"
         return False
 
     def _operand(self) -> tuple[Order, str | Expression]:
         """Parse a term after its coefficient; return (order, signal), or (order, expression) of a non-linear term."""
-        begin = self._position
+        start = self._position
         operator = self._operator()
         if operator is not None and self._next_is("("):
-            shape = self._group()
+            expression = self._group()
             if self._peek()[1] in ("^", "*"):
                 raise self._error(
                     f"{self._peek()[1]!r} at character {self._peek()[2] + 1} follows the derivative of an expression; "
                     "only signals and their derivatives are multiplied"
                 )
-            return operator, shape
-        self._position = begin
+            return operator, expression
+        self._position = start
         kind, value, _ = self._peek()
         if kind == "name" and not (value in FUNCTION_NAMES and self._peek(1)[1] == "("):
             order, signal = self._derivative()
             if self._peek()[1] not in ("^", "*"):
                 return order or Order(), signal
-            self._position = begin
+            self._position = start
         if kind == "symbol" and value != "(":
             raise self._syntax_error("the name of a signal")
         return Order(), self._product(divide=False)
@@ -394,10 +394,10 @@ class EquationParser(TokenReader):
             raise self._error(f"parentheses are nested more than {MAX_DEPTH} times; write the term with fewer")
         terms = self._expression()
         if self._peek()[0] == "name":
-            at = self._peek()[2]
+            position = self._peek()[2]
             raise self._error(
-                f"{self._peek()[1]!r} at character {at + 1} follows another name inside a non-linear term: write * "
-                "between signals; a free parameter inside one is not estimated: give its value"
+                f"{self._peek()[1]!r} at character {position + 1} follows another name inside a non-linear term: write "
+                "* between signals; a free parameter inside one is not estimated: give its value"
             )
         self._expect(")")
         self._depth -= 1
@@ -412,8 +412,8 @@ class EquationParser(TokenReader):
         factors = [self._power()]
         while True:
             kind, value, _ = self._peek()
-            number = factors[-1].operation == "constant"
-            if self._accept("*") or (number and (kind == "name" or value == "(")):
+            is_number = factors[-1].operation == "constant"
+            if self._accept("*") or (is_number and (kind == "name" or value == "(")):
                 factors.append(self._power())
             elif divide and value == "/":
                 if self._peek(1)[0] != "number":
@@ -427,8 +427,8 @@ class EquationParser(TokenReader):
 
     def _power(self) -> Expression:
         """Parse one factor of a product with its optional exponent, and return it."""
-        kind, value, at = self._peek()
-        derived = value == "D" or self._leibniz() is not None
+        kind, value, position = self._peek()
+        is_derivative = value == "D" or self._leibniz() is not None
         if kind == "number":
             self._take()
             base = constant(float(value))
@@ -440,12 +440,12 @@ class EquationParser(TokenReader):
             order, signal = self._derivative()
             if order is not None and order.names:
                 raise self._error(
-                    f"the order {order} at character {at + 1} is free inside a non-linear term; give its value"
+                    f"the order {order} at character {position + 1} is free inside a non-linear term; give its value"
                 )
-            if derived and self._next_is("^"):
-                whole = self._readable[at : self._peek()[2]].strip()
+            if is_derivative and self._next_is("^"):
+                text = self._readable[position : self._peek()[2]].strip()
                 raise self._error(
-                    f"a power of {whole} at character {self._peek()[2] + 1} has two meanings; write ({whole})^…"
+                    f"a power of {text} at character {self._peek()[2] + 1} has two meanings; write ({text})^…"
                 )
             base = channel(signal, 0.0 if order is None else order.constant)
         if not self._accept("^"):
@@ -456,20 +456,20 @@ class EquationParser(TokenReader):
         try:
             return power(base, sign * float(self._take()[1]))
         except ModelError as error:
-            raise self._error(f"at character {at + 1}: {error}") from error
+            raise self._error(f"at character {position + 1}: {error}") from error
 
     def _function(self) -> Expression:
         """Parse a function of an expression, and return it."""
-        _, name, at = self._take()
+        _, name, position = self._take()
         if name not in EXPRESSION_FUNCTIONS:
             reason = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
             friction = "; friction is '- fc*sign(D y)', and drag '- w abs(D y)*D y'" if name == "sign" else ""
-            raise self._error(f"{name}(…) at character {at + 1}: {reason}{friction}")
+            raise self._error(f"{name}(…) at character {position + 1}: {reason}{friction}")
         argument = self._group()
         try:
             return apply(name, argument)
         except ModelError as error:
-            raise self._error(f"at character {at + 1}: {error}") from error
+            raise self._error(f"at character {position + 1}: {error}") from error
 
     # ------------------------------------------------------------------------------------ derivatives and signals
 
@@ -490,10 +490,10 @@ class EquationParser(TokenReader):
 
     def _count_primes(self) -> int:
         """Parse primes after a signal, and return their number."""
-        begin = self._position
+        start = self._position
         while self._accept("'"):
             pass
-        return self._position - begin
+        return self._position - start
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
         """Return (order, signal, number of tokens) of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
@@ -582,7 +582,7 @@ class EquationParser(TokenReader):
 
     def _take_friction(self, sign: float) -> bool:
         """Parse and store ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
-        begin, number, name = self._position, 1.0, None
+        start, number, name = self._position, 1.0, None
         if self._peek()[0] == "number":
             number = float(self._take()[1])
             self._accept("*")
@@ -590,12 +590,12 @@ class EquationParser(TokenReader):
             name = self._take()[1]
             self._accept("*")
         # The exponential factor of Stribeck friction stands before sign(D y).
-        end = self._closing_distance(1) if self._next_is("exp", "(") else 0
-        has_factor = end > 0 and self._peek(end + (self._peek(end)[1] == "*"))[1] == "sign"
+        count = self._closing_distance(1) if self._next_is("exp", "(") else 0
+        has_factor = count > 0 and self._peek(count + (self._peek(count)[1] == "*"))[1] == "sign"
         if not has_factor and not self._next_is("sign", "("):
-            self._position = begin
+            self._position = start
             return False
-        near = self._stribeck_factor() if has_factor else None
+        factor = self._stribeck_factor() if has_factor else None
         self._accept("*")
         self._take()
         self._expect("(")
@@ -608,21 +608,22 @@ class EquationParser(TokenReader):
             )
         signal = self._velocity("D and the name of a signal, as in sign(D y)")
         self._expect(")")
-        if near is not None and near[0] != signal:
+        if factor is not None and factor[0] != signal:
+            speed = factor[0]
             raise self._error(
-                f"Stribeck friction has the speed of {near[0]} and the sign of {signal}; use the same velocity in both"
+                f"Stribeck friction has the speed of {speed} and the sign of {signal}; use the same velocity in both"
             )
         if sign > 0:
-            shape = "fc*" if near is None else f"fs*exp(-(D {signal}/vs)^2)*"
-            raise self._error(f"friction dissipates energy, so it is subtracted: write '- {shape}sign(D {signal})'")
-        if (self.friction if near is None else self.stribeck) is not None:
-            which = "friction" if near is None else "Stribeck friction"
-            raise self._error(f"{which} of D {signal} occurs twice; write it once")
+            prefix = "fc*" if factor is None else f"fs*exp(-(D {signal}/vs)^2)*"
+            raise self._error(f"friction dissipates energy, so it is subtracted: write '- {prefix}sign(D {signal})'")
+        if (self.friction if factor is None else self.stribeck) is not None:
+            subject = "friction" if factor is None else "Stribeck friction"
+            raise self._error(f"{subject} of D {signal} occurs twice; write it once")
         strength: tuple[str | float, float] = (name, sign * number) if name is not None else (number, sign)
-        if near is None:
+        if factor is None:
             self.friction = Friction(*strength), signal
         else:
-            self.stribeck = Stribeck(strength[0], near[1], strength[1]), signal
+            self.stribeck = Stribeck(strength[0], factor[1], strength[1]), signal
         return True
 
     def _stribeck_factor(self) -> tuple[str, str | float]:
@@ -642,9 +643,9 @@ class EquationParser(TokenReader):
 
     def _velocity(self, expectation: str) -> str:
         """Parse ``D y``, ``y'`` or ``dy/dt``, and return the signal; `expectation` is the text of the syntax error."""
-        begin, (order, signal) = self._position, self._derivative() if self._peek()[0] == "name" else (None, "")
+        start, (order, signal) = self._position, self._derivative() if self._peek()[0] == "name" else (None, "")
         if order is None:
-            self._position = begin
+            self._position = start
             raise self._syntax_error(expectation)
         if order != Order(1.0):
             raise self._error(f"friction depends on the first derivative; write sign(D {signal}) for the velocity")
@@ -660,16 +661,16 @@ class EquationParser(TokenReader):
         values = [value for _, value, _ in self._tokens]
         if values.count("=") != 1:
             return False
-        at = values.index("=")
+        equals = values.index("=")
         signal = rf"{IDENTIFIER_PATTERN}( \( s \))?"
-        if not re.fullmatch(rf"{signal}( / {signal})?", " ".join(values[:at])):
+        if not re.fullmatch(rf"{signal}( / {signal})?", " ".join(values[:equals])):
             return False
         last = len(values) - 1
         # The s of u(s), the unit in u(t - 0.1 s) and a last token s, which is a signal, do not count.
         return any(
             values[k] == "s" and k != last and values[k - 1] != "(" and values[k - 3 : k - 1] != ["t", "-"]
-            for k in range(at + 1, len(values))
-        ) or any(values[k : k + 2] == ["(", "s"] and values[k + 2 : k + 3] != [")"] for k in range(at, len(values)))
+            for k in range(equals + 1, len(values))
+        ) or any(values[k : k + 2] == ["(", "s"] and values[k + 2 : k + 3] != [")"] for k in range(equals, len(values)))
 
     def _transfer(self) -> None:
         """Parse transfer functions, multiply the equation by all denominators, and store the terms of both sides."""
@@ -678,22 +679,22 @@ class EquationParser(TokenReader):
         self._expect("=")
         paths: list[tuple[SymbolicPolynomial, SymbolicPolynomial, str]] = []
         for sign in self._signs():
-            top, bottom, delay, inner = self._ratio(common)
-            signal = common or inner or self._laplace_signal()
+            num, den, delay, named_input = self._ratio(common)
+            signal = common or named_input or self._laplace_signal()
             self.delays[signal] = delay
             if any(signal == other for _, _, other in paths):
                 raise self._error(f"{signal} occurs twice; combine its terms into one transfer function")
-            paths.append(([(sign * c, n, o) for c, n, o in top], bottom, signal))
+            paths.append(([(sign * c, n, o) for c, n, o in num], den, signal))
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
         denominators: list[SymbolicPolynomial] = []
-        for _, bottom, _ in paths:
-            if bottom not in denominators:
-                denominators.append(bottom)
-        whole = functools.reduce(self._times, denominators, UNIT_POLYNOMIAL)
-        self.left = [ParsedTerm(c, n, o, output) for c, n, o in whole]
-        for top, own, signal in paths:
-            scaled = functools.reduce(self._times, [bottom for bottom in denominators if bottom != own], top)
+        for _, den, _ in paths:
+            if den not in denominators:
+                denominators.append(den)
+        product = functools.reduce(self._times, denominators, UNIT_POLYNOMIAL)
+        self.left = [ParsedTerm(c, n, o, output) for c, n, o in product]
+        for num, path_den, signal in paths:
+            scaled = functools.reduce(self._times, [den for den in denominators if den != path_den], num)
             self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
     def _laplace_signal(self) -> str:
@@ -712,7 +713,7 @@ class EquationParser(TokenReader):
 
         `common` is u in the form ``y/u = …``.
         """
-        top, bottom, divides, begin = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, self._position
+        num, den, divides, start = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, self._position
         delay: Value = 0.0
         signal: str | None = None
         while True:
@@ -723,28 +724,28 @@ class EquationParser(TokenReader):
             elif not (common or signal or divides) and value != "sqrt" and symbols == ["(", "s", ")"]:
                 signal = self._laplace_signal()
             elif not divides and self._ends_ratio(kind, value, symbols, is_named=common is None and signal is None):
-                return top, bottom, delay, signal
+                return num, den, delay, signal
             elif not divides and (kind == "end" or value in "+-"):
-                raise self._missing_input(begin)
+                raise self._missing_input(start)
             elif divides:
-                bottom = self._times(bottom, self._factor())
+                den = self._times(den, self._factor())
             else:
-                top = self._times(top, self._factor())
+                num = self._times(num, self._factor())
             divides = self._accept("/")
             if not divides:
                 self._accept("*")
 
-    def _missing_input(self, begin: int) -> ModelError:
-        """Return the error for a transfer function without an input at its end; `begin` is its first token."""
-        words = "the transfer function has no input at its end; write "
-        factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[begin : self._position])
+    def _missing_input(self, start: int) -> ModelError:
+        """Return the error for a transfer function without an input at its end; `start` is its first token."""
+        text = "the transfer function has no input at its end; write "
+        factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[start : self._position])
         names = [token for token in factors if token[0] == "name" and token[1] not in ("s", "e", "exp", "sqrt")]
         if names:
-            _, name, at = names[-1]
-            before = self._readable[self._tokens[begin][2] : at].rstrip("* ") or "1"
-            after = self._readable[at + len(name) : self._peek()[2]].strip()
-            words += f"{f'{before}{after} {name}'!r} if {name} is the input, and otherwise "
-        return self._error(f"{words}both signals, as in 'y = 2/(s + 3) u' or 'y/u = 2/(s + 3)'")
+            _, name, position = names[-1]
+            before = self._readable[self._tokens[start][2] : position].rstrip("* ") or "1"
+            after = self._readable[position + len(name) : self._peek()[2]].strip()
+            text += f"{f'{before}{after} {name}'!r} if {name} is the input, and otherwise "
+        return self._error(f"{text}both signals, as in 'y = 2/(s + 3) u' or 'y/u = 2/(s + 3)'")
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
@@ -760,19 +761,19 @@ class EquationParser(TokenReader):
 
     def _exponential(self) -> Value:
         """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s] or its (lower, upper) bounds."""
-        _, value, at = self._take()
+        _, value, position = self._take()
         if value == "e":
             self._take()
-        close = {"(": ")", "{": "}"}.get(self._take()[1])
-        if close is None or not self._accept("-") or self._peek()[0] != "number":
+        closing = {"(": ")", "{": "}"}.get(self._take()[1])
+        if closing is None or not self._accept("-") or self._peek()[0] != "number":
             raise self._error(
-                f"an exponential at character {at + 1} is a delay; write a number, as in e^(-0.1 s), or bounds of an "
-                "estimate, as in e^(-0:0.5 s)"
+                f"an exponential at character {position + 1} is a delay; write a number, as in e^(-0.1 s), or bounds "
+                "of an estimate, as in e^(-0:0.5 s)"
             )
         delay = self._value("a delay [s], or LEAST:LARGEST where it is estimated")
         self._accept("*")
         self._expect("s")
-        self._expect(close)
+        self._expect(closing)
         return delay
 
     def _polynomial(self) -> SymbolicPolynomial:
@@ -792,10 +793,10 @@ class EquationParser(TokenReader):
 
     def _factor(self) -> SymbolicPolynomial:
         """Parse one factor of a transfer function, and return it as a polynomial in s."""
-        kind, value, at = self._peek()
+        kind, value, position = self._peek()
         if kind == "number":
             self._take()
-            inner: SymbolicPolynomial = [(float(value), None, Order())]
+            base: SymbolicPolynomial = [(float(value), None, Order())]
         elif value == "sqrt" and self._next_is("sqrt", "(", "s", ")"):
             self._position += 4
             return [(1.0, None, Order(0.5))]
@@ -803,21 +804,21 @@ class EquationParser(TokenReader):
             self._take()
             if value == "s":
                 return [(1.0, None, self._order() if self._accept("^") else Order(1.0))]
-            inner = [(1.0, value, Order())]
+            base = [(1.0, value, Order())]
         elif self._accept("("):
-            inner = self._polynomial()
+            base = self._polynomial()
             self._expect(")")
         else:
             raise self._syntax_error("a number, a coefficient, s or (…)")
         if not self._accept("^"):
-            return inner
-        kind, value, at = self._take()
+            return base
+        kind, value, position = self._take()
         if not (kind == "number" and value.isdigit() and 1 <= int(value) <= MAX_POLYNOMIAL_POWER):
             raise self._error(
-                f"the power {value!r} of a polynomial at character {at + 1} is not a whole number from 1 to "
+                f"the power {value!r} of a polynomial at character {position + 1} is not a whole number from 1 to "
                 f"{MAX_POLYNOMIAL_POWER}; only these give a sum of powers of s"
             )
-        return functools.reduce(self._times, [inner] * int(value), UNIT_POLYNOMIAL)
+        return functools.reduce(self._times, [base] * int(value), UNIT_POLYNOMIAL)
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
         """Return the product of two polynomials in s; terms with the same power and coefficient names are combined."""
@@ -838,7 +839,7 @@ class EquationParser(TokenReader):
 def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
     """Return a polynomial in which terms of equal order with numeric coefficients are combined."""
     sums: dict[object, tuple[float, str | None, Order]] = {}
-    for place, (c, name, order) in enumerate(terms):
-        key = order if name is None else place
+    for index, (c, name, order) in enumerate(terms):
+        key = order if name is None else index
         sums[key] = (sums[key][0] + c if key in sums else c, name, order)
     return list(sums.values())

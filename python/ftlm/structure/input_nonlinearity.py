@@ -86,25 +86,25 @@ class InputNonlinearity:
     value: Value
 
     def __post_init__(self) -> None:
-        words, least = (
+        subject, relation = (
             f"{INPUT_EFFECT_LABELS[self.law]} of {self.signal}",
             "above" if self.law == "saturation" else "from",
         )
         if isinstance(self.value, (tuple, list)):
             if len(self.value) != 2:
                 raise ModelError(
-                    f"{words} = {self.value!r} has {len(self.value)} values; give one, or (minimum, maximum)"
+                    f"{subject} = {self.value!r} has {len(self.value)} values; give one, or (minimum, maximum)"
                 )
-            low, high = (real_number(f"{words}", v) for v in self.value)
+            low, high = (real_number(f"{subject}", v) for v in self.value)
             if not 0 <= low < high < math.inf:
                 raise ModelError(
-                    f"{words} from {low} to {high} is not an interval; give two increasing values of at least 0"
+                    f"{subject} from {low} to {high} is not an interval; give two increasing values of at least 0"
                 )
             return
-        value = real_number(words, self.value)
+        value = real_number(subject, self.value)
         if not (0 <= value < math.inf and (value > 0 or self.law == "dead_zone")):
             raise ModelError(
-                f"{words} = {self.value} is out of range; give a number {least} 0, in the unit of {self.signal}"
+                f"{subject} = {self.value} is out of range; give a number {relation} 0, in the unit of {self.signal}"
             )
 
     @property
@@ -135,8 +135,8 @@ class InputNonlinearity:
 
         `digits` is a format specification for numbers; ``"r"`` gives all digits.
         """
-        ends = self.value if isinstance(self.value, tuple) else (self.value,)
-        texts = [repr(float(v)) if digits == "r" else format(v, digits) for v in ends]
+        values = self.value if isinstance(self.value, tuple) else (self.value,)
+        texts = [repr(float(v)) if digits == "r" else format(v, digits) for v in values]
         return f"{INPUT_EFFECT_ABBREVIATIONS[self.law]}({inner}, {':'.join(texts)})"
 
 
@@ -172,16 +172,17 @@ def check_nonlinearities(
             raise ModelError(f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is given twice; give it once")
         if limit.free is None:
             continue
-        name, words = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is free"
+        name, subject = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is free"
         other = next((o for o in limits if o.signal == name and o is not limit), None)
         if name in free_delays or (other is not None and other.free is not None):
-            second = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.law]
+            other_label = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.law]
             raise ModelError(
-                f"{words}, and so is its {second}; only one parameter of an input can be estimated: give the other one"
+                f"{subject}, and so is its {other_label}; only one parameter of an input can be estimated: give the "
+                "other one"
             )
         if delays.get(name):
-            raise ModelError(f"{words}, and {name} has a delay; shift the input by it, or give the limit")
+            raise ModelError(f"{subject}, and {name} has a delay; shift the input by it, or give the limit")
         if other is not None and limit.law == "dead_zone":
             raise ModelError(
-                f"{words}, and {name} saturates after it; free the saturation instead, or give both values"
+                f"{subject}, and {name} saturates after it; free the saturation instead, or give both values"
             )

@@ -118,8 +118,8 @@ class Order:
 
 def format_shortest(value: float) -> str:
     """Return a number as text: with six significant digits if they are exact, otherwise with all digits."""
-    short = f"{value:g}"
-    return short if float(short) == value else repr(value)
+    text = f"{value:g}"
+    return text if float(text) == value else repr(value)
 
 
 def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:

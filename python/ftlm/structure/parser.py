@@ -113,8 +113,8 @@ def equation(
     lines = [line for line in re.split(r"[;\n]", text) if line.strip()]
     if not lines:
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
-    parsed = _parse_lines(lines)
-    equations = [_equation_of(words) for words in parsed]
+    parsers = _parse_lines(lines)
+    equations = [_equation_of(parser) for parser in parsers]
     fixed = dict(fixed or {})
     check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
@@ -130,10 +130,10 @@ def equation(
             coupling=coupling,
             initial=check_initial(initial),
             sensor_filter=sensor_filter,
-            offset=_offset_of(list(zip(equations, (words.offset for words in parsed), strict=True)), offset),
-            input_nonlinearities=_merge_nonlinearities(parsed) or UNSET,
+            offset=_offset_of(list(zip(equations, (parser.offset for parser in parsers), strict=True)), offset),
+            input_nonlinearities=_merge_nonlinearities(parsers) or UNSET,
         )
-        .with_delays(_merge_delays(parsed, delay or {}))
+        .with_delays(_merge_delays(parsers, delay or {}))
         .with_orders(orders or {})
     )
     return structure.with_limits(saturation=saturation, dead_zone=dead_zone)
@@ -159,152 +159,154 @@ def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
 
     The first name in a product is a coefficient, unless it denotes a signal elsewhere in the texts.
     """
-    parsed = [EquationParser(line).parse() for line in lines]
-    items = [item for words in parsed for item in (*words.left, *words.right)]
+    parsers = [EquationParser(line).parse() for line in lines]
+    items = [item for parser in parsers for item in (*parser.left, *parser.right)]
     signals = {signal for item in items for signal in item.signals}
     if any(item.name in signals for item in items):
-        parsed = [EquationParser(line, signals).parse() for line in lines]
-    return parsed
+        parsers = [EquationParser(line, signals).parse() for line in lines]
+    return parsers
 
 
-def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
+def _offset_of(options: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
     """Return the offset option: `offset` if given, otherwise the common option of all equation texts.
 
-    `parsed` has pairs (equation, option in its text). Raise ModelError if the options contradict each other.
+    `options` has pairs (equation, option in its text). Raise ModelError if the options contradict each other.
     """
-    pairs = [(item.output, has_offset) for item, has_offset in parsed if has_offset]
+    pairs = [(item.output, option) for item, option in options if option]
     if offset is not None:
         if pairs and check_offset(offset) == "none":
             raise ModelError(
                 f"the equation of {pairs[0][0]} has an offset, but {parameter('offset', 'none')}; leave one of them out"
             )
         return check_offset(offset)
-    without = [item.output for item, has_offset in parsed if not has_offset]
-    if pairs and without:
+    outputs_without = [item.output for item, option in options if not option]
+    if pairs and outputs_without:
         raise ModelError(
-            f"the equation of {pairs[0][0]} has an offset, that of {without[0]} has none; write + c in "
+            f"the equation of {pairs[0][0]} has an offset, that of {outputs_without[0]} has none; write + c in "
             "each equation (its estimate shows whether it is 0), or in none"
         )
-    kinds = {has_offset for _, has_offset in pairs}
+    kinds = {option for _, option in pairs}
     if len(kinds) > 1:
         raise ModelError("one equation has a constant offset and another one a ramp; write the same offset in each")
     return check_offset(pairs[0][1] or "none") if pairs else "none"
 
 
-def _equation_of(words: EquationParser) -> Equation:
+def _equation_of(parser: EquationParser) -> Equation:
     """Return a parsed equation, solved for its leading derivative.
 
     The leading derivative is the highest one on the left-hand side, or the first one if an order there is free. Raise
     ModelError if there is no derivative, or terms of the solved equation would not have one coefficient each.
     """
-    linear = [item for item in words.left if item.expression is None]
+    linear = [item for item in parser.left if item.expression is None]
     derivatives = [item for item in linear if item.order.names or item.order.constant != 0]
     if not derivatives:
         output = linear[0].signal if linear else "y"
         raise ModelError(
-            f"equation {words.text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …', or "
+            f"equation {parser.text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …', or "
             "in s, as in 'y = 2/(s^1.5 + 3) u'"
         )
-    first = derivatives[0]
+    lead = derivatives[0]
     if not any(item.order.names for item in derivatives):
-        first = max(derivatives, key=lambda item: item.order.constant)
-    reason = _division_reason(words, first)
+        lead = max(derivatives, key=lambda item: item.order.constant)
+    reason = _division_reason(parser, lead)
     if reason:
-        raise ModelError(f"equation {words.text!r}: {reason}; write {_divided_equation(words, first)}")
-    leading, rest = 0.0, []
-    for side, items in ((-1.0, words.left), (1.0, words.right)):
+        raise ModelError(f"equation {parser.text!r}: {reason}; write {_divided_equation(parser, lead)}")
+    divisor, others = 0.0, []
+    for sign, items in ((-1.0, parser.left), (1.0, parser.right)):
         for item in items:
-            if replace(item, factor=first.factor) == first:
-                leading -= side * item.factor
+            if replace(item, factor=lead.factor) == lead:
+                divisor -= sign * item.factor
             else:
-                rest.append((side, item))
-    if leading == 0:
+                others.append((sign, item))
+    if divisor == 0:
         raise ModelError(
-            f"equation {words.text!r}: {derivative(first.order, first.signal)} cancels out; leave it out, or correct a "
+            f"equation {parser.text!r}: {derivative(lead.order, lead.signal)} cancels out; leave it out, or correct a "
             "sign"
         )
     terms = []
-    for side, item in rest:
-        factor = side * item.factor / leading
-        shape = item.expression or UNSET
+    for sign, item in others:
+        factor = sign * item.factor / divisor
+        expression = item.expression or UNSET
         if item.name is None:
-            terms.append(Term(item.signal, item.order, factor, expression=shape))
+            terms.append(Term(item.signal, item.order, factor, expression=expression))
         else:
-            terms.append(Term(item.signal, item.order, item.name, factor, expression=shape))
-    return Equation(first.signal, first.order, tuple(terms), _friction_of(words, first.signal, leading) or UNSET)
+            terms.append(Term(item.signal, item.order, item.name, factor, expression=expression))
+    return Equation(lead.signal, lead.order, tuple(terms), _friction_of(parser, lead.signal, divisor) or UNSET)
 
 
-def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
+def _division_reason(parser: EquationParser, lead: ParsedTerm) -> str | None:
     """Return, as text, why the solved equation would not have one coefficient per term; None if it would.
 
-    `first` is the leading derivative.
+    `lead` is the leading derivative.
     """
-    linear = [item for item in (*words.left, *words.right) if item.expression is None]
-    leading = [i for i in linear if i in words.left and (i.signal, i.order) == (first.signal, first.order)]
-    named = next((item.name for item in leading if item.name), None)
-    if named is not None:
-        return f"{named} multiplies the highest derivative"
+    linear = [item for item in (*parser.left, *parser.right) if item.expression is None]
+    leads = [i for i in linear if i in parser.left and (i.signal, i.order) == (lead.signal, lead.order)]
+    name = next((item.name for item in leads if item.name), None)
+    if name is not None:
+        return f"{name} multiplies the highest derivative"
     names = [item.name for item in linear if item.name]
     product = next((name for name in names if "*" in name), None)
     if product is not None:
         return f"{product} is a product of coefficients"
-    twice = next((name for name in names if words.is_transfer and names.count(name) > 1), None)
-    return twice and f"{twice} occurs in several terms after multiplication"
+    duplicate = next((name for name in names if parser.is_transfer and names.count(name) > 1), None)
+    return duplicate and f"{duplicate} occurs in several terms after multiplication"
 
 
-def _divided_equation(words: EquationParser, first: ParsedTerm) -> str:
+def _divided_equation(parser: EquationParser, lead: ParsedTerm) -> str:
     """Return, for an error message, the text of an equation divided by the coefficient of its leading derivative.
 
     Every term has one new coefficient. The text ends with the definitions of the new coefficients by the old ones.
     """
     sums: dict[tuple[str, str], list[tuple[float, str | None]]] = {}
-    for side, items in ((-1.0, words.left), (1.0, words.right)):
+    for sign, items in ((-1.0, parser.left), (1.0, parser.right)):
         for item in items:
-            text = derivative(item.order, _signal_text(words, item.signal))
+            text = derivative(item.order, _signal_text(parser, item.signal))
             if item.expression is not None:
                 text = f"({item.expression.as_text()})"
-            sums.setdefault((item.signal, text), []).append((side * item.factor, item.name))
-    divisor = [(-c, name) for c, name in sums.pop((first.signal, derivative(first.order, first.signal)))]
-    used = {name for item in (*words.left, *words.right) for name in (*item.signals, *(item.name or "").split("*"))}
+            sums.setdefault((item.signal, text), []).append((sign * item.factor, item.name))
+    divisor = [(-c, name) for c, name in sums.pop((lead.signal, derivative(lead.order, lead.signal)))]
+    used_names = {
+        name for item in (*parser.left, *parser.right) for name in (*item.signals, *(item.name or "").split("*"))
+    }
     counts = {"a": itertools.count(), "b": itertools.count()}
     terms: list[str] = []
-    meanings: list[str] = []
+    definitions: list[str] = []
     for (signal, text), quotient in reversed(sums.items()):
         if all(name is None for _, name in (*quotient, *divisor)):
             terms.insert(0, f"{sum(c for c, _ in quotient) / sum(c for c, _ in divisor):g} {text}")
             continue
-        letter = "a" if signal == first.signal else "b"
-        name = next(name for k in counts[letter] if (name := f"{letter}{k}") not in used)
+        letter = "a" if signal == lead.signal else "b"
+        name = next(name for k in counts[letter] if (name := f"{letter}{k}") not in used_names)
         terms.insert(0, f"{name} {text}")
-        meanings.insert(0, f"{name} = {_quotient_text(quotient, divisor)}")
-    right = " + ".join(terms).replace("+ -", "- ") or "0"
+        definitions.insert(0, f"{name} = {_quotient_text(quotient, divisor)}")
+    right_side = " + ".join(terms).replace("+ -", "- ") or "0"
     scaled = []
-    forces = [pair for pair in (words.friction, words.stribeck) if pair is not None]
+    forces = [pair for pair in (parser.friction, parser.stribeck) if pair is not None]
     for force, signal in forces:
-        right += f" {force.as_text(signal)}"
+        right_side += f" {force.as_text(signal)}"
         scaled += [force.coefficient] if isinstance(force.coefficient, str) else []
-    right += {"constant": " + c", "ramp": " + (c + ramp t)"}.get(words.offset or "", "")
+    right_side += {"constant": " + c", "ramp": " + (c + ramp t)"}.get(parser.offset or "", "")
     if divisor != [(1.0, None)]:
-        scaled += ["c"] if words.offset else []
-        meanings += [f"{name} has become {_quotient_text([(1.0, name)], divisor)}" for name in scaled]
-    return f"'{derivative(first.order, first.signal)} = {right}', where {', '.join(meanings)}"
+        scaled += ["c"] if parser.offset else []
+        definitions += [f"{name} has become {_quotient_text([(1.0, name)], divisor)}" for name in scaled]
+    return f"'{derivative(lead.order, lead.signal)} = {right_side}', where {', '.join(definitions)}"
 
 
-def _signal_text(words: EquationParser, signal: str) -> str:
+def _signal_text(parser: EquationParser, signal: str) -> str:
     """Return the text of a signal with its delay, saturation and dead zone in a parsed equation."""
 
     def value_text(value: Value) -> str:
         return ":".join(f"{v:g}" for v in ((value,) if isinstance(value, (int, float)) else value))
 
-    delay = words.delays.get(signal, 0.0)
+    delay = parser.delays.get(signal, 0.0)
     text = signal if delay == 0.0 else f"{signal}(t - {value_text(delay)})"
     for kind in NONLINEARITY_KINDS:
-        if (signal, kind) in words.limits:
-            text = f"{INPUT_EFFECT_ABBREVIATIONS[kind]}({text}, {value_text(words.limits[signal, kind])})"
+        if (signal, kind) in parser.limits:
+            text = f"{INPUT_EFFECT_ABBREVIATIONS[kind]}({text}, {value_text(parser.limits[signal, kind])})"
     return text
 
 
-def _quotient_text(above: Sequence[tuple[float, str | None]], below: Sequence[tuple[float, str | None]]) -> str:
+def _quotient_text(num: Sequence[tuple[float, str | None]], den: Sequence[tuple[float, str | None]]) -> str:
     """Return the quotient of two sums as text; each term of a sum is a (number, product of names) pair."""
 
     def product_text(factor: float, name: str | None) -> str:
@@ -316,66 +318,68 @@ def _quotient_text(above: Sequence[tuple[float, str | None]], below: Sequence[tu
         text = " + ".join("-" * (c == -1.0 and n is not None) + product_text(c, n) for c, n in terms)
         return text.replace("+ -", "- ")
 
-    top, bottom = sum_text(above), sum_text(below)
-    if list(below) == [(1.0, None)]:
-        return top
-    top = f"({top})" if len(above) > 1 else top
-    return f"{top}/{bottom}" if re.fullmatch(r"\w+", bottom) else f"{top}/({bottom})"
+    num_text, den_text = sum_text(num), sum_text(den)
+    if list(den) == [(1.0, None)]:
+        return num_text
+    num_text = f"({num_text})" if len(num) > 1 else num_text
+    return f"{num_text}/{den_text}" if re.fullmatch(r"\w+", den_text) else f"{num_text}/({den_text})"
 
 
-def _friction_of(words: EquationParser, output: str, leading: float) -> Friction | None:
+def _friction_of(parser: EquationParser, output: str, divisor: float) -> Friction | None:
     """Return the friction of an equation, divided by the factor of its leading derivative; None without friction.
 
     Raise ModelError for friction of a signal other than the output, and for Stribeck without Coulomb friction.
     """
-    for pair in (words.friction, words.stribeck):
+    for pair in (parser.friction, parser.stribeck):
         if pair is not None and pair[1] != output:
             raise ModelError(
-                f"equation {words.text!r}: friction opposes the velocity of the output of the equation, which is "
+                f"equation {parser.text!r}: friction opposes the velocity of the output of the equation, which is "
                 f"{output}, not {pair[1]}; the sign of a measured velocity is the signal coulomb_{pair[1]}"
             )
-    if words.friction is None:
-        if words.stribeck is None:
+    if parser.friction is None:
+        if parser.stribeck is None:
             return None
         raise ModelError(
-            f"equation {words.text!r}: Stribeck friction is the excess of friction near rest over Coulomb friction; "
+            f"equation {parser.text!r}: Stribeck friction is the excess of friction near rest over Coulomb friction; "
             f"add '- fc*sign(D {output})', or '- 0*sign(D {output})' without Coulomb friction"
         )
-    scaled = replace(words.friction[0], factor=words.friction[0].factor / leading)
-    if words.stribeck is None:
+    scaled = replace(parser.friction[0], factor=parser.friction[0].factor / divisor)
+    if parser.stribeck is None:
         return scaled
-    return replace(scaled, more=replace(words.stribeck[0], factor=words.stribeck[0].factor / leading))
+    return replace(scaled, more=replace(parser.stribeck[0], factor=parser.stribeck[0].factor / divisor))
 
 
-def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
+def _merge_nonlinearities(parsers: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
     """Return the saturations and dead zones in all equation texts; raise ModelError if texts differ for an input."""
     limits: dict[tuple[str, NonlinearityKind], Value] = {}
-    for key, limit in chain.from_iterable(words.limits.items() for words in parsed):
+    for key, limit in chain.from_iterable(parser.limits.items() for parser in parsers):
         if limits.setdefault(key, limit) != limit:
             raise ModelError(
                 f"{key[0]} has two different saturations or two different dead zones in these equations; use one"
             )
-    bare = {signal for words in parsed for signal in words.plain}
-    both = next((signal for signal, _ in limits if signal in bare), None)
-    if both is not None:
+    unlimited = {signal for parser in parsers for signal in parser.plain}
+    conflict = next((signal for signal, _ in limits if signal in unlimited), None)
+    if conflict is not None:
         raise ModelError(
-            f"{both} occurs with and without its limit, but an actuator limits all of its effects; limit it in each "
-            "term, or give the limited input as another signal of the run"
+            f"{conflict} occurs with and without its limit, but an actuator limits all of its effects; limit it in "
+            "each term, or give the limited input as another signal of the run"
         )
     return tuple(sort_nonlinearities([InputNonlinearity(s, law, value) for (s, law), value in limits.items()]))
 
 
-def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
+def _merge_delays(parsers: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
     """Return the delays in all equation texts and in the argument, by input; raise ModelError if an input has two."""
     delays: dict[str, Value] = {}
-    for signal, delay in chain.from_iterable(words.delays.items() for words in parsed):
+    for signal, delay in chain.from_iterable(parser.delays.items() for parser in parsers):
         if delays.setdefault(signal, delay) != delay:
             raise ModelError(
                 f"{signal} has two delays in these equations; give the input with the longer delay its own name, "
                 "and its own signal in the run"
             )
-    late = {signal: delay for signal, delay in delays.items() if delay != 0.0}
-    twice = next((signal for signal in explicit_delays if signal in late), None)
-    if twice is not None:
-        raise ModelError(f"the delay of {twice} is in the equation and in {parameter('delay')}; leave one of them out")
-    return {**late, **explicit_delays}
+    nonzero_delays = {signal: delay for signal, delay in delays.items() if delay != 0.0}
+    duplicate = next((signal for signal in explicit_delays if signal in nonzero_delays), None)
+    if duplicate is not None:
+        raise ModelError(
+            f"the delay of {duplicate} is in the equation and in {parameter('delay')}; leave one of them out"
+        )
+    return {**nonzero_delays, **explicit_delays}

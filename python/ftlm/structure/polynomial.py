@@ -11,11 +11,11 @@ Polynomial: TypeAlias = dict[float, float]
 POWER_TOLERANCE = 1e-9
 
 
-def add_polynomial(into: Polynomial, summand: Polynomial, factor: float = 1.0) -> None:
-    """Add `factor` times the polynomial `summand` to the polynomial `into` in place; nearly equal powers are merged."""
+def add_polynomial(target: Polynomial, summand: Polynomial, factor: float = 1.0) -> None:
+    """Add `factor` times the polynomial `summand` to the polynomial `target` in place; nearly equal powers merge."""
     for power, value in summand.items():
-        at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
-        into[at] = into.get(at, 0.0) + factor * value
+        key = next((p for p in target if abs(p - power) < POWER_TOLERANCE), power)
+        target[key] = target.get(key, 0.0) + factor * value
 
 
 def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:

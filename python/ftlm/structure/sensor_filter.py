@@ -44,9 +44,9 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Validate the signals and the transfer function."""
         if not self.signals:
             raise ModelError("sensor filter: it names no signal; name the signals that were measured through it")
-        twice = next((s for i, s in enumerate(self.signals) if s in self.signals[:i]), None)
-        if twice is not None:
-            raise ModelError(f"sensor filter: it names {twice} twice; name each signal once")
+        duplicate = next((s for i, s in enumerate(self.signals) if s in self.signals[:i]), None)
+        if duplicate is not None:
+            raise ModelError(f"sensor filter: it names {duplicate} twice; name each signal once")
         for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
             for coefficient, order in terms:
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
@@ -67,17 +67,17 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def relative_degree(self) -> int:
         """Relative degree: order of the denominator minus order of the numerator, rounded down."""
-        bottom, top = (
+        denominator_order, numerator_order = (
             max((order for coefficient, order in part if coefficient), default=0.0)
             for part in (self.denominator, self.numerator)
         )
-        return int(bottom - top + 1e-9)
+        return int(denominator_order - numerator_order + 1e-9)
 
     @property
     def has_impulse_transient(self) -> bool:
         """Whether the transient of the filter is a sum of impulse responses: no zeros and only integer orders."""
-        whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
-        return whole and not any(order for coefficient, order in self.numerator if coefficient)
+        is_integer = all(order == round(order) for coefficient, order in self.denominator if coefficient)
+        return is_integer and not any(order for coefficient, order in self.numerator if coefficient)
 
     @classmethod
     @check_arguments

@@ -59,16 +59,16 @@ class TokenReader:
         self._position = 0
         # Replacements have the length of the originals, so that positions in error messages stay valid.
         readable = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
-        at = 0
-        while readable[at:].strip():
-            token = _TOKEN_PATTERN.match(readable, at)
+        position = 0
+        while readable[position:].strip():
+            token = _TOKEN_PATTERN.match(readable, position)
             if token is None:
-                start = at + len(readable[at:]) - len(readable[at:].lstrip())
+                start = position + len(readable[position:]) - len(readable[position:].lstrip())
                 at_character = f"{text[start]!r} at character {start + 1}"
                 raise ModelError(f"equation {text!r}: unexpected {at_character}; remove it")
             kind = str(token.lastgroup)
             self._tokens.append((kind, token[kind], token.start(kind)))
-            at = token.end()
+            position = token.end()
         self._readable = readable
 
     def _peek(self, offset: int = 0) -> tuple[str, str, int]:
@@ -99,14 +99,14 @@ class TokenReader:
         return ModelError(f"equation {self.text!r}: {message}")
 
     def _syntax_error(self, expectation: str) -> ModelError:
-        kind, value, at = self._peek()
+        kind, value, position = self._peek()
         found = value if kind == "end" else repr(value)
         if kind == "symbol" and value in ",:'":
-            return self._error(f"unexpected {value!r} at character {at + 1}; remove it")
+            return self._error(f"unexpected {value!r} at character {position + 1}; remove it")
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
-                f"expected {expectation} at character {at + 1}, found {found}; D is the derivative in an equation: "
-                f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
+                f"expected {expectation} at character {position + 1}, found {found}; D is the derivative in an "
+                f"equation: rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
         remedy = "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
         before = self._peek(-1) if self._position else ("", "", 0)
@@ -118,7 +118,7 @@ class TokenReader:
             remedy = f"a power of a coefficient is a coefficient: write one name for it, as in 'a1 {value}'"
         elif before[0] == "name" and value == "(":
             remedy = f"{before[1]!r} is no function{nearest(before[1], FUNCTION_NAMES)}"
-        return self._error(f"expected {expectation} at character {at + 1}, found {found}; {remedy}")
+        return self._error(f"expected {expectation} at character {position + 1}, found {found}; {remedy}")
 
     def _signs(self) -> Iterator[float]:
         """Yield the sign of each term of a sum, up to the first token that cannot continue it."""
@@ -132,10 +132,10 @@ class TokenReader:
     def _divisors(self, factor: float) -> float:
         """Parse divisions by numbers at the end of a product, and return `factor` divided by them."""
         while self._accept("/"):
-            kind, value, at = self._peek()
+            kind, value, position = self._peek()
             if kind != "number" or float(value) == 0.0:
                 raise self._error(
-                    f"{value!r} at character {at + 1} divides, but a divisor must be a number other than 0; "
+                    f"{value!r} at character {position + 1} divides, but a divisor must be a number other than 0; "
                     "write a coefficient instead, as in a y for y/T"
                 )
             factor /= float(self._take()[1])
@@ -143,30 +143,30 @@ class TokenReader:
 
     def _value(self, expectation: str) -> Value:
         """Parse a number or an interval ``low:high``, and return it; `expectation` is the text of the syntax error."""
-        ends = []
+        bounds = []
         while True:
             sign = -1.0 if self._accept("-") else 1.0
             if self._peek()[0] != "number":
                 raise self._syntax_error(expectation)
-            ends.append(sign * float(self._take()[1]))
-            if len(ends) == 2 or not self._accept(":"):
-                return ends[0] if len(ends) == 1 else (ends[0], ends[1])
+            bounds.append(sign * float(self._take()[1]))
+            if len(bounds) == 2 or not self._accept(":"):
+                return bounds[0] if len(bounds) == 1 else (bounds[0], bounds[1])
 
     def _order(self) -> Order:
         """Parse an order (a number, a name, or an expression in parentheses), and return it."""
         kind, value, start = self._peek()
         if value in "({" and kind == "symbol":
-            close = ")" if value == "(" else "}"
+            closing = ")" if value == "(" else "}"
             self._take()
-            depth, begin, at = 1, start + 1, start + 1
+            depth, text_start, position = 1, start + 1, start + 1
             while depth:
-                kind, token, at = self._take()
+                kind, token, position = self._take()
                 if kind == "end":
                     self._position -= 1
-                    raise self._syntax_error(f"'{close}'")
+                    raise self._syntax_error(f"'{closing}'")
                 depth += token in "({" and kind == "symbol"
                 depth -= token in ")}" and kind == "symbol"
-            return self._order_from(self._readable[begin:at], begin)
+            return self._order_from(self._readable[text_start:position], text_start)
         sign = "-" if self._accept("-") else ""
         kind, value, _ = self._peek()
         if kind not in ("number", "name"):
@@ -174,8 +174,8 @@ class TokenReader:
         self._take()
         return self._order_from(sign + value, start)
 
-    def _order_from(self, text: str, at: int) -> Order:
+    def _order_from(self, text: str, position: int) -> Order:
         try:
             return Order.parse(text)
         except ModelError as error:
-            raise self._error(f"at character {at + 1}: {error}") from error
+            raise self._error(f"at character {position + 1}: {error}") from error

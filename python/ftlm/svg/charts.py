@@ -73,16 +73,16 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     edges = mean + np.linspace(-half_range, half_range, bars + 1)
     counts, _ = np.histogram(finite, edges)
     width = edges[1] - edges[0]
-    at = np.linspace(edges[0], edges[-1], 121)
-    curve = finite.size * width * _normal(at, mean, deviation) if deviation > 0 else np.zeros(at.size)
+    x = np.linspace(edges[0], edges[-1], 121)
+    curve = finite.size * width * _normal(x, mean, deviation) if deviation > 0 else np.zeros(x.size)
     nonfinite_count = finite_values.size - finite.size
     text = f"{caption} {nonfinite_count} values are not finite and left out.".strip() if nonfinite_count else caption
-    described = (
+    description = (
         f"Histogram of {finite.size} values: mean {number(mean, 3)}, standard deviation {number(deviation, 3)}, from "
         f"{number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}."
     )
     return LineChart(
-        at,
+        x,
         [("", curve)],
         title=title,
         x_label=x_label,
@@ -91,7 +91,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
         bars=(edges, counts.astype(np.float64)),
         width=SMALL_WIDTH_PX,
         height=HISTOGRAM_HEIGHT_PX,
-        description=described,
+        description=description,
     )
 
 
@@ -164,9 +164,9 @@ class BarChart(Figure):
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
         tables, names, width = self.tables, self.names, NARROW_WIDTH_PX if narrow else self.width
-        described = f"Bars, {self.x_label}. " + " ".join(
-            f"{thing}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
-            for k, thing in enumerate(names)
+        description = f"Bars, {self.x_label}. " + " ".join(
+            f"{name}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
+            for k, name in enumerate(names)
         )
         shortened_names = [truncate_text(n, 16 if narrow else MAX_BAR_NAME_CHARACTERS) for n in names]
         left, value = 10 + max(map(text_width, shortened_names)), 52.0
@@ -195,7 +195,7 @@ class BarChart(Figure):
         texts += [svg_text(float(plot.x_pixels(v)), bottom + 15, label, "middle") for v, label in pairs]
         texts.append(svg_text(left + w, bottom + 32, self.x_label, "end"))
         parts = [grid, *bars, axis, text_group(texts)]
-        return svg(width, round(bottom + 40), self.title, described, parts, narrow=narrow)
+        return svg(width, round(bottom + 40), self.title, description, parts, narrow=narrow)
 
 
 def _shade(style: int, x: float, y: float, width: float, height: float, **attributes: str) -> Markup:
@@ -300,13 +300,13 @@ class PlaneChart(Figure):
         box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
         view = " ".join(f"{v:.1f}" for v in box.values())
         x, y = _pixel_coordinates(plot, [0])[0]
-        through = faint_path(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
+        zero_axes = faint_path(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
         curves = self._crosses(plot) if self.line is None else self._locus(plot, self.line)
         texts = plot.labels((x_ticks, y_ticks), (self.x_label, self.y_label), width)
         if self.line is not None:
             texts += [stroke_path(1, [(left, 12.0), (left + 20, 12.0)]), svg_text(left + 26, 16, "model", "start")]
             texts += [_dot(left + 90, 12.0), svg_text(left + 100, 16, "measured", "start")]
-        clipped_group = element("svg", [through, *curves], **box, viewBox=view)
+        clipped_group = element("svg", [zero_axes, *curves], **box, viewBox=view)
         parts = [*plot.grid(x_ticks, y_ticks), clipped_group, text_group(texts)]
         return svg(width, round(top + h + 44), self.title, self._describe(), parts, narrow=narrow)
 
@@ -431,7 +431,7 @@ class Landscape(Figure):
         """Return the chart as SVG markup, for a wide or a narrow screen."""
         score_range = float(np.nanmin(self.valid_scores)), float(np.nanmax(self.valid_scores))
         best_score, worst_score = map(number, score_range)
-        described = f"Heat map of {self.score}. Best {best_score} at {self._best_orders()}; worst {worst_score}."
+        description = f"Heat map of {self.score}. Best {best_score} at {self._best_orders()}; worst {worst_score}."
         best_indices = self.best
         width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
         rows, columns = self.scores.shape
@@ -467,7 +467,7 @@ class Landscape(Figure):
         ]
         out.append(text_group(texts))
         out += [_rectangle(left + k * size, bottom + 48, size, "12", color) for k, color in enumerate(HEAT_COLORS)]
-        return svg(width, round(bottom + bottom_margin), self.title, described, out, narrow=narrow)
+        return svg(width, round(bottom + bottom_margin), self.title, description, out, narrow=narrow)
 
 
 def _color_indices(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
@@ -533,9 +533,9 @@ class CorrelationMap(Figure):
                 f"values has shape {matrix.shape}, but there are {len(names)} names; give one row and one "
                 "column per name"
             )
-        beyond = np.abs(matrix) > 1 + 1e-6
-        if np.any(beyond):
-            row, column = divmod(int(np.argmax(beyond)), len(names))
+        is_outside = np.abs(matrix) > 1 + 1e-6
+        if np.any(is_outside):
+            row, column = divmod(int(np.argmax(is_outside)), len(names))
             raise DataError(
                 f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}, outside [-1, 1]; "
                 "give a correlation matrix, not a covariance"
@@ -548,10 +548,10 @@ class CorrelationMap(Figure):
 
     def _describe(self) -> str:
         names, matrix = self.names, self.matrix
-        off = np.where(np.eye(len(names), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
-        at = np.unravel_index(int(np.argmax(np.abs(off))), off.shape)
-        farthest = f"{names[int(at[0])]} and {names[int(at[1])]} {number(float(off[at]), 3)}"
-        return f"Correlations of {', '.join(names)}. The largest: {farthest}."
+        off_diagonal = np.where(np.eye(len(names), dtype=bool) | ~np.isfinite(matrix), 0.0, matrix)
+        index = np.unravel_index(int(np.argmax(np.abs(off_diagonal))), off_diagonal.shape)
+        largest = f"{names[int(index[0])]} and {names[int(index[1])]} {number(float(off_diagonal[index]), 3)}"
+        return f"Correlations of {', '.join(names)}. The largest: {largest}."
 
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
@@ -577,22 +577,22 @@ class CorrelationMap(Figure):
                 color = CORRELATION_COLORS[step] if is_known else NO_VALUE
                 out.append(element("rect", x=x, y=y, width=cell - 1, height=cell - 1, fill=color))
                 if cell >= MIN_LABELED_CELL_PX and i != j:
-                    ink = "#fff" if step in DARK_COLOR_INDICES or not is_known else "#15181c"
+                    text_color = "#fff" if step in DARK_COLOR_INDICES or not is_known else "#15181c"
                     text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if is_known else "–"
                     center = x + cell / 2 - 0.5, y + cell / 2 + 4
-                    texts.append(svg_text(*center, text, "middle", fill=ink, font_size="11"))
-        labels_drawn = []
+                    texts.append(svg_text(*center, text, "middle", fill=text_color, font_size="11"))
+        markup = []
         for k, label in enumerate(labels):
-            labels_drawn.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
+            markup.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
             x = left + (k + 0.5) * cell
             rotation = f"translate({x + 4:.1f} {top - 6:.1f}) rotate(-90)"
-            upright = element("text", [label], x=0, y=0, transform=rotation)
-            labels_drawn.append(upright if rotated else svg_text(x, top - 6, label, "middle"))
-        foot = top + count * cell + 12
+            label_text = element("text", [label], x=0, y=0, transform=rotation)
+            markup.append(label_text if rotated else svg_text(x, top - 6, label, "middle"))
+        legend_top = top + count * cell + 12
         size = 18.0 if narrow else 22.0
         for k, color in enumerate(CORRELATION_COLORS):
-            labels_drawn.append(element("rect", x=left + k * size, y=foot, width=size, height=10.0, fill=color))
+            markup.append(element("rect", x=left + k * size, y=legend_top, width=size, height=10.0, fill=color))
         for fraction, text, anchor in ((0.0, "−1", "start"), (0.5, "0", "middle"), (1.0, "1", "end")):
-            labels_drawn.append(svg_text(left + fraction * size * len(CORRELATION_COLORS), foot + 24, text, anchor))
-        parts = [*out, text_group([*labels_drawn, *texts])]
-        return svg(width, round(foot + 32), self.title, self._describe(), parts, narrow=narrow)
+            markup.append(svg_text(left + fraction * size * len(CORRELATION_COLORS), legend_top + 24, text, anchor))
+        parts = [*out, text_group([*markup, *texts])]
+        return svg(width, round(legend_top + 32), self.title, self._describe(), parts, narrow=narrow)

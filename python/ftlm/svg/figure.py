@@ -101,13 +101,13 @@ def element(name: str, parts: Iterable[str] | None = None, /, **attributes: str 
 
 
 def svg(
-    width: int, height: int, title: str, described: str, parts: Iterable[Markup], *, narrow: bool, **attributes: str
+    width: int, height: int, title: str, description: str, parts: Iterable[Markup], *, narrow: bool, **attributes: str
 ) -> Markup:
-    """Return an SVG drawing of the given size [px] and parts; `described` is the description for screen readers."""
-    all_parts = [element("title", [title]), element("desc", [described]), *parts]
-    look: dict[str, str] = {"class_": f"chart {'narrow' if narrow else 'wide'}", "role": "img"}
+    """Return an SVG drawing of the given size [px] and parts; `description` is the description for screen readers."""
+    all_parts = [element("title", [title]), element("desc", [description]), *parts]
+    options: dict[str, str] = {"class_": f"chart {'narrow' if narrow else 'wide'}", "role": "img"}
     view = f"0 0 {width} {height}"
-    return element("svg", all_parts, **look, viewBox=view, width=width, height=height, **attributes)
+    return element("svg", all_parts, **options, viewBox=view, width=width, height=height, **attributes)
 
 
 def svg_text(x: float, y: float, text: str, anchor: str, **attributes: str) -> Markup:
@@ -193,16 +193,16 @@ class PlotArea:
         )
         return xs, ys
 
-    def grid(self, across: Ticks, upward: Ticks | None) -> list[Markup]:
+    def grid(self, x_ticks: Ticks, y_ticks: Ticks | None) -> list[Markup]:
         """Return grid lines and the left and lower axis as SVG markup.
 
-        Without ticks of the vertical axis (`upward`), only vertical grid lines and the left axis are drawn.
+        Without ticks of the vertical axis (`y_ticks`), only vertical grid lines and the left axis are drawn.
         """
-        levels = () if upward is None else upward.values
+        levels = () if y_ticks is None else y_ticks.values
         lines = [f"M{self.left:.1f} {float(self.y_pixels(v)):.1f}h{self.width:.1f}" for v in levels]
-        lines += [f"M{float(self.x_pixels(v)):.1f} {self.top:.1f}v{self.height:.1f}" for v in across.values]
+        lines += [f"M{float(self.x_pixels(v)):.1f} {self.top:.1f}v{self.height:.1f}" for v in x_ticks.values]
         paths = [element("path", d=line) for line in lines]
-        lower = "" if upward is None else f"h{self.width:.1f}"
+        lower = "" if y_ticks is None else f"h{self.width:.1f}"
         return [
             element("g", paths, class_="grid", fill="none", stroke="currentColor", stroke_opacity="0.14"),
             faint_path(f"M{self.left:.1f} {self.top:.1f}v{self.height:.1f}{lower}"),
@@ -210,11 +210,11 @@ class PlotArea:
 
     def labels(self, axes: tuple[Ticks, Ticks], names: tuple[str, str], width: int) -> list[Markup]:
         """Return tick labels and axis labels `names` as SVG markup; `width` is the width of the whole drawing [px]."""
-        across, upward = axes
+        x_ticks, y_ticks = axes
         bottom = self.top + self.height
-        pairs = zip(upward.values, upward.labels, strict=True)
+        pairs = zip(y_ticks.values, y_ticks.labels, strict=True)
         tick_labels = [svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end") for v, label in pairs]
-        pairs = zip(across.values, across.labels, strict=True)
+        pairs = zip(x_ticks.values, x_ticks.labels, strict=True)
         for v, label in pairs:
             x = float(self.x_pixels(v))
             # A centered label at the right end would exceed the drawing, so it is right-aligned there.
@@ -310,10 +310,10 @@ def decimate(y: ArrayLike, max_count: int = MAX_LINE_POINTS) -> NDArray[np.intp]
         return segment_ends
     edges = np.linspace(0, finite.size, max(1, (max_count - 2) // 2) + 1).astype(np.intp)
     # Sorting by (block, value) places the extreme values of every block at its ends.
-    stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
-    order = np.lexsort((values[finite], stretch))
-    picked = np.concatenate([order[edges[:-1]], order[edges[1:] - 1], [0, finite.size - 1]])
-    selection: NDArray[np.intp] = finite[np.unique(picked)]
+    blocks = np.repeat(np.arange(edges.size - 1), np.diff(edges))
+    order = np.lexsort((values[finite], blocks))
+    rows = np.concatenate([order[edges[:-1]], order[edges[1:] - 1], [0, finite.size - 1]])
+    selection: NDArray[np.intp] = finite[np.unique(rows)]
     return selection
 
 

@@ -105,11 +105,11 @@ class Table:
     @property
     def starts_group(self) -> list[bool]:
         """For each column, whether it is the first column of a group with a header."""
-        starts, at = [False] * len(self.columns), 0
+        starts, column = [False] * len(self.columns), 0
         for text, width in self.groups:
-            if text and at < len(starts):
-                starts[at] = True
-            at += width
+            if text and column < len(starts):
+                starts[column] = True
+            column += width
         return starts
 
     @property
@@ -127,15 +127,15 @@ class Table:
     def split(self, column: int) -> tuple[Table, Table]:
         """Return two tables, split before the column with index `column`; both have the names of the rows."""
         ends = list(accumulate(width for _, width in self.groups))
-        at = ends.index(column) + 1 if ends else 0
+        group = ends.index(column) + 1 if ends else 0
         left = replace(
-            self, columns=self.columns[:column], rows=[row[:column] for row in self.rows], groups=self.groups[:at]
+            self, columns=self.columns[:column], rows=[row[:column] for row in self.rows], groups=self.groups[:group]
         )
         right = replace(
             self,
             columns=[self.columns[0], *self.columns[column:]],
             rows=[[row[0], *row[column:]] for row in self.rows],
-            groups=[("", 1), *self.groups[at:]] if ends else (),
+            groups=[("", 1), *self.groups[group:]] if ends else (),
         )
         return left, right
 

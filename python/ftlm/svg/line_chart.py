@@ -73,16 +73,16 @@ def slider_readout(
         JSON object with integer values; empty without finite `x` or without lines. Every position is a sample. The
         slider starts at the largest difference between the first two lines.
     """
-    rows_present = np.flatnonzero(np.isfinite(x))
-    if not rows_present.size or not lines:
+    finite_rows = np.flatnonzero(np.isfinite(x))
+    if not finite_rows.size or not lines:
         return ""
-    rows = rows_present[:: max(1, math.ceil(rows_present.size / min(position_count, SLIDER_POSITIONS)))]
+    rows = finite_rows[:: max(1, math.ceil(finite_rows.size / min(position_count, SLIDER_POSITIONS)))]
     start = None
     if len(lines) > 1:
-        differences = np.abs(lines[0][2][rows_present] - lines[1][2][rows_present])
+        differences = np.abs(lines[0][2][finite_rows] - lines[1][2][finite_rows])
         if np.isfinite(differences).any():
-            start = rows_present[int(np.nanargmax(differences))]
-    rows = np.unique(np.append(rows, [rows_present[-1], *([] if start is None else [start])]))
+            start = finite_rows[int(np.nanargmax(differences))]
+    rows = np.unique(np.append(rows, [finite_rows[-1], *([] if start is None else [start])]))
     name, unit = _split_unit(x_label)
     data = {
         "name": name,
@@ -302,16 +302,16 @@ class LineChart(Figure):
         exceeding = []
         for y, line in zip(finite_values, lines, strict=True):
             if y.size and (np.min(y) < floor or np.max(y) > ceiling):
-                middle = (bottom + top) / 2
-                exceeding.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
+                center = (bottom + top) / 2
+                exceeding.append((line.name, float(y[np.argmax(np.abs(y - center))])))
         return max(low, floor), min(high, ceiling), exceeding
 
     @property
     def note(self) -> str:
         """Caption, followed by sentences on values that are not drawn and on lines that exceed the axis."""
         exceeding = [
-            f"{name} leaves the axis (to {number(10.0**exceeding_text if self.log_y else exceeding_text, 3)})."
-            for name, exceeding_text in self._y_limits[2]
+            f"{name} leaves the axis (to {number(10.0**extreme if self.log_y else extreme, 3)})."
+            for name, extreme in self._y_limits[2]
         ]
         return " ".join(part for part in (self.caption, *self.content[1], *exceeding) if part)
 
@@ -340,8 +340,8 @@ class LineChart(Figure):
         plot = PlotArea(left, top, width - left - right, height - top - 40.0, self.frame)
         texts = plot.labels((x_ticks, y_ticks), (self.x_label, self.y_label), width)
         if not any(np.isfinite(line.y).any() for line in lines):
-            middle = plot.left + plot.width / 2, plot.top + plot.height / 2
-            texts.append(svg_text(*middle, "no finite value to draw", "middle"))
+            center = plot.left + plot.width / 2, plot.top + plot.height / 2
+            texts.append(svg_text(*center, "no finite value to draw", "middle"))
         if named:
             texts += _legend_marks(legend) if narrow else _end_labels(named, plot)
         parts = [*plot.grid(x_ticks, y_ticks), self._curves(plot, narrow=narrow), text_group(texts)]
@@ -351,15 +351,15 @@ class LineChart(Figure):
             values = [(line.name, line.style, line.y) for line in lines]
             position_count = max(2, self.points // 2)
             data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, position_count)
-        described = self.description or self._describe()
-        return svg(width, height, self.title, described, parts, narrow=narrow, **data)
+        description = self.description or self._describe()
+        return svg(width, height, self.title, description, parts, narrow=narrow, **data)
 
     def _describe(self) -> str:
         """Return sentences on the axes and the range of every line, for screen readers."""
-        described = f"Line chart. {self.y_label} against {self.x_label}"
-        described += "; logarithmic vertical axis" if self.log_y else ""
-        described += "; logarithmic horizontal axis. " if self.log_x else ". "
-        return described + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
+        text = f"Line chart. {self.y_label} against {self.x_label}"
+        text += "; logarithmic vertical axis" if self.log_y else ""
+        text += "; logarithmic horizontal axis. " if self.log_x else ". "
+        return text + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
 
     def _curves(self, plot: PlotArea, *, narrow: bool) -> Markup:
         """Return bars, bands and lines as a nested SVG element that clips them to the plot area."""
@@ -421,15 +421,15 @@ def _outline(line: _Line, plot: PlotArea, points: int) -> str:
     if line.band is None:
         return ""
     low, high = line.band
-    good = np.flatnonzero(np.isfinite(low) & np.isfinite(high) & np.isfinite(line.x))
-    if good.size < 2:
+    rows = np.flatnonzero(np.isfinite(low) & np.isfinite(high) & np.isfinite(line.x))
+    if rows.size < 2:
         return ""
-    good = good[:: max(1, good.size // points)]
-    xs, top = plot.tenths(line.x[good], high[good])
-    _, bottom = plot.tenths(line.x[good], low[good])
+    rows = rows[:: max(1, rows.size // points)]
+    xs, top = plot.tenths(line.x[rows], high[rows])
+    _, bottom = plot.tenths(line.x[rows], low[rows])
     upper_points = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
-    back = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
-    return "M" + "L".join([*upper_points, *back]) + "Z"
+    lower_points = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
+    return "M" + "L".join([*upper_points, *lower_points]) + "Z"
 
 
 def _stem_path(line: _Line, plot: PlotArea) -> str:
@@ -482,8 +482,8 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
 
 def _line_sample(line: _Line, x: float, y: float, length: int) -> Markup:
     """Return a short sample of a line as SVG markup for its label: `length` [px] from (x, y), or a dot."""
-    at, extension = (x + length / 2, 0) if line.dots else (x, length)
-    return element("path", **_stroke(line), d=f"M{at:.1f} {y:.1f}h{extension}")
+    start, extension = (x + length / 2, 0) if line.dots else (x, length)
+    return element("path", **_stroke(line), d=f"M{start:.1f} {y:.1f}h{extension}")
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:

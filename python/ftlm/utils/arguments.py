@@ -81,8 +81,8 @@ def check_arguments(decorated: Decorated) -> Decorated:
         except Exception as error:
             # An error of an inner decorated function names its own argument; the caller needs the argument of this one.
             cause = error.__cause__ if isinstance(error, FtlmError) else error
-            foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
-            if foreign and cause is not None and not _is_raised_by_caller(cause):
+            is_foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
+            if is_foreign and cause is not None and not _is_raised_by_caller(cause):
                 _raise_type_error(decorated, args, kwargs, error)
             raise
 
@@ -124,11 +124,13 @@ def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, An
     takes_any = any(p.kind == p.VAR_KEYWORD for p in signature.parameters.values())
     unknown = next((name for name in kwargs if name not in names), None)
     if unknown is not None and not takes_any:
-        near = difflib.get_close_matches(unknown, names, 1)
-        known = (
-            f"did you mean {near[0]}=?" if near else f"known: {', '.join(n for n in names if n not in ('self', 'cls'))}"
+        match = difflib.get_close_matches(unknown, names, 1)
+        hint = (
+            f"did you mean {match[0]}=?"
+            if match
+            else f"known: {', '.join(n for n in names if n not in ('self', 'cls'))}"
         )
-        raise TypeError(f"{error}; {known}") from None
+        raise TypeError(f"{error}; {hint}") from None
 
 
 def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:

@@ -116,8 +116,8 @@ class CheckpointFile:
                 uri, READER_TIMEOUT_S, uri=True, isolation_level=None, check_same_thread=False
             )
         except (OSError, ValueError, sqlite3.Error) as error:
-            why = error.strerror if isinstance(error, OSError) else None
-            raise DataError(f"store {path} cannot be {verb}: {why or error}; choose another file") from error
+            reason = error.strerror if isinstance(error, OSError) else None
+            raise DataError(f"store {path} cannot be {verb}: {reason or error}; choose another file") from error
         try:
             # With this setting, the intact records of a truncated file can be read.
             self._connection.execute("PRAGMA writable_schema = ON")
@@ -143,18 +143,18 @@ class CheckpointFile:
 
     def _lock(self) -> None:
         """Lock the file against other writers until it is closed; readers still have access between appends."""
-        run = self._connection.execute
-        run("PRAGMA busy_timeout = 0")
-        run("PRAGMA journal_mode = DELETE")
-        run("BEGIN IMMEDIATE")
+        execute = self._connection.execute
+        execute("PRAGMA busy_timeout = 0")
+        execute("PRAGMA journal_mode = DELETE")
+        execute("BEGIN IMMEDIATE")
         # This statement fails at once if the file or its folder is read-only.
-        run("PRAGMA user_version = 0")
-        run("ROLLBACK")
+        execute("PRAGMA user_version = 0")
+        execute("ROLLBACK")
         time.sleep(LOCK_PAUSE_S)
         # With EXTRA, the deletion of the journal at the end of an append is also flushed to disk.
-        run("PRAGMA synchronous = EXTRA")
-        run("BEGIN IMMEDIATE")
-        run(f"PRAGMA busy_timeout = {round(1000 * READER_TIMEOUT_S)}")
+        execute("PRAGMA synchronous = EXTRA")
+        execute("BEGIN IMMEDIATE")
+        execute(f"PRAGMA busy_timeout = {round(1000 * READER_TIMEOUT_S)}")
 
     def _check_kind(self) -> None:
         """Raise DataError if the database belongs to another kind of computation or to another program."""
@@ -192,16 +192,16 @@ class CheckpointFile:
             return [], None
         try:
             rows = self._connection.execute(f"SELECT number, payload, digest FROM {self.kind} ORDER BY number")
-            for number, payload, own in rows:
+            for number, payload, stored_digest in rows:
                 digest = _digest(digest, payload) if isinstance(payload, bytes) else b""
-                if (number, own) != (len(payloads) + 1, digest):
+                if (number, stored_digest) != (len(payloads) + 1, digest):
                     damage = f"record {len(payloads) + 1} does not match its digest"
                     break
                 payloads.append(payload)
             else:
                 # Check also the pages that no record uses, because a later append may use them.
-                answer = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-                damage = None if answer == "ok" else f"after record {len(payloads)}: {answer}"
+                result = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+                damage = None if result == "ok" else f"after record {len(payloads)}: {result}"
         except sqlite3.Error as error:
             damage = f"after record {len(payloads)}: {error}"
         return payloads, damage
@@ -226,10 +226,10 @@ class CheckpointFile:
         """
         self.close()
         copy = write_atomically(self.path.with_name(self.path.name + ".damaged"), self.path.read_bytes(), force=False)
-        with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as fresh:
-            fresh.execute("BEGIN")
-            _insert(fresh, self.kind, payloads)
-            write_atomically(self.path, fresh.serialize(), force=True)
+        with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
+            database.execute("BEGIN")
+            _insert(database, self.kind, payloads)
+            write_atomically(self.path, database.serialize(), force=True)
         return copy
 
     def close(self) -> None:

@@ -80,10 +80,10 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be created: {error.strerror or error}; choose another folder") from error
-    names_present = [name for name in names if os.path.lexists(folder / name)]
-    if names_present and not force:
+    existing = [name for name in names if os.path.lexists(folder / name)]
+    if existing and not force:
         raise DataError(
-            f"{folder / names_present[0]} exists ({len(names_present)} such files); choose another folder, or "
+            f"{folder / existing[0]} exists ({len(existing)} such files); choose another folder, or "
             f"{parameter('force', True)}"
         )
 
@@ -130,8 +130,8 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
                 temporary_file.unlink()
             raise
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"{file} cannot be written: {why or error}; choose another folder") from error
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise DataError(f"{file} cannot be written: {reason or error}; choose another folder") from error
     # After a power failure, the rename is preserved only if the folder was flushed; not every system supports this.
     with contextlib.suppress(OSError):
         descriptor = os.open(file.parent, os.O_RDONLY)
@@ -178,20 +178,20 @@ _READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK
 def nearest_file_hint(path: Path) -> str:
     """Return text such as " (did you mean …?)" with the most similar file name in the folder of `path`, or ""."""
     try:
-        beside = sorted(entry.name for entry in path.parent.iterdir())
+        names = sorted(entry.name for entry in path.parent.iterdir())
     except (OSError, ValueError):
         return ""
-    return nearest(path.name, beside)
+    return nearest(path.name, names)
 
 
-def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> bytes:
+def read_small_file(path: str | os.PathLike[str], label: str, source: str) -> bytes:
     """Return the bytes of a regular file of at most 1 MiB.
 
     Parameters
     ----------
     path
         File to read.
-    what, source
+    label, source
         Name of the content, and kind of file that the user should pass, for error messages.
 
     Raises
@@ -204,8 +204,8 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> byt
     file = Path(path)
     try:
         descriptor = os.open(file, _READ_FLAGS)
-        state = os.fstat(descriptor)
-        if stat.S_ISREG(state.st_mode) and state.st_size <= MAX_SMALL_FILE_BYTES:
+        status = os.fstat(descriptor)
+        if stat.S_ISREG(status.st_mode) and status.st_size <= MAX_SMALL_FILE_BYTES:
             with os.fdopen(descriptor, "rb") as stream:
                 return stream.read(MAX_SMALL_FILE_BYTES)
         os.close(descriptor)
@@ -215,25 +215,27 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> byt
         path_text = (
             name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)
         )
-        why = (error.strerror if isinstance(error, OSError) else None) or error
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
         hint = nearest_file_hint(file) if isinstance(error, FileNotFoundError) else ""
-        raise DataError(f"{what} {path_text} cannot be read: {why}{hint}; check the path") from error
-    if not stat.S_ISREG(state.st_mode):
+        raise DataError(f"{label} {path_text} cannot be read: {reason}{hint}; check the path") from error
+    if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{file} is not a regular file; give {source}")
-    raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {MAX_SMALL_FILE_BYTES}; give {source}")
+    raise DataError(
+        f"{file} has {status.st_size} bytes, no {label} is larger than {MAX_SMALL_FILE_BYTES}; give {source}"
+    )
 
 
 F = TypeVar("F", bound=msgspec.Struct)
 
 
-def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F]) -> F:
+def read_toml(path: str | os.PathLike[str], label: str, source: str, kind: type[F]) -> F:
     """Return the content of a TOML file.
 
     Parameters
     ----------
     path
         File to read.
-    what, source
+    label, source
         Name of the content, and kind of file that the user should pass, for error messages.
     kind
         Type of the content, a msgspec structure, which is returned.
@@ -243,14 +245,14 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
     DataError
         If the file cannot be read, is too large, is not TOML, or has unknown keys or values of a wrong type.
     """
-    content = read_small_file(path, what, source)
+    content = read_small_file(path, label, source)
     try:
         # Some editors write a byte-order mark at the start.
         return msgspec.toml.decode(content.removeprefix(b"\xef\xbb\xbf"), type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         unknown = re.search("unknown field `(.*)`", str(error))
-        why = error_text(error, MAX_NAME_CHARACTERS) + (nearest(unknown[1], _field_names(kind)) if unknown else "")
-        raise DataError(f"{os.fspath(path)!r} is not a TOML file of {what}: {why}; give {source}") from error
+        reason = error_text(error, MAX_NAME_CHARACTERS) + (nearest(unknown[1], _field_names(kind)) if unknown else "")
+        raise DataError(f"{os.fspath(path)!r} is not a TOML file of {label}: {reason}; give {source}") from error
 
 
 def _field_names(kind: type[msgspec.Struct]) -> list[str]:
@@ -318,10 +320,10 @@ class JsonFormat(Generic[F]):
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return
         if head.format == f"ftlm-{self.what}" and head.schema != self.schema:
-            by = f" (written by {short_repr(head.written_by, MAX_NAME_CHARACTERS)})" if head.written_by else ""
+            version = f" (written by {short_repr(head.written_by, MAX_NAME_CHARACTERS)})" if head.written_by else ""
             raise DataError(
-                f"{file} is a {self.what} file of schema {short_repr(head.schema)}{by}, and ftlm {__version__} reads "
-                f"schema {self.schema}; read it with the version that wrote it, or compute the {self.what} again"
+                f"{file} is a {self.what} file of schema {short_repr(head.schema)}{version}, and ftlm {__version__} "
+                f"reads schema {self.schema}; read it with the version that wrote it, or compute the {self.what} again"
             )
 
 

@@ -115,9 +115,9 @@ def plural(count: int, noun: str, verb: str = "") -> str:
     return f"{count} {noun}{singular if count == 1 else f's {verb}'.rstrip()}"
 
 
-def truncate_text(text: str, most: int) -> str:
-    """Return a text, truncated with an ellipsis if it has more than `most` characters."""
-    return text if len(text) <= most else text[: most - 1] + "…"
+def truncate_text(text: str, max_length: int) -> str:
+    """Return a text, truncated with an ellipsis if it has more than `max_length` characters."""
+    return text if len(text) <= max_length else text[: max_length - 1] + "…"
 
 
 def with_error(value: float, error: float | None) -> str:
@@ -137,18 +137,18 @@ def columns() -> int:
     )
 
 
-def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str]:
+def wrap_text(text: str, lead: str = "", indent: str | None = None) -> list[str]:
     """Return a text as a list of lines that fit the terminal; see :func:`columns`.
 
-    The first line begins with `lead`, and each other line with `further` (by default spaces).
+    The first line begins with `lead`, and each other line with `indent` (by default spaces).
     """
     # Equations break between their terms. Texts such as "1 ± 2" and "3 %" do not break.
-    bound = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
+    text = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(
-        bound,
+        text,
         columns(),
         initial_indent=lead,
-        subsequent_indent=" " * (len(lead) or 2) if further is None else further,
+        subsequent_indent=" " * (len(lead) or 2) if indent is None else indent,
         break_long_words=False,
         break_on_hyphens=False,
     )
@@ -216,9 +216,9 @@ def json_value(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [json_value(each) for each in value]
+        return [json_value(item) for item in value]
     if hasattr(value, "to_dict"):
         return value.to_dict()
     if is_dataclass(value):
-        return attributes(value, [each.name for each in fields(value)])
+        return attributes(value, [item.name for item in fields(value)])
     return finite(value) if isinstance(value, float) else value

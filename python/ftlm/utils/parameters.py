@@ -160,7 +160,7 @@ def _option_in_words(name: str, value: object) -> str:
     if isinstance(value, Mapping):
         return f"{option}: {', '.join(f'{key} = {item}' for key, item in value.items())}"
     if isinstance(value, (tuple, list)) and len(value) == 2:
-        low, high = ("none" if end is None else f"{end}" for end in value)
+        low, high = ("none" if limit is None else f"{limit}" for limit in value)
         return f"{option} = {low} to {high}"
     return f"{option} = {value}"
 
@@ -187,8 +187,8 @@ def layout_parameter(**values: object) -> str:
     """
     if _Current.interface == "python":
         return f"layout=dict({', '.join(f'{name}={value!r}' for name, value in values.items())})"
-    between = " " if _Current.interface == "command line" else " and "
-    return between.join(parameter(name, value) for name, value in values.items())
+    separator = " " if _Current.interface == "command line" else " and "
+    return separator.join(parameter(name, value) for name, value in values.items())
 
 
 def layout_fields(*names: str) -> str:
@@ -205,5 +205,5 @@ def _flag_value(value: object) -> str:
     if isinstance(value, Mapping):
         return " ".join(f"{_flag_value(key)}={_flag_value(item)}" for key, item in value.items())
     if isinstance(value, (tuple, list)):
-        return ":".join("" if end is None else _flag_value(end) for end in value)
+        return ":".join("" if limit is None else _flag_value(limit) for limit in value)
     return shlex.quote(value) if isinstance(value, str) else repr(value)

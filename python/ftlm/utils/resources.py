@@ -97,14 +97,14 @@ def _cgroup_available_bytes(system: Path) -> list[int]:
         version = 2 if number == "0" and not controllers else 1 if "memory" in controllers.split(",") else None
         if version is None:
             continue
-        root, most, now, droppable = _CGROUP_FILES[version]
+        root, limit_file, usage_file, cache_key = _CGROUP_FILES[version]
         parts = [part for part in name.split("/") if part not in ("", "..")]
         for depth in range(len(parts), -1, -1):
             folder = system.joinpath(root, *parts[:depth])
-            limit, usage = _text(folder / most).strip(), _text(folder / now).strip()
+            limit, usage = _text(folder / limit_file).strip(), _text(folder / usage_file).strip()
             # In version 2 "max" means no limit, and in version 1 a huge number does.
             if limit.isdecimal() and usage.isdecimal() and int(limit) < 1 << 60:
-                match = re.search(rf"^{droppable} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
+                match = re.search(rf"^{cache_key} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
                 amounts.append(int(limit) - int(usage) + (int(match[1]) if match else 0))
     return amounts
 
@@ -144,16 +144,16 @@ def duration_bounds(seconds: float, factors: tuple[float, float] = FIT_TIME_FACT
     return factors[0] * seconds, factors[1] * seconds
 
 
-def output_error_cost(samples: int, numbers: int) -> float:
+def output_error_cost(samples: int, parameters: int) -> float:
     """Return the time [s] that an output-error fit takes on one core of the reference machine.
 
-    `samples` is the number of samples of all runs and outputs, and `numbers` is the number of free parameters. Actual
-    times differ from the result by factors within :data:`FIT_TIME_FACTORS`.
+    `samples` is the number of samples of all runs and outputs, and `parameters` is the number of free parameters.
+    Actual times differ from the result by factors within :data:`FIT_TIME_FACTORS`.
 
     The time of the multistart is proportional to the square of the number of parameters, and the remaining time to the
     number of samples. The increase is slower for long records, because most evaluations use a part of the record.
     """
-    return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG_RECORD_SAMPLES) + 2e-5 * samples
+    return 0.04 * parameters**2 + 3.5e-4 * min(samples, LONG_RECORD_SAMPLES) + 2e-5 * samples
 
 
 _STOP_FLAG: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
@@ -197,8 +197,8 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
     site
         Whether Python sets up the site packages at the start, which takes some time.
     """
-    folder_now = os.getcwd()
-    folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != folder_now]
+    working_folder = os.getcwd()
+    folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != working_folder]
     # This process may have imported the package from the working directory.
     folders.append(str(Path(__file__).resolve().parents[2]))
     program = f"import runpy, sys; sys.path += {folders!a}; runpy.run_path({str(script)!a}, run_name='__main__')"
@@ -207,12 +207,12 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
     return {"args": command, "env": environment, "cwd": sys.prefix}
 
 
-def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
+def run_in_worker(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return ``work(*arguments)``; a worker process that calls this function ends when its parent process ends."""
     # Tasks of a process pool run in the main thread, those of a thread pool do not.
     if threading.current_thread() is threading.main_thread():
         _end_with_parent(os.getpid())
-    return work(*arguments)
+    return function(*arguments)
 
 
 @cache

@@ -68,25 +68,25 @@ def quantization_step(samples: Floats) -> float:
     values = np.unique(samples)
     for precision in SAMPLE_PRECISIONS:
         error = ROUNDING_UNITS * precision * float(np.abs(values).max(initial=0.0))
-        gaps = np.diff(values)
-        levels = values[np.concatenate([[True], gaps > error])]
+        differences = np.diff(values)
+        levels = values[np.concatenate([[True], differences > error])]
         if levels.size < 2:
             continue
-        gaps = np.unique(np.diff(levels))
-        step = float(gaps[0])
-        least = max(MIN_QUANTUM_ERRORS * error, float(levels[-1] - levels[0]) / MAX_QUANTIZATION_STEPS)
-        while step > least:
-            counts = np.rint(gaps / step)
-            rest = np.abs(gaps - counts * step)
-            rest = rest[rest > error * (2.0 + counts)]
-            if not rest.size:
-                places = np.rint((levels - levels[0]) / step)
-                step = float(places @ (levels - levels[0])) / float(places @ places)
-                off = np.abs(levels - levels[0] - places * step)
-                if off.max() <= 2.0 * error:
+        differences = np.unique(np.diff(levels))
+        step = float(differences[0])
+        min_step = max(MIN_QUANTUM_ERRORS * error, float(levels[-1] - levels[0]) / MAX_QUANTIZATION_STEPS)
+        while step > min_step:
+            counts = np.rint(differences / step)
+            remainders = np.abs(differences - counts * step)
+            remainders = remainders[remainders > error * (2.0 + counts)]
+            if not remainders.size:
+                indices = np.rint((levels - levels[0]) / step)
+                step = float(indices @ (levels - levels[0])) / float(indices @ indices)
+                deviation = np.abs(levels - levels[0] - indices * step)
+                if deviation.max() <= 2.0 * error:
                     return step
                 break
-            step = float(rest.min())
+            step = float(remainders.min())
     return 0.0
 
 
@@ -103,15 +103,15 @@ def white_noise(samples: Floats) -> float:
     differences of every order. An oscillation with few samples per period also contributes to second differences, but
     less to differences of higher orders (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
     """
-    start = samples[:NOISE_SAMPLES]
-    least = estimate_noise(start)
+    segment = samples[:NOISE_SAMPLES]
+    noise = estimate_noise(segment)
     for order in DIFFERENCE_ORDERS:
-        differences = np.diff(start, order)
+        differences = np.diff(segment, order)
         differences = differences[~np.isnan(differences)]
         if differences.size < MIN_DIFFERENCES:
             break
-        least = min(least, robust_deviation(differences) / math.sqrt(math.comb(2 * order, order)))
-    return least
+        noise = min(noise, robust_deviation(differences) / math.sqrt(math.comb(2 * order, order)))
+    return noise
 
 
 def robust_deviation(values: Floats) -> float:
@@ -119,50 +119,53 @@ def robust_deviation(values: Floats) -> float:
     return float(np.median(np.abs(values))) / MAD_OVER_SIGMA if values.size else 0.0
 
 
-def huber_excess(few: Floats, many: Floats) -> float:
+def huber_excess(nested: Floats, full: Floats) -> float:
     """Return the Huber loss of a smaller model minus that of a larger model, in units of the noise variance.
 
-    `few` and `many` are the residuals of the two models. If the smaller model is sufficient, the difference is
+    `nested` and `full` are the residuals of the two models. If the smaller model is sufficient, the difference is
     chi-squared distributed, even with outliers. The number of degrees of freedom is the number of additional parameters
-    of the larger model (doi:10.1214/aoms/1177703732). The result is infinite if `few` has values that are not finite.
+    of the larger model (doi:10.1214/aoms/1177703732). The result is infinite if `nested` has values that are not
+    finite.
     """
-    scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
-    if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
+    scale = robust_deviation(full) or float(np.sqrt(np.mean(full**2)))
+    if not np.all(np.isfinite(nested)) or (scale == 0.0 and np.any(nested)):
         return float("inf")
-    one, other = (np.abs(e) / (scale or 1.0) for e in (few, many))
-    losses = [np.where(r <= HUBER_THRESHOLD, r**2, HUBER_THRESHOLD * (2.0 * r - HUBER_THRESHOLD)) for r in (one, other)]
+    nested, full = (np.abs(e) / (scale or 1.0) for e in (nested, full))
+    losses = [
+        np.where(r <= HUBER_THRESHOLD, r**2, HUBER_THRESHOLD * (2.0 * r - HUBER_THRESHOLD)) for r in (nested, full)
+    ]
     # Mean squared slope and mean curvature of the loss of the larger model; their ratio is 0.86 for normal noise.
-    slope, curvature = np.mean(np.minimum(other, HUBER_THRESHOLD) ** 2), np.mean(other <= HUBER_THRESHOLD)
+    slope, curvature = np.mean(np.minimum(full, HUBER_THRESHOLD) ** 2), np.mean(full <= HUBER_THRESHOLD)
     return float(np.sum(losses[0] - losses[1]) * curvature / slope) if slope > 0 else 0.0
 
 
-def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Return autocovariances at lags 0 to `most`, pooled over series, and the number of sample pairs at each lag.
+def autocovariances(series: Sequence[Floats], max_lag: int) -> tuple[Floats, Floats]:
+    """Return autocovariances at lags 0 to `max_lag`, pooled over series, and the number of sample pairs at each lag.
 
     The mean of each series is subtracted. NaN marks missing samples.
     """
-    return _core.autocovariances(series, most)
+    return _core.autocovariances(series, max_lag)
 
 
-def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Return autocorrelations at lags 0 to `most`, pooled over series, and the number of sample pairs at each lag.
+def autocorrelations(series: Sequence[Floats], max_lag: int) -> tuple[Floats, Floats]:
+    """Return autocorrelations at lags 0 to `max_lag`, pooled over series, and the number of sample pairs at each lag.
 
     NaN marks missing samples.
     """
-    covariances, pairs = autocovariances(series, most)
+    covariances, pairs = autocovariances(series, max_lag)
     power = covariances[0] * pairs[0]
     return covariances * pairs / (power if power > 0 else 1.0), pairs
 
 
-def portmanteau(series: Sequence[Floats], most: int) -> float:
-    """Return a whiteness statistic over lags 1 to `most`, pooled over series.
+def portmanteau(series: Sequence[Floats], max_lag: int) -> float:
+    """Return a whiteness statistic over lags 1 to `max_lag`, pooled over series.
 
-    For white noise, the statistic is chi-squared distributed with `most` degrees of freedom. The squared
+    For white noise, the statistic is chi-squared distributed with `max_lag` degrees of freedom. The squared
     autocovariance at each lag is divided by the variance of the products at this lag, so the variance of the noise may
     change within a series (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The Box-Pierce statistic would be
     too large for a machine that is at rest during a part of the run.
     """
-    return _core.portmanteau(series, most)
+    return _core.portmanteau(series, max_lag)
 
 
 def chi_squared(degrees: int, level: float) -> float:
@@ -195,7 +198,7 @@ def is_white(series: Floats, lags: int = 25) -> bool:
 CONSTANT_TOLERANCE = 1e-12
 
 
-def autoregression(series: Sequence[Floats], most: int) -> Floats:
+def autoregression(series: Sequence[Floats], max_order: int) -> Floats:
     """Return the coefficients 1, a₁, …, aₙ of a whitening filter that is common to several series.
 
     The Levinson-Durbin recursion solves the Yule-Walker equations (doi:10.1093/biomet/47.3-4.233) with autocovariances
@@ -205,21 +208,21 @@ def autoregression(series: Sequence[Floats], most: int) -> Floats:
     ----------
     series
         One array per run; NaN marks a missing sample.
-    most
+    max_order
         Maximum order.
     """
-    return _core.whitening_filter(series, most)[0]
+    return _core.whitening_filter(series, max_order)[0]
 
 
-def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
-    """Return the series minus their means, filtered by the whitening filter with the coefficients `through`.
+def whiten_series(series: Sequence[Floats], coefficients: Floats) -> list[Floats]:
+    """Return the series minus their means, filtered by the whitening filter with the coefficients `coefficients`.
 
     The initial transient of the filter is omitted. Filtered samples that depend on a missing sample (NaN) are zero.
     """
     out = []
     for x in series:
         mean = np.mean(x[~np.isnan(x)])
-        out.append(np.ascontiguousarray(np.nan_to_num(np.convolve(x - mean, through, "valid"))))
+        out.append(np.ascontiguousarray(np.nan_to_num(np.convolve(x - mean, coefficients, "valid"))))
     return out
 
 

@@ -26,32 +26,32 @@ _REAL_DTYPE_KINDS = frozenset("fiuO")
 _NUMBER_DTYPE_KINDS = frozenset("fiub")
 
 
-def short_repr(value: object, most: int = 60) -> str:
-    """Return the repr of a value for a message, truncated to `most` characters; for a long integer its size in bits."""
-    if type(value) is int and value.bit_length() > 3 * most:
+def short_repr(value: object, max_length: int = 60) -> str:
+    """Return the repr of a value, truncated to `max_length` characters; for a long integer, its size in bits."""
+    if type(value) is int and value.bit_length() > 3 * max_length:
         # Python refuses to convert a long integer to decimal text.
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
     except Exception:
         return f"a {type(value).__name__}"
-    return text if len(text) <= most else f"{text[:most]}…"
+    return text if len(text) <= max_length else f"{text[:max_length]}…"
 
 
-def error_text(error: BaseException, most: int = 500) -> str:
-    """Return the message of an exception of another package, truncated to `most` characters, encodable in UTF-8."""
+def error_text(error: BaseException, max_length: int = 500) -> str:
+    """Return the message of another package's exception, truncated to `max_length` characters, encodable in UTF-8."""
     try:
         text = str(error)
     except Exception:
         return "what it says cannot be read"
-    return (text if len(text) <= most else f"{text[:most]}…").encode("utf-8", "backslashreplace").decode()
+    return (text if len(text) <= max_length else f"{text[:max_length]}…").encode("utf-8", "backslashreplace").decode()
 
 
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise ModelError unless a value is one of the strings in `choices`; `name` is the parameter in the message."""
-    words = list(choices)
-    if not isinstance(value, str) or value not in words:
-        raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
+    options = list(choices)
+    if not isinstance(value, str) or value not in options:
+        raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, options))}")
 
 
 def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
@@ -98,10 +98,10 @@ def check_seed(seed: object) -> int:
     return number
 
 
-def check_pulses(m: object, below: float = 1 << 62) -> int:
-    """Return the number of block pulses as an int; raise ModelError unless it is positive and less than `below`."""
+def check_pulses(m: object, limit: float = 1 << 62) -> int:
+    """Return the number of block pulses as an int; raise ModelError unless it is positive and less than `limit`."""
     pulses = whole_number(m)
-    if pulses is None or not 1 <= pulses < below:
+    if pulses is None or not 1 <= pulses < limit:
         raise ModelError(f"{setting('m')} {m!r} is not a number of pulses; give a whole number, at least 1")
     return pulses
 
@@ -133,29 +133,29 @@ def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
     return low, high
 
 
-def join_names(names: Iterable[object], most: int = 40) -> str:
-    """Return quoted names, joined by commas, for a message; names beyond the first `most` are only counted."""
-    every = [repr(name) for name in names]
-    if not every:
+def join_names(names: Iterable[object], max_count: int = 40) -> str:
+    """Return quoted names, joined by commas, for a message; names beyond the first `max_count` are only counted."""
+    texts = [repr(name) for name in names]
+    if not texts:
         return "none"
-    return ", ".join(every[:most]) + (f", … and {len(every) - most} more" if len(every) > most else "")
+    return ", ".join(texts[:max_count]) + (f", … and {len(texts) - max_count} more" if len(texts) > max_count else "")
 
 
 def nearest(word: object, names: Iterable[object]) -> str:
     """Return text such as " (did you mean …?)" with the name most similar to `word`, or "" if none is similar."""
     options = [str(name) for name in names]
     prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
-    close = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    matches = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
-def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
+def bad_rows(label: str, problem: str, first: int, count: int, remedy: str) -> DataError:
     """Return a DataError for invalid rows.
 
     The message states the object, what is wrong, the first invalid row (from 0), the number of such rows and the
     remedy.
     """
-    return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
+    return DataError(f"{label}: {problem}, first at row {first}, {count} in all; {remedy}")
 
 
 def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]:
@@ -184,23 +184,23 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
     return {name: name for name in names}
 
 
-def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
+def as_mapping(argument: str, value: object, item: str = "array") -> Mapping[str, object]:
     """Return a mapping unchanged; raise DataError for any other value of the argument.
 
-    `of` is the kind of its values in the message.
+    `item` is the kind of its values in the message.
     """
     if not isinstance(value, Mapping):
-        raise DataError(f"{parameter(argument)} is {type_name(value)}; pass a dict of name: {of}")
+        raise DataError(f"{parameter(argument)} is {type_name(value)}; pass a dict of name: {item}")
     return value
 
 
-def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
-    """Raise ModelError for a name that is not in `choices`; `what` is the kind of object in the message."""
+def check_known(kind: str, names: Iterable[str], choices: Sequence[str]) -> None:
+    """Raise ModelError for a name that is not in `choices`; `kind` is the kind of object in the message."""
     for name in names:
         if name not in choices:
-            near = difflib.get_close_matches(str(name), choices, 1)
-            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(dict.fromkeys(choices)) or 'none'}"
-            raise ModelError(f"{what} {name!r} does not occur in the equation; {hint}")
+            matches = difflib.get_close_matches(str(name), choices, 1)
+            hint = f"did you mean {matches[0]}?" if matches else f"known: {', '.join(dict.fromkeys(choices)) or 'none'}"
+            raise ModelError(f"{kind} {name!r} does not occur in the equation; {hint}")
 
 
 def available_threads() -> int:
@@ -348,11 +348,11 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
     return array
 
 
-def apply_along_axis(x: ArrayLike, axis: int, work: Callable[[Floats], Floats]) -> Floats:
-    """Return the result of `work` along one axis of an array, in the shape of the array; messages call the array x.
+def apply_along_axis(x: ArrayLike, axis: int, function: Callable[[Floats], Floats]) -> Floats:
+    """Return the result of `function` along one axis of an array, in the shape of the array; messages call the array x.
 
-    `work` maps a matrix to a matrix of the same shape, row by row. Raise DataError for values that are not finite, an
-    empty array or an unknown axis.
+    `function` maps a matrix to a matrix of the same shape, row by row. Raise DataError for values that are not finite,
+    an empty array or an unknown axis.
     """
     array = finite_floats("x", x)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
@@ -361,7 +361,7 @@ def apply_along_axis(x: ArrayLike, axis: int, work: Callable[[Floats], Floats]) 
     if samples.shape[-1] == 0:
         raise DataError(f"x has shape {array.shape} and no values; give at least one")
     rows = np.ascontiguousarray(samples.reshape(-1, samples.shape[-1]))
-    return np.moveaxis(work(rows).reshape(samples.shape), -1, axis)
+    return np.moveaxis(function(rows).reshape(samples.shape), -1, axis)
 
 
 CSV_TIME = "t_s"
