@@ -3,9 +3,9 @@
 ``python benches/automatic.py [--plants known,drawn,measured] [--seeds 1] [--kept FILE]`` compares the fit of the
 simulation on data that were not fitted, in percent, and the processor time. The known plants are those of
 ``tests/python/automatic_plants.py``, the drawn ones random ones of seed 2026, drawn after the rules of the selection
-were fixed. Of ``robot_arm`` and ``heating`` the first half is fitted, the second judged. The rivals take their order,
-1 to 6, from a fit of the first three quarters judged on the last one. They are optional: what is not installed has no
-column. Of ``heating``, which rests at a level, the rivals see deviations from the first sample.
+were fixed. Of ``robot_arm`` and ``heating`` the first half is fitted, the second validates. The others use an order of
+1 to 6, chosen by a fit of the first three quarters on the last one. They are optional: what is not installed has no
+column. Of ``heating``, which rests at a level, the other programs see deviations from the first sample.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from automatic_plants import NOISE_RATIOS, PLANTS, drawn_plants
 from measured import DATA
 from results import ResultStore, heading, save
 
-#: Orders that the rivals try, and block rows of the subspace method.
+#: Orders that the other programs try, and block rows of the subspace method.
 ORDERS, BLOCK_ROWS = range(1, 7), 15
 #: Seed of the drawn plants.
 DRAWN_SEED = 2026

@@ -282,7 +282,7 @@ def numpy_solve(run: ftlm.Run, equation: ftlm.Structure, count: int = 200_000) -
 
 
 def kernels() -> None:
-    """P4, P5 and P6: the core's own figures, each beside its transforms, and the rivals in Python."""
+    """P4, P5 and P6: the core's own figures, each beside its transforms, and other packages in Python."""
     from scipy.linalg import solve_triangular, toeplitz  # noqa: PLC0415
     from scipy.signal import fftconvolve  # noqa: PLC0415
 

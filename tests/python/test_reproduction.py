@@ -114,7 +114,8 @@ def test_every_model_s_errors_follow_from_its_file_and_the_saved_runs(saved):
 
 
 def test_table_7_follows_from_the_saved_run(saved):
-    written = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]["rivals"]["theta12"]
+    stage = json.loads((saved / "tables.json").read_text())["as it should be"]["1"]
+    written = stage["optimizer_comparisons"]["theta12"]
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
     single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
     settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
@@ -126,7 +127,7 @@ def test_table_7_follows_from_the_saved_run(saved):
         model = ftlm.load_model(saved / f"theta12-{label.replace(' ', '-')}.json")
         error = compare_means(model, run).output_error["theta12"]
         assert error.to_dict() == pytest.approx(row["estimation"]["output_error"]["theta12"], rel=1e-12)
-        # Criterion (45) is what the rivals minimised.
+        # Criterion (45) is what the other optimizers minimized.
         assert error.error == pytest.approx(min(rival.errors.values()), rel=1e-6)
 
 
@@ -179,17 +180,17 @@ def trials_of(found, prior, arm="fractional"):
     return {t.output: t for t in found.cases.trials if (t.prior, t.arm) == (prior, arm)}
 
 
-def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
+def test_multi_innovation_against_other_optimizers_turns_with_k0(reproduction):
     claim = by_words(checks(reproduction), "than the genetic algorithm")
     assert claim.holds is None
     assert "K0" in claim.ruling.factors
-    for contest in reproduction.cases.contests:
-        assert set(contest.order_grid) == {1.0, 1e10}
-        assert [set(errors) for errors in contest.optimizers.values()] == [{0, 1}] * 2
-        if contest.output.endswith("1"):
+    for case in reproduction.cases.optimizer_errors:
+        assert set(case.order_grid) == {1.0, 1e10}
+        assert [set(errors) for errors in case.optimizers.values()] == [{0, 1}] * 2
+        if case.output.endswith("1"):
             # The hubs: the data alone beat every seed of either, K0 = 1 none of the genetic algorithm's best.
-            assert contest.order_grid[1e10] < min(e for errors in contest.optimizers.values() for e in errors.values())
-            assert contest.order_grid[1.0] > 10 * contest.order_grid[1e10]
+            assert case.order_grid[1e10] < min(e for errors in case.optimizers.values() for e in errors.values())
+            assert case.order_grid[1.0] > 10 * case.order_grid[1e10]
     # Bounds of a rival are wider or narrower than the maker's values as the data have it.
     bounds = reproduction.stages[1].optimizer_comparisons["theta11"].optimizers["genetic"].bounds
     assert bounds["a1"][1] != pytest.approx(2 * 628.889, rel=0.01)
@@ -278,10 +279,10 @@ def test_a_fit_that_must_not_be_used_is_no_case_of_a_claim(reproduction):
 
 
 def test_verdicts_turn_when_the_numbers_do(reproduction):
-    panel = reproduction.cases
+    cases = reproduction.cases
     falling = {1: 4.0, 3: 3.0, 5: 2.0, 7: 1.0}
-    trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in panel.trials)
-    contests = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in panel.contests)
+    trials = tuple(replace(t, errors=falling, convergence_steps=falling, nr=0.1, manual=0.2) for t in cases.trials)
+    optimizer_errors = tuple(replace(c, order_grid=dict.fromkeys(c.order_grid, 1e-9)) for c in cases.optimizer_errors)
     freed = tuple(
         replace(
             f,
@@ -290,7 +291,7 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
             gains=dict.fromkeys(f.integer_nr, 5.0),
             is_degenerate=False,
         )
-        for f in panel.order_comparisons
+        for f in cases.order_comparisons
     )
     stage = reproduction.stages[1]
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
@@ -315,7 +316,11 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
         for o, t in reproduction.as_printed.items()
     }
     made = replace(
-        reproduction, stages={1: other}, cases=Cases(trials, contests, freed), printed_model_runs=ran, as_printed=tables
+        reproduction,
+        stages={1: other},
+        cases=Cases(trials, optimizer_errors, freed),
+        printed_model_runs=ran,
+        as_printed=tables,
     )
     found = checks(made)
     for words in (
@@ -357,8 +362,8 @@ def test_both_readings_are_saved(saved):
     assert row["coefficients"]["a"] / -0.7787 == pytest.approx(1.0, abs=0.1)
     assert row["equation"]["error"] / 0.9791 == pytest.approx(1.0, abs=0.15)
     assert {c["verdict"].partition(" on ")[0] for c in written["checks"]} >= {"does not hold", "depends"}
-    assert len(written["ran"]) == 16
-    assert {t["prior"] for t in written["panel"]["trials"]} == {1.0, 1e10}
+    assert len(written["printed_model_runs"]) == 16
+    assert {t["prior"] for t in written["cases"]["trials"]} == {1.0, 1e10}
 
 
 def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduction):
@@ -530,11 +535,11 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
             n: replace(c, validation=None, input_driven=dict(list(c.input_driven.items())[:1]))
             for n, c in stage.candidates.items()
         }
-        rivals = {
+        comparisons = {
             o: replace(r, models={n: replace(c, validation=None) for n, c in r.models.items()})
             for o, r in stage.optimizer_comparisons.items()
         }
-        stages[number] = replace(stage, candidates=candidates, optimizer_comparisons=rivals)
+        stages[number] = replace(stage, candidates=candidates, optimizer_comparisons=comparisons)
     alone = replace(reproduction, sine=None, stages=stages, simulated=False)
     text = alone.page(tmp_path / "alone.html").read_text()
     assert "nothing is validated" in text
@@ -591,14 +596,14 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
     assert "pip install 'ftlm[genetic]'" in lines[0]
     assert found.notes.count(lines[0]) == 1
     assert found.optimizer_comparisons == {}
-    assert found.cases.contests == ()
+    assert found.cases.optimizer_errors == ()
     # The joint fits of the other arm do not need the optimizers.
     assert {c.arm for c in found.cases.order_comparisons} == {"fractional", "whole orders"}
     page = found.page(tmp_path / "paper.html").read_text()
     assert "Tables 6 and 7 and Figure 11 are left out: " in page
     assert "Table 5." in page
     assert "Table 6. " not in page
-    assert "Table 7. Multi-innovation and its rivals" not in page
+    assert "Table 7. Multi-innovation and other optimizers" not in page
 
 
 def test_stages_are_found_by_their_signals(reproduction):

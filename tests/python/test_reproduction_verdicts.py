@@ -1,4 +1,4 @@
-"""Verdicts of the reproduction: their rule, the rivals, the printed models simulated, the paper's tables."""
+"""Verdicts of the reproduction: their rule, the other optimizers, the printed models simulated, the paper's tables."""
 
 import threading
 from dataclasses import replace
@@ -241,7 +241,7 @@ def test_the_scan_s_closed_form_is_the_recursion(tables):
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Rivals
+# Other optimizers
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +250,7 @@ def hub():
     return demo_run("square").select(list(structure.signals)), structure.equation("theta21")
 
 
-def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(hub):
+def test_optimizers_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(hub):
     run, single = hub
     lattice = ftlm.OrderGrid(increment=0.25, alpha=(1.95, 2.0))
     settings = ftlm.GeneticAlgorithm(seeds=(0,), evaluations=400)
@@ -301,7 +301,7 @@ def test_multi_innovation_is_held_against_the_median_seed():
 
 
 @pytest.mark.parametrize("step", [0.05, 0.25])
-def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch, step):
+def test_optimizers_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch, step):
     given = []
 
     def like(run, single, lattice, asked, **_):
@@ -315,7 +315,7 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
         simulated_cases(1, "whole orders", [1], 0.0, preset, silent_progress())
     work = StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress())
     assert work.compare_optimizers() == {}
-    assert replace(preset, rivals_increment=0.01).comparison_order_grid.increment == step
+    assert replace(preset, comparison_increment=0.01).comparison_order_grid.increment == step
     assert given[0] == given[1] == (ftlm.OrderGrid(increment=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
@@ -404,12 +404,12 @@ def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end(
 def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
     stage = seconds_of_all(0.05, 1)
     assert seconds_of_all(0.05, 2) == 2 * stage
-    assert seconds_of_all(0.05, 1, arms=1) > stage + seconds_of("freed", 0.05)
+    assert seconds_of_all(0.05, 1, arms=1) > stage + seconds_of("order comparison", 0.05)
     assert seconds_of_all(0.025, 1) > stage > seconds_of_all(0.1, 1)
-    # Rivals' lattices are no finer than theirs.
-    assert seconds_of("rivals", 0.05) == seconds_of("rivals", 0.1) > seconds_of("rivals", 0.2)
+    # Order grids of the comparison are no finer than theirs.
+    assert seconds_of("optimizers", 0.05) == seconds_of("optimizers", 0.1) > seconds_of("optimizers", 0.2)
     # Sixteen times the evaluations a seed, three seeds for ten.
-    assert seconds_of("rivals", 0.05, 0.05) == pytest.approx(16 * 3 / 10 * seconds_of("rivals", 0.05))
+    assert seconds_of("optimizers", 0.05, 0.05) == pytest.approx(16 * 3 / 10 * seconds_of("optimizers", 0.05))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -436,8 +436,8 @@ def test_arms_differ_in_what_they_are_called_for():
         ({"records": 0}, "records = 0 is not a whole number from 1"),
         ({"records": 2.5}, "records = 2.5 is not a whole number from 1"),
         ({"increment": 0.0}, "increment"),
-        ({"rivals_increment": 0.0}, "increment"),
-        ({"rivals_increment": "0.1"}, "increment"),
+        ({"comparison_increment": 0.0}, "increment"),
+        ({"comparison_increment": "0.1"}, "increment"),
     ],
 )
 def test_what_cannot_be_asked_for_is_said_first(words, message):

@@ -51,7 +51,7 @@ def demo(
         Seed of the noise.
     """
     with Progress("", quiet=as_json) as progress:
-        progress.expect("the demo", estimate_duration(DEMO_SECONDS * (0.1 / increment) ** 2, check_threads(threads)))
+        progress.announce("the demo", estimate_duration(DEMO_SECONDS * (0.1 / increment) ** 2, check_threads(threads)))
         result = run_demo(
             Path(out),
             increment=increment,
@@ -59,7 +59,7 @@ def demo(
             seed=seed,
             threads=threads,
             force=force,
-            log=progress.name,
+            log=progress.set_label,
             progress=progress,
         )
         result.files.append(demo_page(result, Path(out) / "demo.html", force=force))
@@ -85,7 +85,7 @@ def reproduce(
     seed: NonNegative = 1,
     arms: list[str] | None = None,
     records: Positive = 3,
-    rivals_increment: float = COMPARISON_INCREMENT,
+    comparison_increment: float = COMPARISON_INCREMENT,
     genetic: GeneticOptions,
     threads: int | None = None,
     force: bool = False,
@@ -109,7 +109,7 @@ def reproduce(
         Simulated arm for the verdicts; several, or all.
     records
         Records per arm, with different noise.
-    rivals_increment
+    comparison_increment
         Minimum order increment in the genetic comparison.
     """
     if save is not None:
@@ -125,14 +125,14 @@ def reproduce(
             noise=noise,
             seed=seed,
             genetic=GeneticAlgorithm(**rival) if rival else None,
-            rivals_increment=rivals_increment,
+            comparison_increment=comparison_increment,
             arms=arms,
             records=records,
             threads=threads,
-            log=progress.say,
+            log=progress.print_label,
             progress=progress,
         )
-        progress.say("writing the page")
+        progress.print_label("writing the page")
         files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]
     if as_json:
         show_json({**result.to_dict(), "files": [str(f) for f in files]})
@@ -160,8 +160,8 @@ def orders(
     """
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
-        result = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
-        progress.say("writing the page")
+        result = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.print_label, progress=progress)
+        progress.print_label("writing the page")
         page = cross_validation_page(result, out, force=force)
     if as_json:
         show_json({**result.to_dict(), "files": [str(page)]})

@@ -384,20 +384,20 @@ def has_smaller_error(error: float, seeds: Iterable[float]) -> bool:
 
 def optimizers(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
-    contests = reproduction.cases.contests
+    comparisons = reproduction.cases.optimizer_errors
     cases = []
-    for c in contests:
+    for c in comparisons:
         for k, (name, errors) in product(c.order_grid, c.optimizers.items()):
             holds = has_smaller_error(c.order_grid[k], errors.values())
-            cases.append(case(holds, K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name))
-    first = {c.output: c for c in reversed(contests)}
+            cases.append(case(holds, K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_optimizer=name))
+    first = {c.output: c for c in reversed(comparisons)}
     own = {o: first[o] for o in ANGLE_NAMES if o in first}
     of_seeds = (min, statistics.median, max)
     both = {
         o: (*c.order_grid.values(), *(f(each.values()) for each in c.optimizers.values() for f in of_seeds))
         for o, c in own.items()
     }
-    seeds = [len(c.optimizers["genetic"]) for c in contests]
+    seeds = [len(c.optimizers["genetic"]) for c in comparisons]
     return combine_cases(cases), {
         "errors": by_angle(both),
         "budgets": ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values())),

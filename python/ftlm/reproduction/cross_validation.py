@@ -30,7 +30,7 @@ from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart
-from ftlm.utils.files import check_free
+from ftlm.utils.files import check_writable
 from ftlm.utils.formatting import Cell, Exact, attributes, finite, format_bound, json_value, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
@@ -354,7 +354,7 @@ def cross_validate_orders(
         numbers = [len(s.order_names) + len(s.coefficient_names) for s in structures]
         each = sum(output_error_cost(run.length, count) for count in numbers for run in used)
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
-        progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
+        progress.announce("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
 
     def cross_validate(structure: Structure, suffix: str = "") -> Deflection:
         """Fit a structure with each set of free orders to every run; return the cross-validation of its output."""
@@ -528,7 +528,7 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
     DataError
         If the file exists and `force` is False, or it cannot be written.
     """
-    check_free(path, force=force)
+    check_writable(path, force=force)
     both: list[Markup] = []
     alone: list[Markup] = []
     charts: list[LineChart] = []

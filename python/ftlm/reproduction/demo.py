@@ -156,7 +156,7 @@ def run_demo(
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
     grid = OrderGrid(increment=increment, alpha=GRID_ALPHA)
-    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, rivals_increment=None, threads=threads)
+    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, comparison_increment=None, threads=threads)
     seconds = (len(INNOVATION_LENGTHS) + 1) * seconds_of("search", increment) + seconds_of("output error", increment)
     whole = TotalProgress(len(STAGE_NUMBERS) * seconds, progress)
     steps = WorkerProgress(whole, threading.Event())

@@ -297,7 +297,7 @@ class AsPrinted:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as a dictionary for JSON."""
-        settings = {"closest settings": str(self.interpretation), "reading": json_value(self.interpretation)}
+        settings = {"closest settings": str(self.interpretation), "interpretation": json_value(self.interpretation)}
         numbers = attributes(self, ("ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows"))
         return settings | numbers | attributes(self, ("rank", "among", "best"))
 

@@ -35,7 +35,7 @@ from ftlm.structure.equation import format_equation
 from ftlm.svg.figure import Figure, StaticFigure
 from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, read_resource, write_page
 from ftlm.svg.line_chart import LineChart
-from ftlm.utils.files import check_free
+from ftlm.utils.files import check_writable
 from ftlm.utils.formatting import (
     DIVERGED_TEXT,
     SIGNIFICANT_DIGITS,
@@ -636,7 +636,7 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
 
     Raise DataError if the file exists and `force` is False, or it cannot be written.
     """
-    check_free(path, force=force)
+    check_writable(path, force=force)
     names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
     origin = page_text("simulated_origin") if reproduction.simulated else f"the runs {names},"
     strongest = page_text("strongest", brief=reproduction.checks[0].brief) if reproduction.printed_model_runs else ""

@@ -168,8 +168,8 @@ class Reproduction:
             "order_grid": attributes(self.order_grid, ("increment", "alpha")),
             "as it should be": json_value(self.stages),
             **attributes(self, ("checks", "as_printed")),
-            "ran": json_value(self.printed_model_runs),
-            "panel": json_value(self.cases),
+            "printed_model_runs": json_value(self.printed_model_runs),
+            "cases": json_value(self.cases),
             "notes": json_value(self.notes),
         }
 
@@ -187,7 +187,7 @@ def reproduce(
     noise: float = 1e-4,
     seed: int = 1,
     genetic: GeneticAlgorithm | None = None,
-    rivals_increment: float = COMPARISON_INCREMENT,
+    comparison_increment: float = COMPARISON_INCREMENT,
     arms: Sequence[str] | None = None,
     records: int = 3,
     threads: int | None = None,
@@ -213,7 +213,7 @@ def reproduce(
         Settings of the genetic algorithm, whose seeds and evaluations also apply to differential evolution. By default
         each seed has as many evaluations as the compared order grid has candidates, and there are ten seeds, or fewer
         on a fine grid. `order_grid` and `norm` must not be set, because the comparison determines them.
-    rivals_increment
+    comparison_increment
         Minimum increment of the order grid on which multi-innovation, the genetic algorithm and differential
         evolution are compared. The paper's 0.05 takes sixteen times as long as the default.
     arms
@@ -248,7 +248,7 @@ def reproduce(
         )
     simulated = square is None
     others, grid = _other_arms(arms, records), OrderGrid(increment=increment, alpha=computation.GRID_ALPHA)
-    for each in (increment, real_number("rivals_increment", rivals_increment)):
+    for each in (increment, real_number("comparison_increment", comparison_increment)):
         replace(grid, increment=each).values(computation.published_structure(1))
     if square is None and sine is not None:
         raise ModelError("a sine run is given without a square run; give both, or neither")
@@ -257,16 +257,16 @@ def reproduce(
         load_pygad()
         load_differential_evolution()
     except ModelError as error:
-        omitted.append(page_text("rivals_omitted", reason=error))
+        omitted.append(page_text("comparison_omitted", reason=error))
         log(omitted[0])
-    compared_increment = None if omitted else rivals_increment
-    preset = Preset(grid, rivals_increment=compared_increment, genetic=genetic, threads=threads)
+    compared_increment = None if omitted else comparison_increment
+    preset = Preset(grid, comparison_increment=compared_increment, genetic=genetic, threads=threads)
     if square is None:
         log("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
     more = (len(others), records) if simulated else ()
-    seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=compared_increment)
+    seconds = seconds_of_all(increment, len(numbers), *more, comparison_increment=compared_increment)
     expected = estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))
     log(f"this takes {format_time_left(expected).removesuffix(' left')}")
     seeds, runs = [seed + k for k in range(records)], (square, sine)

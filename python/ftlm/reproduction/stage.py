@@ -245,7 +245,7 @@ class Stage:
         """Return the results of the joint as a dictionary for JSON."""
         derived = attributes(self.derived, ("output", "order", "correlations"))
         parts = {"models": json_value(self.candidates), "derived input order": derived}
-        return parts | attributes(self, ("printed_orders", "weak")) | {"rivals": json_value(self.optimizer_comparisons)}
+        return parts | attributes(self, ("printed_orders", "weak", "optimizer_comparisons"))
 
 
 def compare_optimizers(
@@ -424,7 +424,7 @@ class Cases:
     """All cases on which verdicts on claims are based: multi-innovation, other optimizers, integer and free orders."""
 
     trials: tuple[Trial, ...] = ()
-    contests: tuple[OptimizerErrors, ...] = ()
+    optimizer_errors: tuple[OptimizerErrors, ...] = ()
     order_comparisons: tuple[OrderComparison, ...] = ()
 
     def __add__(self, other: Cases) -> Cases:
@@ -519,8 +519,8 @@ def cases_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
     """Return the cases for verdicts from the results of one joint; trials are omitted for a run not from rest."""
     models = stage.candidates["integer, identified"], stage.candidates["output error"]
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
-    contests = (OptimizerErrors.of(arm, o, comparison) for o, comparison in stage.optimizer_comparisons.items())
-    return Cases(tuple(trials), tuple(contests), (OrderComparison.of(arm, stage.number, *models),))
+    errors = (OptimizerErrors.of(arm, o, comparison) for o, comparison in stage.optimizer_comparisons.items())
+    return Cases(tuple(trials), tuple(errors), (OrderComparison.of(arm, stage.number, *models),))
 
 
 @dataclass(frozen=True)
@@ -530,20 +530,20 @@ class Preset:
     order_grid: OrderGrid
     top: int | None = None  # table rows of an order search with identification; None for no identification
     trace_every: int = TRACE_EVERY  # recursion steps between two points of a convergence curve
-    rivals_increment: float | None = COMPARISON_INCREMENT  # minimum order increment of the comparison; None without one
+    comparison_increment: float | None = COMPARISON_INCREMENT  # minimum order increment; None: no comparison
     genetic: GeneticAlgorithm | None = None  # settings of the optimizer comparison; None for default settings
     threads: int | None = None
 
     @property
     def comparison_order_grid(self) -> OrderGrid | None:
         """Order grid of the optimizer comparison; None for no comparison."""
-        if self.rivals_increment is None:
+        if self.comparison_increment is None:
             return None
-        return OrderGrid(increment=max(self.order_grid.increment, self.rivals_increment), alpha=COMPARISON_ALPHA)
+        return OrderGrid(increment=max(self.order_grid.increment, self.comparison_increment), alpha=COMPARISON_ALPHA)
 
     def seconds_of(self, step: str) -> float:
         """Return the expected processor time [s] of the step with this name, at the order increments of this preset."""
-        return seconds_of(step, self.order_grid.increment, self.rivals_increment)
+        return seconds_of(step, self.order_grid.increment, self.comparison_increment)
 
 
 def simulated_cases(
@@ -566,12 +566,12 @@ def simulated_cases(
         own, grid = run.select(list(structure.signals)), preset.comparison_order_grid
         if grid is not None:
             for output in structure.outputs:
-                progress.begin(preset.seconds_of("rivals"))
+                progress.begin(preset.seconds_of("optimizers"))
                 comparison = compare_optimizers(
                     own, structure.equation(output), grid, preset.genetic, **execution_options
                 )
-                cases += Cases(contests=(OptimizerErrors.of(arm, output, comparison),))
-        progress.begin(preset.seconds_of("freed"))
+                cases += Cases(optimizer_errors=(OptimizerErrors.of(arm, output, comparison),))
+        progress.begin(preset.seconds_of("order comparison"))
         cases += Cases(order_comparisons=(compare_orders(stage, run, arm, validation=validation, **execution_options),))
     return cases
 
@@ -815,11 +815,11 @@ class StageWork:
             return {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
-            self.begin(f"the rivals on {output}", "rivals")
+            self.begin(f"the other optimizers on {output}", "optimizers")
             try:
                 comparison = compare_optimizers(run, single, grid, self.preset.genetic, **self.execution_options)
             except ModelError as error:
-                self.notes.append(page_text("rivals_omitted", reason=error))
+                self.notes.append(page_text("comparison_omitted", reason=error))
                 return {}
             searches = dict(zip(MULTI_INNOVATION_LABELS, comparison.order_grid.values(), strict=True))
             ends: dict[str, GeneticRun | SearchResult] = {**comparison.optimizers, **searches}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 
-from ftlm.progress import ShareTracker, Stoppable
+from ftlm.progress import CancellableProgress, FractionTracker
 
 #: Steps of the reproduction: processor time on one core of the reference machine [s], number of executions for a joint
 #: of the estimation run, and for a joint of another arm. Times hold for the paper's increment of the order grid, and
-#: for the default increment of the optimizer comparison ("rivals"). They are three quarters of the measured times,
+#: for the default increment of the optimizer comparison ("optimizers"). They are three quarters of the measured times,
 #: because the machine had other load.
 STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "whole orders": (1.5, 1, 0),
@@ -18,11 +18,11 @@ STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "output error": (5.8, 1, 0),
     "published": (1.5, 1, 0),
     "traces": (0.8, 1, 0),
-    "rivals": (5.2, 2, 2),
+    "optimizers": (5.2, 2, 2),
     "landscape": (2.4, 1, 0),
     "printed": (0.4, 1, 0),
     "trials": (2.0, 1, 0),
-    "freed": (4.0, 0, 1),
+    "order comparison": (4.0, 0, 1),
 }
 #: Number of candidates of the order grid in the optimizer comparison at its default increment.
 COMPARISON_CANDIDATES = 3800
@@ -41,19 +41,21 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
     return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
-def seconds_of(step: str, increment: float, rivals_increment: float | None = COMPARISON_INCREMENT) -> float:
+def seconds_of(step: str, increment: float, comparison_increment: float | None = COMPARISON_INCREMENT) -> float:
     """Return the expected processor time [s] of the step with this name.
 
-    The time of an order search is proportional to the inverse fourth power of the increment. `rivals_increment` is the
-    increment of the optimizer comparison; None without one.
+    The time of an order search is proportional to the inverse fourth power of the increment. `comparison_increment` is
+    the increment of the optimizer comparison; None without one.
     """
     scale = 1.0
     if step == "search":
         scale = (0.05 / increment) ** 4
-    elif step == "rivals":
+    elif step == "optimizers":
         candidates = 0
-        if rivals_increment is not None:
-            candidates = round(COMPARISON_CANDIDATES * (COMPARISON_INCREMENT / max(increment, rivals_increment)) ** 4)
+        if comparison_increment is not None:
+            candidates = round(
+                COMPARISON_CANDIDATES * (COMPARISON_INCREMENT / max(increment, comparison_increment)) ** 4
+            )
         scale = (
             candidates * len(seeds_for(candidates)) / (COMPARISON_CANDIDATES * len(seeds_for(COMPARISON_CANDIDATES)))
         )
@@ -66,7 +68,7 @@ def seconds_of_all(
     arms: int = 0,
     records: int = 1,
     *,
-    rivals_increment: float | None = COMPARISON_INCREMENT,
+    comparison_increment: float | None = COMPARISON_INCREMENT,
 ) -> float:
     """Return the expected processor time of the whole reproduction [s].
 
@@ -74,7 +76,7 @@ def seconds_of_all(
     """
     counts = {step: own + arms * other for step, (_, own, other) in STEP_COSTS.items()}
     counts["trials"] += (arms + 1) * records - 1
-    return stages * sum(count * seconds_of(step, increment, rivals_increment) for step, count in counts.items())
+    return stages * sum(count * seconds_of(step, increment, comparison_increment) for step, count in counts.items())
 
 
 class TotalProgress:
@@ -85,11 +87,11 @@ class TotalProgress:
     seconds
         Expected processor time of all work [s].
     listener
-        Progress callback with (parts done, total parts); see :class:`ftlm.progress.ShareTracker`.
+        Progress callback with (parts done, total parts); see :class:`ftlm.progress.FractionTracker`.
     """
 
     def __init__(self, seconds: float, listener: Callable[[int, int], None] | None) -> None:
-        self._seconds, self._course, self._lock = max(seconds, 1e-9), ShareTracker(listener), threading.Lock()
+        self._seconds, self._course, self._lock = max(seconds, 1e-9), FractionTracker(listener), threading.Lock()
         self._seconds_by_worker: dict[object, float] = {}
 
     def report(self, worker: object, seconds: float) -> None:
@@ -103,7 +105,7 @@ class TotalProgress:
         self._course.advance_to(1.0)
 
 
-class WorkerProgress(Stoppable):
+class WorkerProgress(CancellableProgress):
     """Progress callback of one worker thread.
 
     Searches and fits call it with the counts (done, total) of their own work.
