@@ -21,7 +21,7 @@ stand for values. `docs/findings.py` writes this page from the catalogue.
 
 def cell(text: str) -> str:
     """Return the text of a table cell, with placeholders in italics."""
-    shown = re.sub(r"\{ask\[(\w+)(?: is ([\w-]+))?\]\}", lambda m: f"`{m[1]}={repr(m[2]) if m[2] else ''}`", text)
+    shown = re.sub(r"\{option\[(\w+)(?: is ([\w-]+))?\]\}", lambda m: f"`{m[1]}={repr(m[2]) if m[2] else ''}`", text)
     shown = re.sub(r"\{choose\[[^\]]*\]\}", "`validate`", shown)
     return re.sub(r"\{(\w+)(?::[^}]*)?\}", r"*\1*", shown).replace("|", "").replace("**", "* *")
 

@@ -6,7 +6,7 @@ import signal
 import threading
 
 
-def _leave(*_: object) -> None:
+def _exit_interrupted(*_: object) -> None:
     os.write(2, b"ftlm: interrupted; nothing was written\n")
     os._exit(130)
 
@@ -17,7 +17,7 @@ _OWNS_INTERRUPT = (
     and threading.current_thread() is threading.main_thread()
 )
 if _OWNS_INTERRUPT:
-    signal.signal(signal.SIGINT, _leave)
+    signal.signal(signal.SIGINT, _exit_interrupted)
 # Imports create no garbage, and the collector would take a twentieth of the start-up time.
 gc.disable()
 # The handler above must be in place during this import.

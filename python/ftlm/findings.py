@@ -25,7 +25,7 @@ MAX_SUMMARY_FINDINGS = 3
 #: Codes of findings that residuals are not white.
 NOT_WHITE_CODES = ("residuals_not_white", "output_not_white", "noise_coloured", "response_not_white")
 #: Codes of findings that residuals indicate a missing part of the model.
-LEFT_OUT_CODES = (
+MISSING_PART_CODES = (
     "residuals_follow_input",
     "coupling_missing",
     "residuals_follow_direction",
@@ -44,7 +44,7 @@ class Topic:
 
     Parameters
     ----------
-    what
+    statement
         Common statement of the findings of this topic.
     remedy
         Template of the recommended action.
@@ -56,7 +56,7 @@ class Topic:
         whiteness test that fails because of rounding only.
     """
 
-    what: str
+    statement: str
     remedy: str = ""
     alternative: str = ""
     method: str = ""
@@ -101,7 +101,7 @@ class FindingKind:
         Template of the beginning of the sentence, which names the run. It is omitted if the finding names no run.
     names_missing_part
         Whether the finding names a missing part of the model. Such a finding precedes findings on residuals.
-    judges_whole_run
+    simulates_whole_run
         Whether the finding is based on the simulation of a whole run, which diverges for an unstable plant.
     """
 
@@ -112,7 +112,7 @@ class FindingKind:
     remedy: str = ""
     prefix: str = ""
     names_missing_part: bool = False
-    judges_whole_run: bool = False
+    simulates_whole_run: bool = False
 
     @property
     def states_remedy(self) -> bool:
@@ -146,8 +146,8 @@ def finding_catalogue() -> Catalogue:
 finding_catalogue()
 
 
-class _Reference:
-    """Object ``ask`` in templates, which replaces ``{ask[offset]}`` or ``{ask[offset is none]}`` by parameter text.
+class _ParameterText:
+    """Object ``option`` in templates, which replaces ``{option[offset]}`` and ``{option[offset is none]}`` by text.
 
     The text is that of :func:`ftlm.utils.parameters.parameter`.
     """
@@ -157,14 +157,14 @@ class _Reference:
         return parameter(name, value or None)
 
 
-class _Choice:
+class _InterfaceText:
     """Object ``choose`` in templates, which replaces ``{choose[validate]}`` by text for the interface."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
-class _Sentence(string.Formatter):
+class _SentenceFormatter(string.Formatter):
     """Formatter of templates that inserts text such as "inf" unchanged, even where the template formats a number."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
@@ -243,7 +243,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         kind = self.kind
         if kind.reason == SAME_REASON:
             return self.sentence
-        return self._render(kind.reason or f"{self.topic.what}: {kind.template.partition('|')[0]}")
+        return self._render(kind.reason or f"{self.topic.statement}: {kind.template.partition('|')[0]}")
 
     @property
     def remedy(self) -> str:
@@ -260,11 +260,11 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         # An option in the words of the one who loaded the run means nothing to the reader of a page.
         otherwise = self.numbers.get("otherwise", "") if current_interface() in TYPED_INTERFACES else ""
         otherwise = f"; otherwise {otherwise}" if otherwise else ""
-        fields |= {**self.numbers, "otherwise": otherwise, "ask": _Reference(), "choose": _Choice()}
+        fields |= {**self.numbers, "otherwise": otherwise, "option": _ParameterText(), "choose": _InterfaceText()}
         try:
             if "{remedy}" in template:
                 fields["remedy"] = self.remedy
-            return _Sentence().vformat(template, (), fields)
+            return _SentenceFormatter().vformat(template, (), fields)
         except (KeyError, ValueError, TypeError):
             # A finding from a file may lack a number of the sentence.
             return self.code
@@ -305,7 +305,7 @@ def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
     return tuple(f.text for f in findings)
 
 
-def on_validation(findings: Iterable[Finding], run: str) -> list[Finding]:
+def mark_validation(findings: Iterable[Finding], run: str) -> list[Finding]:
     """Return copies of findings, marked as coming from the validation run with the name `run`."""
     return [msgspec.structs.replace(f, run=f.run or run, role=VALIDATION_ROLE) for f in findings]
 

@@ -23,12 +23,12 @@ ANNOUNCEMENT_THRESHOLD_S = 2.0
 MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS, WIDE_TERMINAL_COLUMNS = 10, 12, 100
 
 
-class ShareTotal(int):
+class PercentTotal(int):
     """Total number of parts for which a progress bar shows only a percentage, without counts."""
 
 
 #: Total number of parts of work that has no natural units to count.
-TOTAL_PARTS = ShareTotal(1000)
+TOTAL_PARTS = PercentTotal(1000)
 
 
 def format_time_left(seconds: float) -> str:
@@ -56,7 +56,7 @@ def round_coarsely(value: float) -> float:
     return power * min((1, 2, 3, 5, 7, 10), key=lambda digit: abs(digit * power - value))
 
 
-class ShareTracker:
+class FractionTracker:
     """Tracker of the completed fraction of work that consists of several parts. The fraction never decreases.
 
     Parameters
@@ -67,13 +67,13 @@ class ShareTracker:
 
     def __init__(self, listener: Callable[[int, int], None] | None) -> None:
         self._listener = listener
-        self.reached = 0.0
+        self.fraction = 0.0
         self._reported_parts = -1
 
     def advance_to(self, fraction: float) -> None:
         """Report that the fraction `fraction` of the whole work is completed; a decrease is ignored."""
-        self.reached = max(self.reached, min(fraction, 1.0))
-        parts = round(TOTAL_PARTS * self.reached)
+        self.fraction = max(self.fraction, min(fraction, 1.0))
+        parts = round(TOTAL_PARTS * self.fraction)
         if self._listener is not None and parts > self._reported_parts:
             self._reported_parts = parts
             self._listener(parts, TOTAL_PARTS)
@@ -84,13 +84,13 @@ class ShareTracker:
         The part may count from 0 to its total several times. Each such pass then covers the fraction `pass_fraction` of
         the remaining work of the part.
         """
-        first, last = self.reached, 0.0
+        first, last = self.fraction, 0.0
 
         def report_subtask(count: int, total: int) -> None:
             nonlocal first, last
             fraction = count / max(total, 1)
             if fraction < last:
-                first = self.reached
+                first = self.fraction
             last = fraction
             self.advance_to(first + pass_fraction * (end_fraction - first) * fraction)
 
@@ -149,7 +149,7 @@ class Progress:
         elapsed = max(time.monotonic() - self._start, 1e-9)
         text = f"{100 * count // total:.0f} %"
         # For work without natural units, only the percentage is shown.
-        if not isinstance(total, ShareTotal):
+        if not isinstance(total, PercentTotal):
             text += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
             text += f" {count / elapsed:,.0f}/s"
         pruned_text = "" if pruned is None else f"{100 * pruned / max(count, 1):.1f} % pruned"
@@ -159,7 +159,7 @@ class Progress:
             # The next search of the same job starts a new bar.
             self._stop()
 
-    def so_far(self, count: int, total: int) -> None:
+    def show_count(self, count: int, total: int) -> None:
         """Show that ``count`` of ``total`` parts are completed, for work whose total may still increase."""
         elapsed = time.monotonic() - self._start
         if self._quiet or elapsed < BAR_DELAY_S:
@@ -171,19 +171,19 @@ class Progress:
         """Whether nothing is shown."""
         return self._quiet
 
-    def expect(self, label: str, shortest: float, longest: float | None = None) -> None:
+    def announce(self, label: str, shortest: float, longest: float | None = None) -> None:
         """Print the estimated duration of the work `label`, from `shortest` to `longest` [s], if it is long."""
         longest = shortest if longest is None else longest
         if not self._quiet and longest >= ANNOUNCEMENT_THRESHOLD_S:
             print(f"{label} takes {format_duration_estimate(shortest, longest)}; Ctrl-C ends it", file=sys.stderr)
 
-    def name(self, label: str) -> None:
+    def set_label(self, label: str) -> None:
         """Set the label of the bar."""
         self._label = label
 
-    def say(self, label: str) -> None:
+    def print_label(self, label: str) -> None:
         """Set the label of the bar and print it."""
-        self.name(label)
+        self.set_label(label)
         if not self._quiet:
             print(label, file=sys.stderr)
 
@@ -212,7 +212,7 @@ class Progress:
         self._stop()
 
 
-class Stoppable(Progress):
+class CancellableProgress(Progress):
     """Progress callback for work in another thread, which can also cancel this work.
 
     Parameters
@@ -227,11 +227,11 @@ class Stoppable(Progress):
     def __init__(self, listener: Callable[[int, int], None] | None, stop: threading.Event) -> None:
         super().__init__("", quiet=True)
         self._listener = listener
-        self._ended = stop
+        self._stop_event = stop
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Forward a report to the listener; raise KeyboardInterrupt if the stop event is set."""
-        if self._ended.is_set():
+        if self._stop_event.is_set():
             raise KeyboardInterrupt
         if isinstance(self._listener, Progress):
             self._listener(count, total, pruned)

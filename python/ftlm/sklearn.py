@@ -25,7 +25,7 @@ except ImportError:
 
 
 #: Maximum deviation of a step of a data frame's index from the median step, as a fraction of the median step.
-MAX_INDEX_JITTER_SHARE = 0.02
+MAX_INDEX_JITTER_FRACTION = 0.02
 
 
 class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseEstimator):  # type: ignore[misc, name-defined]
@@ -124,7 +124,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         run = self._run(X, table, "fit")
         self.identification_ = identify(run, structure, method=self.method, threads=self.threads, offset=self.offset)
         self.model_ = self.identification_.model
-        self._fit_inputs, self._flat = X.copy(), np.ndim(y) == 1
+        self._fit_inputs, self._is_vector = X.copy(), np.ndim(y) == 1
         return self
 
     @check_arguments
@@ -150,7 +150,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         run = self._run(X, np.zeros((len(X), len(self._outputs))), "predict")
         free = self.model_.simulate(run, initial={o: {} for o in self._outputs})
         out: Floats = np.stack([free[o] for o in self._outputs], axis=1)[rows_before:rows]
-        return out[:, 0] if self._flat else out
+        return out[:, 0] if self._is_vector else out
 
     def _structure(self, inputs: int, outputs: int) -> Structure:
         """Return the structure for the numbers of input and output columns, with the requested orders.
@@ -214,7 +214,7 @@ def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
     """
     steps = np.diff(index) if index is not None else np.zeros(0)
     usual = float(np.median(steps)) if steps.size else 1.0
-    bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))
+    bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_FRACTION * usual)))
     if not bad.size:
         return index
     where = "between the fitted rows and those of X" if fit_rows == bad[0] + 1 else f"after row {bad[0]} of X"

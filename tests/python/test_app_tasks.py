@@ -37,7 +37,7 @@ from ftlm.utils.parameters import (
     parameter,
     use_interface,
 )
-from ftlm.utils.resources import python_child
+from ftlm.utils.resources import subprocess_arguments
 
 
 @pytest.fixture(scope="module")
@@ -470,7 +470,7 @@ def test_children_search_neither_the_working_folder_nor_relative_entries(tmp_pat
     monkeypatch.setenv("PYTHONPATH", f":.:{tmp_path}")
     monkeypatch.setattr(sys, "path", ["", ".", str(tmp_path), "relative", *sys.path])
     for site in (True, False):
-        ran = subprocess.run(**python_child(script, site=site), capture_output=True, text=True, check=True)
+        ran = subprocess.run(**subprocess_arguments(script, site=site), capture_output=True, text=True, check=True)
         folder, searched, variable = json.loads(ran.stdout)
         assert (Path(folder), variable) == (Path(sys.prefix), None)
         assert all(map(os.path.isabs, searched))

@@ -241,13 +241,13 @@ def starts_process(call):
 
 
 def careless_processes(source):
-    """Calls that start a process in another way than `python_child` says, and imports that may."""
+    """Calls that start a process in another way than `subprocess_arguments` says, and imports that may."""
     tree = ast.parse(source)
     functions = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
     careful = {
         call
         for function in functions
-        if "python_child(" in source and "python_child(" in ast.unparse(function)
+        if "subprocess_arguments(" in source and "subprocess_arguments(" in ast.unparse(function)
         for call in ast.walk(function)
         if isinstance(call, ast.Call) and any(k.arg is None for k in call.keywords)
     }
@@ -269,7 +269,7 @@ def careless_processes(source):
 def test_every_process_is_started_in_one_way():
     found = {name_of(path): careless_processes(path.read_text(encoding="utf-8")) for path in PYTHON}
     assert {name: calls for name, calls in found.items() if calls} == {}
-    users = [name_of(p) for p in PYTHON if "python_child(" in p.read_text(encoding="utf-8")]
+    users = [name_of(p) for p in PYTHON if "subprocess_arguments(" in p.read_text(encoding="utf-8")]
     assert sorted(users) == [
         "python/ftlm/app/subprocess_task.py",
         "python/ftlm/io/isolated_reader.py",
@@ -281,9 +281,9 @@ def test_every_process_is_started_in_one_way():
 @pytest.mark.parametrize(
     ("source", "count"),
     [
-        ("def f():\n    subprocess.run(**python_child(p), stdin=0)", 0),
+        ("def f():\n    subprocess.run(**subprocess_arguments(p), stdin=0)", 0),
         ("def f():\n    subprocess.run([sys.executable, p])", 1),
-        ("def f():\n    python_child(p)\n    subprocess.Popen([p])", 1),
+        ("def f():\n    subprocess_arguments(p)\n    subprocess.Popen([p])", 1),
         ("subprocess.run(**options)", 1),
         ("async def f():\n    await asyncio.create_subprocess_exec(p)", 1),
         ("os.execv(p, [])", 1),

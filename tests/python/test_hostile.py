@@ -77,7 +77,7 @@ def test_a_file_that_is_overwritten_keeps_its_permissions(tmp_path, mode):
 @pytest.mark.parametrize("links", [True, False])
 def test_a_file_that_is_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch, links):
     path = tmp_path / "run.csv"
-    real = output.check_new
+    real = output.check_target
 
     def late(file, **options):
         found = real(file, **options)
@@ -85,7 +85,7 @@ def test_a_file_that_is_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch,
             path.write_text("theirs")
         return found
 
-    monkeypatch.setattr(output, "check_new", late)
+    monkeypatch.setattr(output, "check_target", late)
     if not links:
         monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no links here")))
     with pytest.raises(ftlm.DataError, match="exists"):

@@ -17,8 +17,8 @@ from ftlm.estimation import objective
 PACKAGE = str(Path(ftlm.__file__).parent)
 #: Functions that the core reports its progress to.
 DRIVERS = (
-    "progress.py:ShareTracker.advance_to",
-    "progress.py:ShareTracker.subtask.<locals>.report_subtask",
+    "progress.py:FractionTracker.advance_to",
+    "progress.py:FractionTracker.subtask.<locals>.report_subtask",
 )
 #: Calls that depend on the course of a fit and on what there is to report.
 SLACK_CALLS = 60

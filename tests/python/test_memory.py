@@ -12,7 +12,7 @@ import ftlm
 from ftlm.errors import ModelError
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.utils.resources import (
-    DEFAULT_MEMORY_SHARE,
+    DEFAULT_MEMORY_FRACTION,
     FALLBACK_MEMORY_BYTES,
     MEMORY_VARIABLE,
     available_memory,
@@ -65,7 +65,7 @@ def test_a_machine_is_asked_what_it_has_left(tmp_path, monkeypatch, files, left)
     monkeypatch.delenv(MEMORY_VARIABLE, raising=False)
     system = machine(tmp_path, **files)
     assert available_memory(system) == left
-    assert memory_limit(system) == int(DEFAULT_MEMORY_SHARE * left)
+    assert memory_limit(system) == int(DEFAULT_MEMORY_FRACTION * left)
 
 
 def test_a_machine_that_tells_nothing_gives_what_is_safe(tmp_path, monkeypatch):

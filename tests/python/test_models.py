@@ -18,7 +18,7 @@ from ftlm.structure.equation import format_equation
 from ftlm.structure.order import order_axis, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import check_initial
-from ftlm.utils.files import check_free, check_new, write_atomically
+from ftlm.utils.files import check_target, check_writable, write_atomically
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Orders
@@ -651,13 +651,13 @@ def test_whether_a_file_may_be_written_is_said_before_it_is(tmp_path):
     there.touch()
     exists = f"{there} exists; choose another name, or overwrite it with force=True"
     for path, text in ((there, exists), (tmp_path, f"{tmp_path} is a folder; name a file in it")):
-        for check in (check_new, check_free):
+        for check in (check_target, check_writable):
             with pytest.raises(ftlm.DataError, match=f"^{re.escape(text)}$"):
                 check(path, force=False)
     with pytest.raises(ftlm.DataError, match=f"^{re.escape(f'{new} is not a folder')}; create it first$"):
-        check_free(None, new / "file", force=False)
-    check_free(there, new, None, force=True)
-    assert check_new(new / "file", force=False) == new / "file"
+        check_writable(None, new / "file", force=False)
+    check_writable(there, new, None, force=True)
+    assert check_target(new / "file", force=False) == new / "file"
 
 
 def test_a_written_file_has_the_usual_permissions(tmp_path):

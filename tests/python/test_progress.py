@@ -19,7 +19,14 @@ from ftlm.order_search.batches import EquationProblem
 from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import announce_time, expected_seconds, make_job, run_job
-from ftlm.progress import TOTAL_PARTS, Progress, ShareTracker, Stoppable, format_duration_estimate, format_time_left
+from ftlm.progress import (
+    TOTAL_PARTS,
+    CancellableProgress,
+    FractionTracker,
+    Progress,
+    format_duration_estimate,
+    format_time_left,
+)
 from ftlm.reproduction import cross_validation as unseen
 from ftlm.utils import resources
 from ftlm.utils.resources import estimate_duration, machine_slowdown, output_error_cost
@@ -63,7 +70,7 @@ def test_a_pipe_gets_nothing(monkeypatch, capsys):
     monkeypatch.setattr(progress, "BAR_DELAY_S", 0.0)
     assert not sys.stderr.isatty()
     with Progress("searching") as bar:
-        bar.say("next search")
+        bar.print_label("next search")
         bar(50, 100)
     assert capsys.readouterr().err == ""
 
@@ -73,14 +80,14 @@ def test_quiet_says_nothing(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with Progress("searching", quiet=True) as bar:
-        bar.say("next search")
+        bar.print_label("next search")
         bar(50, 100)
     assert terminal.getvalue() == ""
 
 
 def test_stopping_ends_what_another_thread_reports():
     stop, seen = threading.Event(), []
-    callback = Stoppable(lambda done, total: seen.append((done, total)), stop)
+    callback = CancellableProgress(lambda done, total: seen.append((done, total)), stop)
     callback(1, 2, 0)
     stop.set()
     with pytest.raises(KeyboardInterrupt):
@@ -90,12 +97,12 @@ def test_stopping_ends_what_another_thread_reports():
 
 def test_a_course_never_goes_back_whatever_its_parts_count():
     reports = []
-    tracker = ShareTracker(lambda done, total: reports.append((done, total)))
+    tracker = FractionTracker(lambda done, total: reports.append((done, total)))
     part = tracker.subtask(0.5, 0.5)
     for total in (4, 9, 2):
         for done in range(total + 1):
             part(done, total)
-    assert tracker.reached < 0.5
+    assert tracker.fraction < 0.5
     tracker.advance_to(0.5)
     tracker.advance_to(0.2)
     last = tracker.subtask(1.0)
@@ -107,7 +114,7 @@ def test_a_course_never_goes_back_whatever_its_parts_count():
     # A sweep takes its share of what is left, and the next one of the rest.
     assert 250 in shares
     assert 375 in shares
-    ShareTracker(None).advance_to(1.0)
+    FractionTracker(None).advance_to(1.0)
 
 
 def test_a_fit_tells_how_far_it_is_to_its_end():
@@ -151,8 +158,8 @@ def test_time_left_follows_what_is_behind(monkeypatch):
     clock = iter(np.arange(0, 4000, 1.0))
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     with Progress("fitting") as bar:
-        bar.expect("the fit", 31.0)
-        bar.expect("nothing to wonder at", 1.0)
+        bar.announce("the fit", 31.0)
+        bar.announce("nothing to wonder at", 1.0)
         bar(100, TOTAL_PARTS)
         bar._current_bar().refresh()
     written = terminal.getvalue()
@@ -167,10 +174,10 @@ def estimates(monkeypatch):
     """What commands say beforehand, as if somebody sat before them: what takes how long at least and at most."""
     said = []
 
-    def expect(self, what, least, most=None):
+    def announce(self, what, least, most=None):
         said.append((what, least, least if most is None else most))
 
-    monkeypatch.setattr(Progress, "expect", expect)
+    monkeypatch.setattr(Progress, "announce", announce)
     monkeypatch.setattr(Progress, "quiet", property(lambda self: False))
     return said
 
@@ -337,7 +344,7 @@ def test_work_that_grows_is_counted_and_no_end_is_made_up(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     with Progress("fitting candidates") as bar:
         for done in (3, 8, 8):
-            bar.so_far(done, 8)
+            bar.show_count(done, 8)
             bar._current_bar().refresh()
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
     assert "fitting candidates" in plain

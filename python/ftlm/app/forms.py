@@ -80,7 +80,7 @@ class RunSource:
         if not self.path or run.name != base_name(Path(self.path)):
             return run
         name = base_name(Path(self.file))
-        return run._with(name=name if is_run_name(name) else "run")
+        return run._replace(name=name if is_run_name(name) else "run")
 
     def script(self, name: str) -> list[str]:
         """Return the lines of a Python script that load the run into the variable `name`."""
@@ -467,7 +467,7 @@ def _text(texts: Mapping[str, Any], name: str) -> str:
 #: Maximum number of outputs, and of inputs, for which structures are suggested; longer lists are not readable.
 MAX_SUGGESTED_SIGNALS = 6
 #: Upper bound of the delay in a suggested structure, as a fraction of the duration of the run.
-MAX_DELAY_SHARE = 0.1
+MAX_DELAY_FRACTION = 0.1
 
 
 @cache
@@ -488,7 +488,7 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
     suggestions: list[dict[str, str]] = []
     input_names = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
-        delay_range = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
+        delay_range = f"0:{MAX_DELAY_FRACTION * duration:.2g} s"
         terms = {
             "inputs": "".join(f" + b{k} {name}" for k, name in enumerate(input_names)),
             "delayed_inputs": "".join(f" + b{k} {name}(t - {delay_range})" for k, name in enumerate(input_names)),

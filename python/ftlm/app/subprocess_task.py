@@ -13,7 +13,7 @@ from typing import Any
 
 from ftlm.errors import DataError
 from ftlm.io.isolated_reader import describe_crash
-from ftlm.utils.resources import python_child
+from ftlm.utils.resources import subprocess_arguments
 
 _WORKER_PATH = Path(__file__).with_name("worker.py")
 #: Maximum length of a message of a worker process; a model with its charts takes some hundred kilobytes.
@@ -57,7 +57,7 @@ class Task:
         if self._ended:
             raise TaskError("stopped")
         # The process has a new session: Ctrl-C does not reach it, and killing its group also kills its children.
-        child = python_child(_WORKER_PATH)
+        child = subprocess_arguments(_WORKER_PATH)
         process = await asyncio.create_subprocess_exec(
             *child.pop("args"),
             **child,

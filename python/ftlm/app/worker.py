@@ -1,7 +1,7 @@
 """Worker process of the web app, which opens a file or fits a model.
 
-A separate process protects the server from damaged files and long fits. `ftlm.utils.resources.python_child` runs this
-file by its path.
+A separate process protects the server from damaged files and long fits. The arguments by which this file is run are
+those of `ftlm.utils.resources.subprocess_arguments`.
 
 The first line of standard input is the task, a JSON object with absolute paths: ``{"do": "open", "file": …,
 "options": …}`` or ``{"do": "model", "fit_request": …, "store": …, "model": …, "report": …}``. The process exits

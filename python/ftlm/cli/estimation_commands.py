@@ -116,7 +116,7 @@ def select_structure(
     )
     seconds = sum(fit_seconds(runs, candidate, threads) for candidate in largest)
     with Progress("fitting candidates", quiet=quiet) as progress:
-        progress.expect(
+        progress.announce(
             "choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if is_listed else STEPWISE_TIME_FACTORS)
         )
         return choice.select(
@@ -127,7 +127,7 @@ def select_structure(
             driven_by=drivers or None,
             threads=threads,
             # The number of candidates of a stepwise selection is not known in advance.
-            progress=progress if is_listed else progress.so_far,
+            progress=progress if is_listed else progress.show_count,
             store=store,
         )
 
@@ -218,7 +218,7 @@ def identify(
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
-            progress.expect("the fit", *duration_bounds(fit_seconds(runs, target, threads)))
+            progress.announce("the fit", *duration_bounds(fit_seconds(runs, target, threads)))
         if selection is not None and estimator == OutputError() and m is None:
             result = selection.best
         else:
@@ -226,7 +226,7 @@ def identify(
     if out is not None:
         result.model.save(out, force=force)
     if report is not None:
-        progress.say("writing the report")
+        progress.print_label("writing the report")
         chosen_selection = selection if selection is not None and selection.best is result else None
         (chosen_selection or result).report(report, validation=validation_data or None, force=force)
     checked = result.validate(validation_data) if validation_data else None
@@ -376,7 +376,7 @@ def certify(
                 max_cells=max_cells,
                 m=m,
                 threads=threads,
-                progress=progress.so_far,
+                progress=progress.show_count,
             )
     show_by_output(results, as_json=as_json)
 
@@ -661,7 +661,7 @@ def consistency(
     method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting segments", quiet=as_json) as progress:
         count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
-        progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
+        progress.announce("fitting all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
         result = consistency_module.consistency(
             runs, target, segments=segments, method=method, threads=threads, progress=progress
         )

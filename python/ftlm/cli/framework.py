@@ -22,8 +22,8 @@ from ftlm import cli
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
-from ftlm.utils.files import check_ending, check_free, write_atomically
-from ftlm.utils.formatting import columns, wrap_text
+from ftlm.utils.files import check_ending, check_writable, write_atomically
+from ftlm.utils.formatting import line_length, wrap_text
 from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
 from ftlm.utils.validation import join_names, nearest
@@ -334,7 +334,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         }
         try:
             if outputs:
-                check_free(*(arguments[name] for name in outputs), force=arguments["force"])
+                check_writable(*(arguments[name] for name in outputs), force=arguments["force"])
             for name, ending in outputs.items():
                 if ending and arguments[name] is not None:
                     check_ending(arguments[name], ending)
@@ -436,7 +436,11 @@ def wrap_line(line: str) -> list[str]:
     Table rows, and lines that begin with "next: ", are not wrapped.
     """
     indent = line[: len(line) - len(line.lstrip())]
-    if len(line) <= columns() or line.startswith("next: ") or len(_GAP_PATTERN.findall(line.strip())) >= MIN_TABLE_GAPS:
+    if (
+        len(line) <= line_length()
+        or line.startswith("next: ")
+        or len(_GAP_PATTERN.findall(line.strip())) >= MIN_TABLE_GAPS
+    ):
         return [line]
     # Further lines of a list entry are indented to the column where the text of the entry begins.
     entry = _ENTRY_PATTERN.match(line)
@@ -521,4 +525,4 @@ def _announce(operation: str, seconds: float, *, quiet: bool = False) -> None:
     # The speed of this machine is measured only for long work, because the measurement itself takes time.
     if seconds > MIN_ANNOUNCED_TIME_S:
         bounds = duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS)
-        Progress("", quiet=quiet).expect(operation, *bounds)
+        Progress("", quiet=quiet).announce(operation, *bounds)

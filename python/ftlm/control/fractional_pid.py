@@ -322,13 +322,13 @@ COMPARISON_FREQUENCIES = 300
 #: smallest value by the factor SENSITIVITY_TOLERANCE.
 TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE = 1.5, 1.05
 #: Frequency, as a fraction of the crossover, at which the loop gain is maximized to reject friction and offsets.
-LOW_FREQUENCY_SHARE = 0.1
+LOW_FREQUENCY_FRACTION = 0.1
 #: Maximum fraction of parameter samples for which the loop may be unstable or have too small a phase margin.
-MAX_FAILED_SAMPLE_SHARE = 0.05
+MAX_FAILED_SAMPLE_FRACTION = 0.05
 #: Minimum phase margin for a parameter sample, as a fraction of the requested one.
-MIN_PHASE_MARGIN_SHARE = 0.5
+MIN_PHASE_MARGIN_FRACTION = 0.5
 #: Minimum crossover [rad/s] divided by the sampling rate [Hz]. Below it, margins are not computable in floating point.
-MIN_CROSSOVER_SHARE = 1e-6
+MIN_CROSSOVER_FRACTION = 1e-6
 #: Frequency, relative to the requested crossover, above which the loop gain must be below 1.
 LAST_CROSSOVER_TOLERANCE = 1.01
 #: Factors of the plant gain at which the phase margin is evaluated, besides 1.
@@ -456,10 +456,10 @@ def fractional_pid(
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
-    if not MIN_CROSSOVER_SHARE * plant.rate <= wc < math.pi * plant.rate / 4:
+    if not MIN_CROSSOVER_FRACTION * plant.rate <= wc < math.pi * plant.rate / 4:
         raise ModelError(
             f"{setting('crossover')} {short_repr(crossover)} rad/s is out of range; give one from "
-            f"{MIN_CROSSOVER_SHARE * plant.rate:.4g} to {math.pi * plant.rate / 4:.4g} at {plant.rate:g} Hz"
+            f"{MIN_CROSSOVER_FRACTION * plant.rate:.4g} to {math.pi * plant.rate / 4:.4g} at {plant.rate:g} Hz"
         )
     margin = real_number("phase_margin", phase_margin)
     if not 10 <= margin <= 80:
@@ -517,11 +517,11 @@ def fractional_pid(
             "below it"
         )
     margins = tuple(map(loop_margins, samples_drawn))
-    failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * margin)]
-    if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
+    failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_FRACTION * margin)]
+    if len(failures) > MAX_FAILED_SAMPLE_FRACTION * len(margins):
         raise ModelError(
             f"the confidence intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the "
-            f"parameters the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * margin:g} degrees of the "
+            f"parameters the loop is not stable or has less than {MIN_PHASE_MARGIN_FRACTION * margin:g} degrees of the "
             "phase margin; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
@@ -590,7 +590,7 @@ def _best_controller(
                     continue
                 max_sensitivity = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * plant_responses)))
                 candidates.append(
-                    (max_sensitivity, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid)
+                    (max_sensitivity, float(abs(pid.response(np.array([LOW_FREQUENCY_FRACTION * wc]))[0])), pid)
                 )
         if not candidates:
             return None

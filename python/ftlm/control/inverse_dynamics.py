@@ -28,9 +28,9 @@ MAX_REFERENCE_RATIO = 20.0
 MAX_PATH_ROWS = 100_000
 #: Maximum deviation of the first sample of a reference from the path, relative to the move. Above it, the path needs a
 #: longer dwell before the move.
-MAX_INITIAL_OFFSET_SHARE = 1e-3
+MAX_INITIAL_OFFSET_FRACTION = 1e-3
 #: Maximum residual vibration, relative to that with the path itself as reference. Above it, the model is too uncertain.
-MAX_RESIDUAL_SHARE = 0.5
+MAX_RESIDUAL_FRACTION = 0.5
 
 
 class Loop(Protocol):
@@ -237,10 +237,10 @@ def inverse_dynamics(
     reference = inverse_transform(command_spectrum) + rows[0]
     range_width = float(np.ptp(rows))
     off = float(np.max(np.abs(reference[:1] - rows[0])))
-    if off > MAX_INITIAL_OFFSET_SHARE * range_width:
+    if off > MAX_INITIAL_OFFSET_FRACTION * range_width:
         raise ModelError(
             f"the reference would have to begin before the path: at its first row it differs from rest by {off:.3g}, "
-            f"more than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path stay at rest longer before the move"
+            f"more than {MAX_INITIAL_OFFSET_FRACTION:g} of the move; let the path stay at rest longer before the move"
         )
     effort = inverse_transform(command_spectrum * command)
     if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * range_width:
@@ -254,7 +254,7 @@ def inverse_dynamics(
             f"the path needs a command of {np.max(np.abs(effort)):.3g} at {at / design.rate:.4g} s, over the limit of "
             f"{maximum:g}; give it more time, or a smaller move"
         )
-    end_row = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * range_width)[-1]) + 1
+    end_row = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_FRACTION * range_width)[-1]) + 1
     unshaped_residual = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, end_row)
     errors = [
         _residual_rms(
@@ -265,7 +265,7 @@ def inverse_dynamics(
         for plant_sample in design.plants[0].samples(count, start)
     ]
     worst_error = float(np.quantile(errors, 0.975)) if errors else None
-    if worst_error is not None and not worst_error <= MAX_RESIDUAL_SHARE * unshaped_residual:
+    if worst_error is not None and not worst_error <= MAX_RESIDUAL_FRACTION * unshaped_residual:
         raise ModelError(
             "the confidence intervals are too wide to design on: within them the deviation after the end of the path "
             "may be "
@@ -300,7 +300,7 @@ def _path(path: ArrayLike) -> Floats:
     if np.ptp(rows) < POSITIVE_RANGE[0]:
         raise DataError("path: all points are equal; give at least two different points")
     for end_name, pair in (("begin", rows[:2]), ("end", rows[-2:])):
-        if abs(pair[1] - pair[0]) > MAX_INITIAL_OFFSET_SHARE * np.ptp(rows):
+        if abs(pair[1] - pair[0]) > MAX_INITIAL_OFFSET_FRACTION * np.ptp(rows):
             raise DataError(
                 f"path does not {end_name} at rest; repeat its {'first' if end_name == 'begin' else 'last'} row"
             )

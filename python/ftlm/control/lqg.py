@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.control.arguments import check_limit, check_samples, positive, select_outputs, sum_row
-from ftlm.control.fractional_pid import MAX_FAILED_SAMPLE_SHARE, least_certain_parameter, plant_of
+from ftlm.control.fractional_pid import MAX_FAILED_SAMPLE_FRACTION, least_certain_parameter, plant_of
 from ftlm.control.realization import Realization, catch_numerical_errors, fit_realization
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
@@ -581,7 +581,7 @@ def lqg(
         )
     margins = tuple(loop_margins(plant_sample.model) for plant_sample in plants[0].samples(count, start))
     failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
-    if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
+    if len(failures) > MAX_FAILED_SAMPLE_FRACTION * len(margins):
         raise ModelError(
             f"the confidence intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the "
             f"parameters the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "

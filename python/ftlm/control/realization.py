@@ -26,7 +26,7 @@ MAX_POLE_ITERATIONS, POLE_TOLERANCE = 30, 1e-6
 #: are smaller for all outputs and frequencies is removed.
 MIN_POLE_CONTRIBUTION = 1e-6
 #: Fraction of the lower end of the band. Poles closer to 0 duplicate the integrator and are removed.
-INTEGRATOR_BAND_SHARE = 1e-3
+INTEGRATOR_BAND_FRACTION = 1e-3
 #: Target values of the maximum gain error [dB] and phase error [degrees].
 GAIN_DB, PHASE_DEGREES = 0.1, 1.0
 #: Range of the number of poles without the integrator.
@@ -269,7 +269,7 @@ def _fit(
     # Superfluous poles have negligible residues, so their states would not be observable. A second integrator would not
     # be observable either.
     at, is_significant = 1, []
-    lowest_frequency = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(has_integrator) else 0.0
+    lowest_frequency = INTEGRATOR_BAND_FRACTION * float(np.min(s.imag)) if any(has_integrator) else 0.0
     for p in poles:
         pole_count = 1 if p.imag == 0 else 2
         contribution = residues[:, at : at + pole_count] @ _basis(s, np.array([p])).T

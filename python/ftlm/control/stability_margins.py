@@ -25,7 +25,7 @@ from ftlm.utils.validation import Complex, Floats, as_complex
 
 #: Number of frequencies of a Nyquist curve, and its lowest frequency as a fraction of the crossover.
 NYQUIST_POINTS = 1500
-LOWEST_FREQUENCY_SHARE = 1e-3
+LOWEST_FREQUENCY_FRACTION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def nyquist_frequencies(crossover: float, rate: float) -> Floats:
 
     `crossover` is the crossover frequency [rad/s] and `rate` the sampling rate [Hz].
     """
-    return np.geomspace(LOWEST_FREQUENCY_SHARE * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
+    return np.geomspace(LOWEST_FREQUENCY_FRACTION * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
 
 
 def margins_of(loop: Complex, w: Floats, integrates: float, unstable_poles: float = 0.0) -> Margins:

@@ -21,7 +21,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import as_seconds, as_vector, check_step_agrees, missing_mask, uniform_times
 from ftlm.data.units import TIME_UNITS, is_time_name, parse_unit, split_time_header, time_unit_of
 from ftlm.errors import DataError
-from ftlm.utils.files import check_new, write_atomically
+from ftlm.utils.files import check_target, write_atomically
 from ftlm.utils.parameters import type_name
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
@@ -173,7 +173,7 @@ UTF8_BOM = b"\xef\xbb\xbf"
 #: Maximum length of the first line; without it, a file without line breaks would be read into memory as a whole.
 MAX_HEADER_BYTES = 1 << 20
 #: Note in files of runs with nonuniform samples: the files contain only the samples on the uniform grid.
-OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read are not written"
+OMITTED_TIMES_NOTE = "written on its grid: the times at which outputs were read are not written"
 
 
 class Header(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -205,7 +205,7 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
             run.outputs,
             run.units,
             dict(run.intersample),
-            run.notes if run.sample_times is None else (*run.notes, OWN_TIMES_OMITTED_NOTE),
+            run.notes if run.sample_times is None else (*run.notes, OMITTED_TIMES_NOTE),
             run.metadata,
             tuple(n for n in run.outputs if missing_mask(run[n]).any()),
         )
@@ -263,7 +263,7 @@ def header_of_line(path: Path, line: bytes) -> Header | None:
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run to a csv file; see :meth:`ftlm.Run.to_csv`."""
-    check_new(path, force=force)
+    check_target(path, force=force)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
     text = Header.of(run).line() + "\n".join([",".join(columns), *rows, ""])
@@ -272,7 +272,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
     """Write a run to a parquet file; see :meth:`ftlm.Run.to_parquet`."""
-    target = check_new(path, force=force)
+    target = check_target(path, force=force)
     try:
         pyarrow = importlib.import_module("pyarrow")
         parquet = importlib.import_module("pyarrow.parquet")

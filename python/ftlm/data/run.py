@@ -305,7 +305,7 @@ class Run:
         """
         if not any(missing_mask(self._data[name]).any() for name in self.outputs):
             return self
-        return self._with(_data={name: interpolate_gaps(values) for name, values in self._data.items()})
+        return self._replace(_data={name: interpolate_gaps(values) for name, values in self._data.items()})
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -375,7 +375,7 @@ class Run:
         nonuniform = self.sample_times
         if nonuniform is not None:
             nonuniform = nonuniform.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
-        return self._with(_data=data, start=start_time, sample_times=nonuniform)
+        return self._replace(_data=data, start=start_time, sample_times=nonuniform)
 
     def split(self, duration: float) -> list[Run]:
         """Split this run into consecutive runs whose lengths differ by at most one row.
@@ -403,7 +403,7 @@ class Run:
         if count == 1:
             return [self]
         pieces = (self.window(float(a), float(b)) for a, b in itertools.pairwise(ends))
-        return [p._with(name=f"{self.name} piece {k} of {count}", notes=()) for k, p in enumerate(pieces, 1)]
+        return [p._replace(name=f"{self.name} piece {k} of {count}", notes=()) for k, p in enumerate(pieces, 1)]
 
     def resample(self, step: float) -> Run:
         """Return this run resampled to another step.
@@ -435,7 +435,7 @@ class Run:
         data = resample_uniform(source.times, source.data, self._intersample, new_step)
         how = describe_resampled_signals(self._intersample, keep_times=nonuniform is not None)
         note = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
-        return self._with(_data=data, step=new_step, notes=(*self.notes, note), sample_times=nonuniform)
+        return self._replace(_data=data, step=new_step, notes=(*self.notes, note), sample_times=nonuniform)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of signals subtracted from them.
@@ -472,7 +472,7 @@ class Run:
             if nonuniform is not None:
                 nonuniform = nonuniform.replace_signals(**{name: nonuniform.data[name] - trend(nonuniform.times)})
             run_notes.append(f"detrended: {text} subtracted from {name}")
-        return self._with(_data=data, notes=tuple(run_notes), sample_times=nonuniform)
+        return self._replace(_data=data, notes=tuple(run_notes), sample_times=nonuniform)
 
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
         """Return this run with the given saturations and dead zones, which must be fixed, applied to its inputs."""
@@ -481,7 +481,7 @@ class Run:
             data[limit.signal] = limit.apply(data[limit.signal])
             if nonuniform is not None:
                 nonuniform = nonuniform.replace_signals(**{limit.signal: limit.apply(nonuniform.data[limit.signal])})
-        return self._with(_data=data, sample_times=nonuniform)
+        return self._replace(_data=data, sample_times=nonuniform)
 
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
         """Return this run with some of its signals replaced by new samples.
@@ -503,11 +503,11 @@ class Run:
         if nonuniform is not None:
             values = {} if read is None else read
             nonuniform = nonuniform.replace_signals(**self._checked_samples("read", values, nonuniform.times.size))
-        return self._with(_data={**self._data, **checked}, sample_times=nonuniform)
+        return self._replace(_data={**self._data, **checked}, sample_times=nonuniform)
 
     def with_unmasked_run(self, run: Run) -> Run:
         """Return this run with `unmasked_run` set to the original run, whose first samples give the initial state."""
-        return self._with(unmasked_run=run)
+        return self._replace(unmasked_run=run)
 
     def _checked_samples(self, argument: str, values_by_name: object, length: int) -> dict[str, Floats]:
         """Return new samples by signal as float arrays; raise DataError for a wrong name, length or value."""
@@ -547,7 +547,7 @@ class Run:
         for index, name in enumerate(names):
             if name in names[:index]:
                 raise DataError(f"rename: two signals would have the name {name!r}; give every signal its own name")
-        return self._with(
+        return self._replace(
             inputs=tuple(renamed[name] for name in self.inputs),
             outputs=tuple(renamed[name] for name in self.outputs),
             _data={renamed[name]: values for name, values in self._data.items()},
@@ -579,7 +579,7 @@ class Run:
         """
         intersample = {**self._intersample, **check_intersample(mapping, self.inputs)}
         data = self._data if self.sample_times is None else self.sample_times.resample(intersample, self.step)
-        return self._with(_intersample=intersample, _data={n: v[: self.length] for n, v in data.items()})
+        return self._replace(_intersample=intersample, _data={n: v[: self.length] for n, v in data.items()})
 
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
         """Return this run with additional or replaced outputs.
@@ -610,7 +610,7 @@ class Run:
             nonuniform = nonuniform.replace_signals(
                 **{n: np.interp(nonuniform.times, self.time, v) for n, v in values_by_name.items()}
             )
-        return self._with(
+        return self._replace(
             outputs=tuple(dict.fromkeys([*self.outputs, *values_by_name])),
             _data={**self._data, **values_by_name},
             _units={**dict.fromkeys(values_by_name, ""), **self._units},
@@ -642,7 +642,7 @@ class Run:
         if not outputs:
             raise DataError(f"select: no output is left; keep at least one of {join_names(self.outputs)}")
         inputs = tuple(name for name in signals if name in self.inputs)
-        return self._with(inputs=inputs, outputs=outputs)
+        return self._replace(inputs=inputs, outputs=outputs)
 
     def require_outputs(self, names: Iterable[str]) -> None:
         """Raise DataError unless every name is an output of this run that is not constant.
@@ -809,7 +809,7 @@ class Run:
             f"its signals are {join_names(self.signals)}"
         )
 
-    def _with(self, **changes: Any) -> Run:
+    def _replace(self, **changes: Any) -> Run:
         return Run._from_checked(**{**vars(self), "unmasked_run": None, **changes})
 
     def _headline(self) -> str:

@@ -24,8 +24,8 @@ MAX_SAMPLE_VALUE = 1e150
 MIN_RUN_SAMPLES = 3
 _MAX_RUN_SAMPLES = 50_000_000
 _MIN_STEP_S, _MAX_STEP_S = 1e-30, 1e30
-_MAX_JITTER_SHARE = 0.02
-_MIN_REPORTED_JITTER_SHARE = 1e-3
+_MAX_JITTER_FRACTION = 0.02
+_MIN_REPORTED_JITTER_FRACTION = 1e-3
 _GAP_STEP_RATIO = 1.5
 # A window limit such as 1.1 s must include its sample although t - t0 has a rounding error.
 _EDGE_TOLERANCE_STEPS = 1e-6
@@ -158,18 +158,18 @@ def _not_numbers(values: object, array: npt.NDArray[Any], label: str) -> DataErr
     if array.dtype.kind in "Mm":
         return bad_rows(label, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
     if array.ndim == 0:
-        return DataError(f"{label}: {_short(array.item())} is not an array; pass one number per row")
+        return DataError(f"{label}: {_abbreviate(array.item())} is not an array; pass one number per row")
     # NumPy turns a list of numbers and text into an array of text; the list still distinguishes them.
     flat = list(values) if isinstance(values, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
         problem = f"objects, not numbers (dtype {array.dtype})"
         return bad_rows(label, problem, 0, len(flat), "use np.asarray(x, dtype=float)")
-    problem = "missing value None" if flat[bad[0]] is None else f"{_short(flat[bad[0]])} is not a number"
+    problem = "missing value None" if flat[bad[0]] is None else f"{_abbreviate(flat[bad[0]])} is not a number"
     return bad_rows(label, problem, bad[0], len(bad), "convert it to numbers first")
 
 
-def _short(value: object) -> str:
+def _abbreviate(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "…" + text[-1]
 
@@ -282,7 +282,7 @@ def regular_step(
         raise DataError(f"{label}: the mean step {mean!r} s cannot be used; check the unit of the time")
     deviation = np.abs(elapsed - uniform_times(times.size, mean))
     max_deviation = float(deviation.max())
-    if max_deviation > _MAX_JITTER_SHARE * mean:
+    if max_deviation > _MAX_JITTER_FRACTION * mean:
         steps = np.diff(times)
         median_step = float(np.median(steps))
         gaps = np.flatnonzero(steps > _GAP_STEP_RATIO * median_step)
@@ -295,15 +295,15 @@ def regular_step(
             )
             raise bad_rows(label, problem, offset + int(gaps[0]) + 1, gaps.size, remedy)
         problem = f"jitter of up to {100.0 * max_deviation / mean:.3g} % of the mean step {mean:.6g} s"
-        problem += f" ({100 * _MAX_JITTER_SHARE:g} % allowed)"
+        problem += f" ({100 * _MAX_JITTER_FRACTION:g} % allowed)"
         remedy = (
             f"put the inputs on a regular grid with {parameter('resample', Placeholder('STEP'))}; outputs are "
             "then compared at their original times"
         )
-        is_late = deviation > _MAX_JITTER_SHARE * mean
+        is_late = deviation > _MAX_JITTER_FRACTION * mean
         raise masked_rows_error(label, problem, is_late, remedy, offset)
     notes: tuple[str, ...] = ()
-    if max_deviation > _MIN_REPORTED_JITTER_SHARE * mean:
+    if max_deviation > _MIN_REPORTED_JITTER_FRACTION * mean:
         row = offset + int(deviation.argmax())
         jitter = f"{100.0 * max_deviation / mean:.2g} % of a step, the most at row {row}"
         notes = (f"time jitters by up to {jitter}; the sampling was assumed uniform",)
@@ -327,7 +327,7 @@ def check_step_agrees(step: object, times: Floats, label: str) -> None:
     if not steps.size or not np.all(steps > 0):
         return
     intervals = float(np.mean(steps)), float(np.median(steps))
-    if min(abs(interval / seconds - 1.0) for interval in intervals) > _MAX_JITTER_SHARE:
+    if min(abs(interval / seconds - 1.0) for interval in intervals) > _MAX_JITTER_FRACTION:
         raise DataError(
             f"{parameter('step', step)}, but {label} has a step of {intervals[1]:.6g} s; omit {parameter('step')}, "
             f"with {parameter('time_unit')} if the times have another unit, or rename the column if it is not the time"
@@ -401,9 +401,11 @@ def window_rows(times: Floats, window: object, label: str = "time") -> tuple[int
 def rows_coincide(times: Floats, step: float) -> bool:
     """Whether the sample times `times` [s] are regular and every row at the new step [s] is an original sample."""
     mean_step = float(times[-1]) / (times.size - 1)
-    is_regular = np.abs(times - uniform_times(times.size, mean_step)).max() <= _MAX_JITTER_SHARE * mean_step
+    is_regular = np.abs(times - uniform_times(times.size, mean_step)).max() <= _MAX_JITTER_FRACTION * mean_step
     ratio = step / mean_step
-    return bool(is_regular) and abs(ratio - round(ratio)) * times.size <= _MAX_JITTER_SHARE and step > 0.5 * mean_step
+    return (
+        bool(is_regular) and abs(ratio - round(ratio)) * times.size <= _MAX_JITTER_FRACTION and step > 0.5 * mean_step
+    )
 
 
 def resample_uniform(
@@ -573,7 +575,7 @@ def describe_missing(label: str, is_missing: NDArray[np.bool_], treatment: str) 
 
 
 #: Maximum delay of a default search: in samples, and as a fraction of the length of the run.
-MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
+MAX_DELAY_SAMPLES, MAX_DELAY_FRACTION = 60, 1.0 / 12.0
 
 
 def longest_delay(length: int, step: float) -> float:
@@ -582,4 +584,4 @@ def longest_delay(length: int, step: float) -> float:
     `length` is the number of samples, and `step` the sampling interval [s].
     """
     # Three digits, because the limit is printed in the name of a structure.
-    return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_SHARE) * step:.3g}")
+    return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_FRACTION) * step:.3g}")

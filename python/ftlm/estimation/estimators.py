@@ -35,7 +35,7 @@ from ftlm.order_search.checkpoint import Store
 from ftlm.order_search.options import OrderGrid, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, make_job, run_job
-from ftlm.progress import ShareTracker
+from ftlm.progress import FractionTracker
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import resolve_start
 from ftlm.structure.structure import Structure
@@ -211,7 +211,7 @@ def estimate_output_error(
         guess = values_of_model(free, begin, additional_values or {}) if isinstance(begin, Model) else begin
         additional_guesses = warm_starts(free, guess)
     # Progress assumes one fit, since a second one (with or without a history) is rare. Profiles take about a third.
-    tracker = ShareTracker(progress)
+    tracker = FractionTracker(progress)
     joint = joint_fit or fit_with_initial_conditions(
         noise_free_runs or task.runs,
         structure,

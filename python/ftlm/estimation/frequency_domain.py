@@ -26,7 +26,7 @@ from ftlm.estimation.prior_knowledge import Bounds, check_bounds, check_interval
 from ftlm.estimation.response_problem import MAX_EXPONENT, ConstraintText, ResponseProblem
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
-from ftlm.progress import Progress, ShareTracker
+from ftlm.progress import FractionTracker, Progress
 from ftlm.simulation.discretization import check_linear
 from ftlm.structure.circuit import Circuit
 from ftlm.structure.order import Values
@@ -208,13 +208,13 @@ def _fit_response(
             f"({', '.join(problem.names)}); measure more frequencies, or fix parameters"
         )
     if isinstance(progress, Progress):
-        progress.expect(
+        progress.announce(
             "the fit",
             *duration_bounds(
                 estimate_duration(0.007 * parameter_count**2 + 2e-6 * parameter_count * count, 1), DURATION_FACTOR_RANGE
             ),
         )
-    tracker = ShareTracker(progress)
+    tracker = FractionTracker(progress)
     descriptions = problem.constraints()[2]
     PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))

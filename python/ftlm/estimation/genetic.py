@@ -275,7 +275,7 @@ def genetic_search(
     total = evaluations * len(settings.seeds)
     if isinstance(progress, Progress):
         name = "the stage" if structure.has_order_law else structure.outputs[0]
-        progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
+        progress.announce(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
     results: dict[int, _ParentThreshold] = {}
     for number, seed in enumerate(settings.seeds):
 

@@ -44,10 +44,10 @@ from ftlm.estimation.prior_knowledge import Bounds, Priors
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
-from ftlm.findings import LEFT_OUT_CODES, Finding, make_finding, unique
+from ftlm.findings import MISSING_PART_CODES, Finding, make_finding, unique
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
-from ftlm.progress import ShareTracker
+from ftlm.progress import FractionTracker
 from ftlm.simulation.discretization import check_linear, default_m
 from ftlm.structure.parser import as_structure
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
@@ -223,7 +223,7 @@ def _fit_runs(
         InitialConditionFits(estimate, may_add_offset),
     )
     if preliminary_method is not None:
-        tracker = ShareTracker(progress)
+        tracker = FractionTracker(progress)
         initial_condition_fits = InitialConditionFits(
             partial(estimate, method=preliminary_method, report=tracker.subtask(INITIAL_CONDITIONS_SHARE, 0.9)),
             may_add_offset,
@@ -329,7 +329,7 @@ def assess_fit(fit: Fit) -> Identification:
         fit, replace(model, estimate=_estimate(fit, comparison, None, ())), runs, comparison
     )
     if plant:
-        findings = [*plant, *(f for f in findings if not f.kind.judges_whole_run)]
+        findings = [*plant, *(f for f in findings if not f.kind.simulates_whole_run)]
     if any(f.code == "plant_unstable_in_pieces" for f in plant):
         # Residuals of unstable simulations are no test of the model.
         tests, criteria = None, None
@@ -438,9 +438,9 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
     Friction at a hub is a term in the equation of the hub angle. It affects the equation of a deflection only through
     this angle.
     """
-    if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
+    if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in MISSING_PART_CODES for f in findings):
         return []
-    outputs = enumerate_names(list(dict.fromkeys(f.output for f in findings if f.code in LEFT_OUT_CODES)))
+    outputs = enumerate_names(list(dict.fromkeys(f.output for f in findings if f.code in MISSING_PART_CODES)))
     stages = {name[len("theta")] for name in structure.signals if name.startswith("theta")}
     has_hub = not {"theta11", "theta21"}.isdisjoint(structure.outputs)
     kinds = ["hub_friction_missing"] if has_hub and not structure.has_friction else []

@@ -20,9 +20,9 @@ from ftlm.experiment_design.exchange import Design, exchange_holds, scaled_desig
 from ftlm.experiment_design.problem import Bounds, Criterion, Kind, ModelFit, Sensitivities, per_signal_values
 from ftlm.experiment_design.result import DesignedInput, PredictedExtreme
 from ftlm.experiment_design.spectrum import Spectrum, best_spectrum, spectral_lines
-from ftlm.findings import LEFT_OUT_CODES, NOT_WHITE_CODES, Finding, make_finding
+from ftlm.findings import MISSING_PART_CODES, NOT_WHITE_CODES, Finding, make_finding
 from ftlm.model.model import Model, check_model
-from ftlm.progress import Progress, ShareTracker
+from ftlm.progress import FractionTracker, Progress
 from ftlm.simulation.discretization import check_linear
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting, type_name
@@ -253,8 +253,8 @@ def design_input(
         )
     if isinstance(progress, Progress):
         size = len(fit.names) * len(fit.outputs) * rows
-        progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
-    tracker = ShareTracker(progress)
+        progress.announce("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
+    tracker = FractionTracker(progress)
     sensitivities = Sensitivities.of(fit, step, rows - 1, bounds.ramp_samples(step))
     tracker.advance_to(0.05)
     spectrum = best_spectrum(spectral_lines(fit, bounds, step, rows - 1), goal)
@@ -287,7 +287,12 @@ def design_input(
 
 
 def _design_candidates(
-    sensitivities: Sensitivities, goal: Criterion, bounds: Bounds, spectrum: Spectrum, seed: int, tracker: ShareTracker
+    sensitivities: Sensitivities,
+    goal: Criterion,
+    bounds: Bounds,
+    spectrum: Spectrum,
+    seed: int,
+    tracker: FractionTracker,
 ) -> list[Design]:
     """Return all candidate inputs, best first: initial inputs, and those improved by the exchange algorithm.
 
@@ -375,8 +380,8 @@ def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, .
     Noise that is not white is not reported if the user gave the noise standard deviations (`noise_given`).
     """
     findings = () if model.estimate is None else model.estimate.findings
-    missing = [f for f in findings if f.code in LEFT_OUT_CODES]
-    finding = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
+    missing = [f for f in findings if f.code in MISSING_PART_CODES]
+    finding = min(missing, key=lambda f: MISSING_PART_CODES.index(f.code), default=None)
     if finding is not None:
         return (make_finding("prediction_in_doubt", output=finding.output, text=finding.text),)
     noise_finding = next((f for f in findings if f.code in NOT_WHITE_CODES), None)

@@ -159,7 +159,7 @@ class Hold:
     offsets
         Inner products of `block`, shifted to each start, with the basis of the responses to offsets, shape (holds,
         parameters, basis vectors).
-    own
+    quadratic
         Fisher information of the response to a unit exchange, shape (holds, parameters, parameters), by the distance of
         the two holds of the exchange [holds]. The first axis is the first hold of the exchange. Distance 0 means an
         exchange of one hold. For a larger distance, the response to the second hold is subtracted, because the two
@@ -171,7 +171,7 @@ class Hold:
     response: Floats
     spectrum: Complex
     offsets: Floats
-    own: Mapping[int, Floats]
+    quadratic: Mapping[int, Floats]
 
     @classmethod
     def of(cls, sensitivities: Sensitivities, index: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
@@ -213,7 +213,7 @@ class Hold:
             rows = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
             linear = linear - np.einsum("spr,qr->spq", self.offsets, rows)
         linear = linear + np.swapaxes(linear, -1, -2)
-        for gap, quadratic in self.own.items():
+        for gap, quadratic in self.quadratic.items():
             pair = linear
             if gap:
                 pair = np.zeros_like(linear)

@@ -1,8 +1,9 @@
 """Reader of binary data files that runs in a separate process, because a damaged file can crash the libraries.
 
-`ftlm.utils.resources.python_child` runs this file by its path with the arguments KIND OPTIONS FILE…; the parent process
-never imports it. KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS is a JSON object with the requested
-sheet. For every file the reader writes an answer to standard output: one line of JSON, the header, then the numbers.
+The file is run by its path with the arguments KIND OPTIONS FILE…, by `ftlm.utils.resources.subprocess_arguments`; the
+parent process never imports it. KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS is a JSON object with
+the requested sheet. For every file the reader writes an answer to standard output: one line of JSON, the header, then
+the numbers.
 
 The header is ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}``, and the arrays
 follow as little-endian float64, column after column. For an unreadable file, the answer is only ``{"error": reason,

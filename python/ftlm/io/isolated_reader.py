@@ -26,7 +26,7 @@ from ftlm.io.dialect import Assumption, Layout
 from ftlm.io.table import Column, FileTable, dates_problem
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, layout_parameter
-from ftlm.utils.resources import python_child
+from ftlm.utils.resources import subprocess_arguments
 from ftlm.utils.validation import Floats
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
@@ -114,7 +114,7 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
     request = json.dumps({"sheet": layout.sheet})
     try:
         process = subprocess.run(
-            **python_child(_READER_PATH, kind.kind, request, *files),
+            **subprocess_arguments(_READER_PATH, kind.kind, request, *files),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_READER_TIMEOUT_S,

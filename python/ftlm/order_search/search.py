@@ -697,7 +697,7 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
         fraction = 1.0 if store is None else _remaining_fraction(job, store, number)
         low, high = expected_seconds(job) if fraction > 0 else (0.0, 0.0)
         lower_total, upper_total = lower_total + fraction * low, upper_total + fraction * high
-    progress.expect("the search", lower_total, upper_total)
+    progress.announce("the search", lower_total, upper_total)
 
 
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:

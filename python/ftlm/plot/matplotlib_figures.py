@@ -47,7 +47,7 @@ from ftlm.validation.residual_tests import Residuals
 #: Width of a figure and height of one row of axes [inch]. The width is that of two columns of a journal.
 FIGURE_WIDTH_INCH, ROW_HEIGHT_INCH = 7.0, 2.2
 #: Free space above the lines for the legend, as a fraction of the range of the vertical axis.
-LEGEND_HEIGHT_SHARE = 0.25
+LEGEND_HEIGHT_FRACTION = 0.25
 #: Resolution of figures in notebooks [dots per inch].
 NOTEBOOK_DPI = 110
 
@@ -154,7 +154,7 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
         axis.fill_between(x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
     left, right, bottom, top = chart.frame
     # Free space for the legend, so that it does not cover the lines.
-    top += LEGEND_HEIGHT_SHARE * (top - bottom) if any(name for name, _ in chart.lines) else 0.0
+    top += LEGEND_HEIGHT_FRACTION * (top - bottom) if any(name for name, _ in chart.lines) else 0.0
     xlim, ylim = (10.0**left, 10.0**right) if chart.log_x else (left, right), (bottom, top)
     axis.set(xscale="log" if chart.log_x else "linear", yscale="log" if chart.log_y else "linear")
     axis.set(xlim=xlim, ylim=(10.0**bottom, 10.0**top) if chart.log_y else ylim)
@@ -234,7 +234,7 @@ def _draw_landscape(axis: Any, chart: Landscape) -> None:
 
 
 #: Height of a residual plot, as a fraction of the height of the fit plot above it.
-RESIDUAL_HEIGHT_SHARE = 0.4
+RESIDUAL_HEIGHT_FRACTION = 0.4
 
 
 @check_arguments
@@ -293,7 +293,7 @@ def fit(
                 replace(fit_chart, title=f"{fit_chart.title}. {fit_chart.caption}"),
                 replace(residual_chart, title="", y_label="residual"),
             ]
-            heights += [1.0, RESIDUAL_HEIGHT_SHARE]
+            heights += [1.0, RESIDUAL_HEIGHT_FRACTION]
         input_charts = [signal_chart(runs_of_result[k], name) for name in runs_of_result[k].inputs] if inputs else []
         charts += input_charts
         heights += [0.7] * len(input_charts)

@@ -29,7 +29,7 @@ from ftlm.findings import (
     Finding,
     group_findings,
     make_finding,
-    on_validation,
+    mark_validation,
     texts,
     unique,
 )
@@ -54,7 +54,7 @@ from ftlm.svg.charts import CorrelationMap
 from ftlm.svg.figure import MAX_LINE_POINTS, Figure
 from ftlm.svg.html_page import Page, Section, Table
 from ftlm.svg.line_chart import LineChart
-from ftlm.utils.files import check_free
+from ftlm.utils.files import check_writable
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html, typeset
 from ftlm.utils.parameters import use_interface
 from ftlm.validation.comparison import (
@@ -239,7 +239,7 @@ def identification_page(
     Path
         The file that was written.
     """
-    check_free(path, force=force)
+    check_writable(path, force=force)
     validation_runs = [] if validation is None else as_runs(validation)
     comparisons = [validate(result, run) for run in validation_runs] or ([] if validated is None else [validated])
     pooled = validate(result, validation_runs) if len(validation_runs) > 1 else comparisons[0] if comparisons else None
@@ -264,20 +264,18 @@ def _identification_content(
     if undefined:
         findings.append(make_finding("errors_undefined", parameter=", ".join(undefined)))
     for run, comparison in zip(validation_runs, comparisons, strict=False):
-        findings += on_validation([*comparison.findings, *data_notes(run)], run.name)
+        findings += mark_validation([*comparison.findings, *data_notes(run)], run.name)
     compared = [("estimation", result.comparison), *(("validation", c) for c in comparisons)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
-    tests += tests_on(model, validation_runs)
+    tests += validation_tests(model, validation_runs)
     overall_verdict = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *validation_runs]
     bands = [confidence_bands(model, run, c) for run, c in zip(validation_runs, comparisons, strict=False)]
-    first_parts = first_sections(
-        model, findings, compared, bool(comparisons), result.joint, runs, bands, result.offsets
-    )
-    collapsed = [section for section in first_parts if section.collapsed]
-    first_parts = [
-        *first_parts[: len(first_parts) - len(collapsed)],
+    main_parts = main_sections(model, findings, compared, bool(comparisons), result.joint, runs, bands, result.offsets)
+    collapsed = [section for section in main_parts if section.collapsed]
+    main_parts = [
+        *main_parts[: len(main_parts) - len(collapsed)],
         *sections,
         *_order_search_sections(result),
         *collapsed,
@@ -291,7 +289,7 @@ def _identification_content(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return _content(model, overall_verdict, compared, first_parts, details)
+    return _content(model, overall_verdict, compared, main_parts, details)
 
 
 def _content(
@@ -306,10 +304,10 @@ def _content(
     `compared` has (role of the data, comparison) pairs, whose fits are summarized below the title.
     """
     all_sections = [*sections, *(replace(section, collapsed=True) for section in details)]
-    return Page(title_of(model), all_sections, lead_of(compared), verdict_box(overall_verdict))
+    return Page(title_of(model), all_sections, fit_sentences(compared), verdict_box(overall_verdict))
 
 
-def first_sections(
+def main_sections(
     model: Model,
     findings: Iterable[Finding],
     compared: Sequence[tuple[str, Comparison]],
@@ -410,7 +408,7 @@ def _with_inputs(
     return charts
 
 
-def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
+def validation_tests(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
     """Return a ("validation", residual tests) pair for each run with at least ``2 * DEFAULT_LAGS + 3`` samples."""
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * DEFAULT_LAGS + 3]
 
@@ -555,7 +553,7 @@ def _recursion_error_charts(result: Identification) -> list[LineChart]:
     return figures
 
 
-def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
+def fit_sentences(compared: Sequence[tuple[str, Comparison]]) -> str:
     """Return text on the simulation fit of every output [%], one sentence for each (role of the data, comparison)."""
     sentences = []
     for label, comparison in compared:
@@ -688,7 +686,7 @@ def model_page(
     Path
         The file that was written.
     """
-    check_free(path, force=force)
+    check_writable(path, force=force)
     validation_runs = [] if validation is None else as_runs(validation)
     validated = [validate_model(model, run) for run in validation_runs]
     with use_interface("report"):
@@ -707,12 +705,12 @@ def _model_content(model: Model, validation_runs: Sequence[Run], validated: Sequ
                 {n: f for n, f in estimate.fit.items() if f is not None}, comparison
             )
             run_findings += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
-        findings += on_validation(run_findings, run.name)
+        findings += mark_validation(run_findings, run.name)
     compared = [("validation", comparison) for comparison in validated]
     bands = [confidence_bands(model, run, c) for run, c in zip(validation_runs, validated, strict=True)]
-    sections = first_sections(model, findings, compared, bool(validation_runs), None, validation_runs, bands)
+    sections = main_sections(model, findings, compared, bool(validation_runs), None, validation_runs, bands)
     details = []
-    if tests := tests_on(model, validation_runs):
+    if tests := validation_tests(model, validation_runs):
         details.append(residual_section(tests, None, compared, model.units))
     details += frequency_sections(model, [(r.step, r.duration) for r in validation_runs])
     model_rows: list[list[Cell]] = [

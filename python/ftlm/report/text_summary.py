@@ -35,7 +35,7 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
     lines = [*wrap_text(str(overall_verdict)), ""]
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
-    lines += [*fit_lines(result, validation), *_residuals(result), *_initial_condition_lines(result)]
+    lines += [*fit_lines(result, validation), *_residual_lines(result), *_initial_condition_lines(result)]
     if validation is not None and (terms := describe_initial_terms(validation)):
         lines += wrap_text(f"initial terms and levels of validation runs, estimated on them (their number): {terms}")
     lines += finding_lines(result.findings)
@@ -50,13 +50,13 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
     structure = model.structure
     lines = []
     for equation in model.equations:
-        offset = _offset(equation.output, comparison)
+        offset = _offset_text(equation.output, comparison)
         tail = structure.offset_in_words if offset is None else offset
-        lines.append(format_equation(_readable(equation), structure.describe_inputs(".6g")) + tail)
+        lines.append(format_equation(_rounded_equation(equation), structure.describe_inputs(".6g")) + tail)
     return lines
 
 
-def _readable(equation: Equation) -> Equation:
+def _rounded_equation(equation: Equation) -> Equation:
     """Return a copy of an equation with its orders rounded to four decimals."""
     copied = copy.copy(equation)
     terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in equation.terms)
@@ -64,7 +64,7 @@ def _readable(equation: Equation) -> Equation:
     return copied
 
 
-def _offset(output: str, comparison: Comparison | None) -> str | None:
+def _offset_text(output: str, comparison: Comparison | None) -> str | None:
     """Return the estimated offset of the equation of `output` as text; None for several runs or without an offset.
 
     An offset of kind "level" is omitted: it is added to the output, and is not a term of the equation.
@@ -174,7 +174,7 @@ def fit_lines(result: Identification, validation: Comparison | None) -> list[str
     return lines
 
 
-def _residuals(result: Identification) -> list[str]:
+def _residual_lines(result: Identification) -> list[str]:
     if result.residuals is None:
         return ["residuals: the runs are too short for tests"]
     whiteness_text = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())

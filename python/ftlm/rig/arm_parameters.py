@@ -31,7 +31,7 @@ ARM_SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
 #: one fiftieth of the rotor's part couples to link 1.
 INERTIA_RATIO = 0.00301955 / 0.170434
 LINK_COUPLING_RATIO = 0.157 * 0.202 * 0.20185 / 0.0064387
-ROTATING_INERTIA_SHARE = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
+ROTATING_INERTIA_FRACTION = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
 #: Maximum step of the simulation within a sampling interval [s]. The error of deflections is then below 2e-4 of their
 #: standard deviation, and for joint 1 below 1e-5.
 MAX_SUBSTEP_S = 1e-4
@@ -132,7 +132,7 @@ class ArmParameters:
     coupling: float = 1.0
     inertia_ratio: float = INERTIA_RATIO
     reach: float = LINK_COUPLING_RATIO
-    rotating_share: float = ROTATING_INERTIA_SHARE
+    rotating_share: float = ROTATING_INERTIA_FRACTION
     current_offset: tuple[float, float] = (0.0, 0.0)
     strain_noise: tuple[float, float] = (0.015, 0.0134)
     current_noise: tuple[float, float] = (0.0012, 0.0012)

@@ -25,7 +25,7 @@ from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_rate, check_thread, describe_signal
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.files import check_free
+from ftlm.utils.files import check_writable
 from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
 
@@ -649,7 +649,7 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r} ends with neither .csv nor .parquet; runs are written as one of them")
     if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
-    check_free(target, force=force)
+    check_writable(target, force=force)
     partial = partial_path(target)
     # The path is also occupied if it is a symbolic link to a missing file.
     if os.path.lexists(partial) and not force:

@@ -25,7 +25,7 @@ from ftlm.rig.rig import (
     check_watchdog,
     missing_expiration_state,
 )
-from ftlm.utils.resources import python_child
+from ftlm.utils.resources import subprocess_arguments
 from ftlm.utils.validation import Floats, check_choice, check_seed, short_repr, whole_number
 
 #: Faults that can be injected, by name, with the meaning of the number that is given with the fault; "" if it has none.
@@ -276,7 +276,9 @@ def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Pop
     """
     # A separate session, and on Windows a console, so that Ctrl-C and Ctrl-Break do not reach the watchdog.
     return subprocess.Popen(
-        **python_child(Path(watchdog.__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False),
+        **subprocess_arguments(
+            Path(watchdog.__file__), str(page.path.resolve()), "keep" if keep else "remove", site=False
+        ),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -19,7 +19,7 @@ from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.statistics import (
     NOISE_SAMPLES,
-    REST_SHARE,
+    REST_FRACTION,
     REST_SIGMAS,
     ROUNDING_RESIDUAL_RATIO,
     chi_squared,
@@ -175,7 +175,9 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
             if has_frequent_changes and drift_error > START_SETTINGS.drift_share * float(np.nanstd(run[name])):
                 return None
             levels[name] = float(np.mean(rows))
-            threshold = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_SHARE * float(np.nanstd(run[name]))
+            threshold = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_FRACTION * float(
+                np.nanstd(run[name])
+            )
             shows_level |= abs(levels[name]) > threshold
         return RestEvidence(rest_length, levels, {n: float(run[n][0]) for n in inputs}, shows_level)
     constant = all(_change_indices(run[n][1:]).size == 0 for n in inputs)

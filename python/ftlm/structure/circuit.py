@@ -45,7 +45,7 @@ class Element:
 
     Parameters
     ----------
-    meaning
+    description
         Name of the kind, such as "resistor".
     parameters
         Name suffix and unit of each parameter. The suffix is empty if the parameter has the name of the element.
@@ -57,7 +57,7 @@ class Element:
         if the impedance is not such a ratio.
     """
 
-    meaning: str
+    description: str
     parameters: tuple[tuple[str, str], ...]
     impedance: Callable[[Complex, Sequence[float]], Response]
     ratio: Callable[[Sequence[float]], tuple[Polynomial, Polynomial]] | None = None
@@ -179,7 +179,7 @@ class Circuit:
                     )
                 return group("parallel", parts)
             if _letters(token) not in CIRCUIT_ELEMENTS:
-                elements = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())
+                elements = ", ".join(f"{n} ({e.description})" for n, e in CIRCUIT_ELEMENTS.items())
                 raise ModelError(
                     f"circuit {self.text!r}: {token!r} is not an element; known: {elements}, and p(…,…); an equation "
                     "needs '='"
@@ -258,8 +258,8 @@ class Circuit:
             element = CIRCUIT_ELEMENTS[kind]
             if element.ratio is None:
                 raise ModelError(
-                    f"{body} ({element.meaning}) has no equation with powers of s; use .circuit.impedance(w) for the "
-                    "response, or approximate it by p(R,CPE) for a model over time"
+                    f"{body} ({element.description}) has no equation with powers of s; use .circuit.impedance(w) for "
+                    "the response, or approximate it by p(R,CPE) for a model over time"
                 )
             return element.ratio([self.values[body + suffix] for suffix, _ in element.parameters])
 

@@ -121,7 +121,7 @@ class EquationParser(TokenReader):
         Kind of the offset: ``"constant"``, ``"ramp"`` or ``"auto"``; None without an offset.
     limits
         Saturation levels and half-widths of dead zones, by (signal, kind): a number, or (lower, upper) bounds.
-    plain
+    unlimited
         Names of signals that occur at least once without a saturation or dead zone.
     delays
         Delay [s] of each signal: a number if it is known, (lower, upper) bounds if it is to be estimated.
@@ -134,14 +134,14 @@ class EquationParser(TokenReader):
         self._signals = signals
         self._depth = 0
         self._primes = 0
-        self._twice_delayed: str | None = None
+        self._conflicting_delay: str | None = None
         self.left: list[ParsedTerm] = []
         self.right: list[ParsedTerm] = []
         self.friction: tuple[Friction, str] | None = None
         self.stribeck: tuple[Stribeck, str] | None = None
         self.offset: str | None = None
         self.limits: dict[tuple[str, NonlinearityKind], Value] = {}
-        self.plain: set[str] = set()
+        self.unlimited: set[str] = set()
         self.delays: dict[str, Value] = {}
         self.is_transfer = False
 
@@ -171,7 +171,7 @@ class EquationParser(TokenReader):
         """
         outputs = {item.signal for item in self.left if item.order.names or item.order.constant}
         output = next((signal for signal in self.delays if self.delays[signal] != 0.0 and signal in outputs), None)
-        signal = self._twice_delayed if output is None else output
+        signal = self._conflicting_delay if output is None else output
         if signal is None:
             return
         reason = f"{signal} has two delays; give the input with the longer delay its own name"
@@ -297,7 +297,7 @@ class EquationParser(TokenReader):
                     if self.offset:
                         raise self._error("the offset occurs twice; write it once")
                     self.offset = kind
-                    self._position += 3 + len(phrase)
+                    self._index += 3 + len(phrase)
                     return True
         return False
 
@@ -354,7 +354,7 @@ class EquationParser(TokenReader):
 
     def _operand(self) -> tuple[Order, str | Expression]:
         """Parse a term after its coefficient; return (order, signal), or (order, expression) of a non-linear term."""
-        start = self._position
+        start = self._index
         operator = self._operator()
         if operator is not None and self._next_is("("):
             expression = self._group()
@@ -364,13 +364,13 @@ class EquationParser(TokenReader):
                     "only signals and their derivatives are multiplied"
                 )
             return operator, expression
-        self._position = start
+        self._index = start
         kind, value, _ = self._peek()
         if kind == "name" and not (value in FUNCTION_NAMES and self._peek(1)[1] == "("):
             order, signal = self._derivative()
             if self._peek()[1] not in ("^", "*"):
                 return order or Order(), signal
-            self._position = start
+            self._index = start
         if kind == "symbol" and value != "(":
             raise self._syntax_error("the name of a signal")
         return Order(), self._product(divide=False)
@@ -379,7 +379,7 @@ class EquationParser(TokenReader):
         """Parse ``D``, ``D^order`` or ``d/dt`` before an operand, and return its order; None for other text."""
         derivative = self._leibniz()
         if derivative is not None and not derivative[1]:
-            self._position += derivative[2]
+            self._index += derivative[2]
             return derivative[0]
         if not self._next_is("D"):
             return None
@@ -443,7 +443,7 @@ class EquationParser(TokenReader):
                     f"the order {order} at character {position + 1} is free inside a non-linear term; give its value"
                 )
             if is_derivative and self._next_is("^"):
-                text = self._readable[position : self._peek()[2]].strip()
+                text = self._normalized[position : self._peek()[2]].strip()
                 raise self._error(
                     f"a power of {text} at character {self._peek()[2] + 1} has two meanings; write ({text})^…"
                 )
@@ -477,7 +477,7 @@ class EquationParser(TokenReader):
         """Parse a signal or its derivative, and return (order, signal); the order of a plain signal is None."""
         derivative = self._leibniz()
         if derivative is not None and derivative[1]:
-            self._position += derivative[2]
+            self._index += derivative[2]
             return derivative[:2]
         self._primes = 0
         order, signal = self._operator(), self._signal()
@@ -490,10 +490,10 @@ class EquationParser(TokenReader):
 
     def _count_primes(self) -> int:
         """Parse primes after a signal, and return their number."""
-        start = self._position
+        start = self._index
         while self._accept("'"):
             pass
-        return self._position - start
+        return self._index - start
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
         """Return (order, signal, number of tokens) of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
@@ -506,7 +506,7 @@ class EquationParser(TokenReader):
         if bottom is None:
             return None
         if signal:
-            self.plain.add(signal)
+            self.unlimited.add(signal)
         return self._order_from(order, self._peek()[2]), signal, text.count(" ", 0, bottom.end()) + 1
 
     def _signal(self) -> str:
@@ -520,16 +520,16 @@ class EquationParser(TokenReader):
         )
         self._take()
         if law is None:
-            self.plain.add(value)
+            self.unlimited.add(value)
             self._primes = self._count_primes()
             self._time_argument(value)
             return value
         self._take()
-        plain_before = set(self.plain)
+        unlimited_before = set(self.unlimited)
         signal = self._signal()
         if self._primes:
             raise self._error(f"{value}(…) limits a signal, not its derivative; write {value}({signal}, …)")
-        self.plain = plain_before | (self.plain - {signal})
+        self.unlimited = unlimited_before | (self.unlimited - {signal})
         if law == "dead_zone" and (signal, "saturation") in self.limits:
             raise self._error(f"a dead zone acts before a saturation: write sat(dead({signal}, …), …)")
         self._expect(",", "',' and the limit, as in sat(u, 0.94)")
@@ -544,20 +544,20 @@ class EquationParser(TokenReader):
         if not (self._next_is("(", "t") and self._peek(2)[1] in ")-+"):
             self._check_delay(signal, 0.0)
             return
-        self._position += 2
+        self._index += 2
         delay: Value = 0.0
         if self._accept("+"):
             delay = self._lead(signal)
         elif self._accept("-"):
             delay = self._delay(signal)
         # A printed model has the unit s after a delay.
-        self._position += self._next_is("s")
+        self._index += self._next_is("s")
         self._expect(")")
         self._check_delay(signal, delay)
 
     def _check_delay(self, signal: str, delay: Value) -> None:
         if self.delays.setdefault(signal, delay) != delay:
-            self._twice_delayed = self._twice_delayed or signal
+            self._conflicting_delay = self._conflicting_delay or signal
 
     def _lead(self, signal: str) -> float:
         kind, value, _ = self._peek()
@@ -582,7 +582,7 @@ class EquationParser(TokenReader):
 
     def _take_friction(self, sign: float) -> bool:
         """Parse and store ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
-        start, number, name = self._position, 1.0, None
+        start, number, name = self._index, 1.0, None
         if self._peek()[0] == "number":
             number = float(self._take()[1])
             self._accept("*")
@@ -593,7 +593,7 @@ class EquationParser(TokenReader):
         count = self._closing_distance(1) if self._next_is("exp", "(") else 0
         has_factor = count > 0 and self._peek(count + (self._peek(count)[1] == "*"))[1] == "sign"
         if not has_factor and not self._next_is("sign", "("):
-            self._position = start
+            self._index = start
             return False
         factor = self._stribeck_factor() if has_factor else None
         self._accept("*")
@@ -643,9 +643,9 @@ class EquationParser(TokenReader):
 
     def _velocity(self, expectation: str) -> str:
         """Parse ``D y``, ``y'`` or ``dy/dt``, and return the signal; `expectation` is the text of the syntax error."""
-        start, (order, signal) = self._position, self._derivative() if self._peek()[0] == "name" else (None, "")
+        start, (order, signal) = self._index, self._derivative() if self._peek()[0] == "name" else (None, "")
         if order is None:
-            self._position = start
+            self._index = start
             raise self._syntax_error(expectation)
         if order != Order(1.0):
             raise self._error(f"friction depends on the first derivative; write sign(D {signal}) for the velocity")
@@ -704,8 +704,8 @@ class EquationParser(TokenReader):
             raise self._syntax_error("the name of a signal")
         self._take()
         if self._next_is("(", "s", ")"):
-            self._position += 3
-        self.plain.add(value)
+            self._index += 3
+        self.unlimited.add(value)
         return value
 
     def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value, str | None]:
@@ -713,7 +713,7 @@ class EquationParser(TokenReader):
 
         `common` is u in the form ``y/u = …``.
         """
-        num, den, divides, start = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, self._position
+        num, den, divides, start = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, self._index
         delay: Value = 0.0
         signal: str | None = None
         while True:
@@ -738,12 +738,12 @@ class EquationParser(TokenReader):
     def _missing_input(self, start: int) -> ModelError:
         """Return the error for a transfer function without an input at its end; `start` is its first token."""
         text = "the transfer function has no input at its end; write "
-        factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[start : self._position])
+        factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[start : self._index])
         names = [token for token in factors if token[0] == "name" and token[1] not in ("s", "e", "exp", "sqrt")]
         if names:
             _, name, position = names[-1]
-            before = self._readable[self._tokens[start][2] : position].rstrip("* ") or "1"
-            after = self._readable[position + len(name) : self._peek()[2]].strip()
+            before = self._normalized[self._tokens[start][2] : position].rstrip("* ") or "1"
+            after = self._normalized[position + len(name) : self._peek()[2]].strip()
             text += f"{f'{before}{after} {name}'!r} if {name} is the input, and otherwise "
         return self._error(f"{text}both signals, as in 'y = 2/(s + 3) u' or 'y/u = 2/(s + 3)'")
 
@@ -789,7 +789,7 @@ class EquationParser(TokenReader):
                     self._accept("*")
                     product = self._times(product, self._factor())
             polynomial += [(sign * c, name, order) for c, name, order in product]
-        return [term for term in _add_known(polynomial) if term[0] != 0.0] or UNIT_POLYNOMIAL
+        return [term for term in _combine_numeric(polynomial) if term[0] != 0.0] or UNIT_POLYNOMIAL
 
     def _factor(self) -> SymbolicPolynomial:
         """Parse one factor of a transfer function, and return it as a polynomial in s."""
@@ -798,7 +798,7 @@ class EquationParser(TokenReader):
             self._take()
             base: SymbolicPolynomial = [(float(value), None, Order())]
         elif value == "sqrt" and self._next_is("sqrt", "(", "s", ")"):
-            self._position += 4
+            self._index += 4
             return [(1.0, None, Order(0.5))]
         elif kind == "name" and value not in FUNCTION_NAMES:
             self._take()
@@ -836,7 +836,7 @@ class EquationParser(TokenReader):
         return [(c, name, order) for (name, order), c in products.items() if c != 0.0]
 
 
-def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
+def _combine_numeric(terms: SymbolicPolynomial) -> SymbolicPolynomial:
     """Return a polynomial in which terms of equal order with numeric coefficients are combined."""
     sums: dict[object, tuple[float, str | None, Order]] = {}
     for index, (c, name, order) in enumerate(terms):

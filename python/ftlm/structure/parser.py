@@ -357,7 +357,7 @@ def _merge_nonlinearities(parsers: Sequence[EquationParser]) -> tuple[InputNonli
             raise ModelError(
                 f"{key[0]} has two different saturations or two different dead zones in these equations; use one"
             )
-    unlimited = {signal for parser in parsers for signal in parser.plain}
+    unlimited = {signal for parser in parsers for signal in parser.unlimited}
     conflict = next((signal for signal, _ in limits if signal in unlimited), None)
     if conflict is not None:
         raise ModelError(

@@ -56,28 +56,28 @@ class TokenReader:
         text = _DOTTED_PATTERN.sub(_prime_notation, unicodedata.normalize("NFC", text))
         self.text = text
         self._tokens: list[tuple[str, str, int]] = []
-        self._position = 0
+        self._index = 0
         # Replacements have the length of the originals, so that positions in error messages stay valid.
-        readable = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
+        normalized = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
         position = 0
-        while readable[position:].strip():
-            token = _TOKEN_PATTERN.match(readable, position)
+        while normalized[position:].strip():
+            token = _TOKEN_PATTERN.match(normalized, position)
             if token is None:
-                start = position + len(readable[position:]) - len(readable[position:].lstrip())
+                start = position + len(normalized[position:]) - len(normalized[position:].lstrip())
                 at_character = f"{text[start]!r} at character {start + 1}"
                 raise ModelError(f"equation {text!r}: unexpected {at_character}; remove it")
             kind = str(token.lastgroup)
             self._tokens.append((kind, token[kind], token.start(kind)))
             position = token.end()
-        self._readable = readable
+        self._normalized = normalized
 
     def _peek(self, offset: int = 0) -> tuple[str, str, int]:
-        index = self._position + offset
+        index = self._index + offset
         return self._tokens[index] if index < len(self._tokens) else ("end", "the end", len(self.text))
 
     def _take(self) -> tuple[str, str, int]:
         token = self._peek()
-        self._position += 1
+        self._index += 1
         return token
 
     def _next_is(self, *values: str) -> bool:
@@ -87,7 +87,7 @@ class TokenReader:
     def _accept(self, symbol: str) -> bool:
         """Consume the next token if it is the given symbol, and return whether it was."""
         is_match = self._peek()[:2] == ("symbol", symbol)
-        self._position += is_match
+        self._index += is_match
         return is_match
 
     def _expect(self, symbol: str, expectation: str | None = None) -> None:
@@ -103,18 +103,18 @@ class TokenReader:
         found = value if kind == "end" else repr(value)
         if kind == "symbol" and value in ",:'":
             return self._error(f"unexpected {value!r} at character {position + 1}; remove it")
-        if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
+        if value == "D" or (expectation == "the name of a signal" and self._index > 0 and self._peek(-1)[1] == "D"):
             return self._error(
                 f"expected {expectation} at character {position + 1}, found {found}; D is the derivative in an "
                 f"equation: rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
         remedy = "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
-        before = self._peek(-1) if self._position else ("", "", 0)
+        before = self._peek(-1) if self._index else ("", "", 0)
         if before[0] == kind == "name":
             remedy = f"a name has no blanks: write {f'{before[1]}_{value}'!r} for one signal"
-            if self._position > 1 and self._peek(-2)[0] == "name":
+            if self._index > 1 and self._peek(-2)[0] == "name":
                 remedy += f", and one name for a product of coefficients, as in 'a1 {value}'"
-        elif kind == "name" and self._position > 1 and self._peek(-2)[1] == "^":
+        elif kind == "name" and self._index > 1 and self._peek(-2)[1] == "^":
             remedy = f"a power of a coefficient is a coefficient: write one name for it, as in 'a1 {value}'"
         elif before[0] == "name" and value == "(":
             remedy = f"{before[1]!r} is no function{nearest(before[1], FUNCTION_NAMES)}"
@@ -162,11 +162,11 @@ class TokenReader:
             while depth:
                 kind, token, position = self._take()
                 if kind == "end":
-                    self._position -= 1
+                    self._index -= 1
                     raise self._syntax_error(f"'{closing}'")
                 depth += token in "({" and kind == "symbol"
                 depth -= token in ")}" and kind == "symbol"
-            return self._order_from(self._readable[text_start:position], text_start)
+            return self._order_from(self._normalized[text_start:position], text_start)
         sign = "-" if self._accept("-") else ""
         kind, value, _ = self._peek()
         if kind not in ("number", "name"):

@@ -18,7 +18,7 @@ from ftlm.estimation.identify import identify, identify_pieces
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import least_squares_piece_test
 from ftlm.estimation.verdict import MIN_FIT_GAIN, improves_prediction, is_degenerate
-from ftlm.findings import Finding, make_finding, on_validation
+from ftlm.findings import Finding, make_finding, mark_validation
 from ftlm.simulation.discretization import prepare
 from ftlm.simulation.initial_conditions import has_memory
 from ftlm.structure.parser import as_structure
@@ -410,7 +410,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         findings += _fractional_order_findings(single_choice.winner, single_choice.ranked, result)
     validated = result.validate(folds.unseen_runs) if folds.unseen_runs else None
     if validated is not None:
-        findings += on_validation(validated.findings, ", ".join(run.name for run in folds.unseen_runs))
+        findings += mark_validation(validated.findings, ", ".join(run.name for run in folds.unseen_runs))
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),

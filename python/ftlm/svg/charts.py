@@ -208,7 +208,7 @@ def _shade(style: int, x: float, y: float, width: float, height: float, **attrib
 PLANE_HEIGHT_PX, CROSS_HALF_SIZE_PX, DOT_RADIUS_PX = 260.0, 5.0, 2.6
 #: Axis limit of a pole map divided by the largest magnitude of a pole. Margin around the dots of a locus, as a fraction
 #: of their range.
-PLANE_MARGIN_FACTOR, LOCUS_MARGIN_SHARE = 1.18, 0.06
+PLANE_MARGIN_FACTOR, LOCUS_MARGIN_FRACTION = 1.18, 0.06
 
 
 @check_arguments
@@ -273,7 +273,7 @@ class PlaneChart(Figure):
             return complex(-largest, -largest) * PLANE_MARGIN_FACTOR, complex(largest, largest) * PLANE_MARGIN_FACTOR
         real, imag = self.values.real, self.values.imag
         low, high = complex(real.min(), imag.min()), complex(real.max(), imag.max())
-        pad = LOCUS_MARGIN_SHARE * (max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0)
+        pad = LOCUS_MARGIN_FRACTION * (max(high.real - low.real, high.imag - low.imag) or abs(high) or 1.0)
         return low - complex(pad, pad), high + complex(pad, pad)
 
     def sector_outline(self, half_range: float) -> list[complex]:

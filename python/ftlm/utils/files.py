@@ -31,7 +31,7 @@ PACKAGE_LOGGER.addHandler(logging.NullHandler())
 _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
-def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
+def check_target(path: str | os.PathLike[str], *, force: bool) -> Path:
     """Return the path of a file to be written; raise DataError if it must not be written.
 
     This is the case for a folder, a link, a device, and an existing file if `force` is False.
@@ -58,7 +58,7 @@ def _link_status(file: Path) -> os.stat_result | None:
         return None
 
 
-def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
+def check_writable(*paths: str | os.PathLike[str] | None, force: bool) -> None:
     """Raise DataError if a file cannot be written to one of the paths; a path that is None is skipped.
 
     The function is called before a long computation, which would otherwise be lost.
@@ -66,7 +66,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
     for path in paths:
         if path is None:
             continue
-        file = check_new(path, force=force)
+        file = check_target(path, force=force)
         folder = file.absolute().parent
         if not folder.is_dir():
             raise DataError(f"{file.parent} is not a folder; create it first")
@@ -98,7 +98,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     DataError
         If the file exists and ``force`` is False, or it cannot be written.
     """
-    file = check_new(path, force=force)
+    file = check_target(path, force=force)
     try:
         # The file is in the same folder, because a rename cannot cross file systems. File names have a maximum length.
         temporary_file = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
@@ -123,7 +123,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
             with contextlib.suppress(OSError):
                 temporary_file.unlink()
             # Another program created the file after the check.
-            check_new(file, force=False)
+            check_target(file, force=False)
             raise
         except BaseException:
             with contextlib.suppress(OSError):
@@ -280,7 +280,7 @@ class JsonFormat(Generic[F]):
 
     Parameters
     ----------
-    what
+    name
         Name of the content.
     source
         Kind of file that the user should pass, for error messages.
@@ -290,7 +290,7 @@ class JsonFormat(Generic[F]):
         Schema version that this version of ftlm reads and writes.
     """
 
-    what: str
+    name: str
     source: str
     kind: type[F]
     schema: int
@@ -303,14 +303,14 @@ class JsonFormat(Generic[F]):
         DataError
             If the file cannot be read, is too large, or has another format or schema version.
         """
-        content = read_small_file(path, self.what, self.source)
+        content = read_small_file(path, self.name, self.source)
         file = Path(path)
         self._check_schema(file, content)
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise DataError(
-                f"{file} is not an ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
+                f"{file} is not an ftlm {self.name}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
             ) from error
 
     def _check_schema(self, file: Path, content: bytes) -> None:
@@ -319,11 +319,11 @@ class JsonFormat(Generic[F]):
             head = msgspec.json.decode(content, type=FileHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return
-        if head.format == f"ftlm-{self.what}" and head.schema != self.schema:
+        if head.format == f"ftlm-{self.name}" and head.schema != self.schema:
             version = f" (written by {short_repr(head.written_by, MAX_NAME_CHARACTERS)})" if head.written_by else ""
             raise DataError(
-                f"{file} is a {self.what} file of schema {short_repr(head.schema)}{version}, and ftlm {__version__} "
-                f"reads schema {self.schema}; read it with the version that wrote it, or compute the {self.what} again"
+                f"{file} is a {self.name} file of schema {short_repr(head.schema)}{version}, and ftlm {__version__} "
+                f"reads schema {self.schema}; read it with the version that wrote it, or compute the {self.name} again"
             )
 
 

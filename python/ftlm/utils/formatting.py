@@ -130,7 +130,7 @@ def with_error(value: float, error: float | None) -> str:
     return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
-def columns() -> int:
+def line_length() -> int:
     """Return the line length [characters] of the terminal or of the variable ``COLUMNS``, limited to 40 … 110."""
     return min(
         max(shutil.get_terminal_size((MAX_LINE_CHARACTERS, 40)).columns, MIN_LINE_CHARACTERS), MAX_LINE_CHARACTERS
@@ -138,7 +138,7 @@ def columns() -> int:
 
 
 def wrap_text(text: str, lead: str = "", indent: str | None = None) -> list[str]:
-    """Return a text as a list of lines that fit the terminal; see :func:`columns`.
+    """Return a text as a list of lines that fit the terminal; see :func:`line_length`.
 
     The first line begins with `lead`, and each other line with `indent` (by default spaces).
     """
@@ -146,7 +146,7 @@ def wrap_text(text: str, lead: str = "", indent: str | None = None) -> list[str]
     text = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(
         text,
-        columns(),
+        line_length(),
         initial_indent=lead,
         subsequent_indent=" " * (len(lead) or 2) if indent is None else indent,
         break_long_words=False,

@@ -41,7 +41,7 @@ FIELD_BY_PARAMETER = {
 }
 
 
-class _Current:
+class _CurrentInterface:
     """Global variable for the interface whose syntax messages use."""
 
     interface: Interface = "python"
@@ -93,17 +93,17 @@ PART_COLUMNS = {Placeholder("part"): Placeholder("column")}
 
 def current_interface() -> Interface:
     """Return the interface whose syntax messages use."""
-    return _Current.interface
+    return _CurrentInterface.interface
 
 
 @contextmanager
 def use_interface(name: Interface) -> Iterator[None]:
     """Format messages in the syntax of an interface within a ``with`` block."""
-    interface_before, _Current.interface = _Current.interface, name
+    interface_before, _CurrentInterface.interface = _CurrentInterface.interface, name
     try:
         yield
     finally:
-        _Current.interface = interface_before
+        _CurrentInterface.interface = interface_before
 
 
 def flag_of(name: str) -> str:
@@ -133,9 +133,9 @@ def parameter(name: str, value: object = None) -> str:
     ...     parameter("window"), parameter("method", "output-error")
     ('--window', '--method output-error')
     """
-    if _Current.interface == "python":
+    if _CurrentInterface.interface == "python":
         return f"{name}=" if value is None else f"{name}={value!r}"
-    if _Current.interface != "command line":
+    if _CurrentInterface.interface != "command line":
         return _option_in_words(name, value)
     flag = flag_of(name)
     if value is None or value is True:
@@ -147,8 +147,8 @@ def parameter(name: str, value: object = None) -> str:
 
 def _option_in_words(name: str, value: object) -> str:
     """Return a reference to a parameter for a reader who types no options, such as ``the option offset = auto``."""
-    field = FIELD_BY_PARAMETER.get(name) if _Current.interface == "app" else None
-    option = field or f"the option {name}{' of Python' if _Current.interface == 'app' else ''}"
+    field = FIELD_BY_PARAMETER.get(name) if _CurrentInterface.interface == "app" else None
+    option = field or f"the option {name}{' of Python' if _CurrentInterface.interface == 'app' else ''}"
     # A placeholder tells how an option is typed.
     is_placeholder = isinstance(value, Placeholder) or (
         isinstance(value, Mapping) and any(isinstance(item, Placeholder) for item in value.values())
@@ -170,14 +170,14 @@ def setting(name: str) -> str:
 
     A name that is not an identifier, such as "delay of u", is a quantity and always followed by ``=``.
     """
-    return parameter(name) if _Current.interface == "command line" and name.isidentifier() else f"{name} ="
+    return parameter(name) if _CurrentInterface.interface == "command line" and name.isidentifier() else f"{name} ="
 
 
 def choose_text(python: str, command_line: str, page: str | None = None) -> str:
     """Return the text for the interface; a report and the app have the text of Python if there is none for a page."""
-    if _Current.interface == "command line":
+    if _CurrentInterface.interface == "command line":
         return command_line
-    return python if page is None or _Current.interface == "python" else page
+    return python if page is None or _CurrentInterface.interface == "python" else page
 
 
 def layout_parameter(**values: object) -> str:
@@ -185,15 +185,15 @@ def layout_parameter(**values: object) -> str:
 
     Examples are ``layout=dict(decimal='comma')`` in Python and ``--decimal comma`` on the command line.
     """
-    if _Current.interface == "python":
+    if _CurrentInterface.interface == "python":
         return f"layout=dict({', '.join(f'{name}={value!r}' for name, value in values.items())})"
-    separator = " " if _Current.interface == "command line" else " and "
+    separator = " " if _CurrentInterface.interface == "command line" else " and "
     return separator.join(parameter(name, value) for name, value in values.items())
 
 
 def layout_fields(*names: str) -> str:
     """Return a reference to layout options for the start of a sentence, such as ``layout=: skip`` or ``--skip``."""
-    if _Current.interface == "python":
+    if _CurrentInterface.interface == "python":
         return f"{parameter('layout')}: {' and '.join(names)}"
     return " and ".join(map(parameter, names))
 

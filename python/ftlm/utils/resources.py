@@ -24,7 +24,7 @@ from ftlm.errors import ModelError
 #: Environment variable with the memory limit: bytes, or a number with K, M, G or T (powers of 1024).
 MEMORY_VARIABLE = "FTLM_MEMORY"
 #: Default share of the available memory. The rest is for records, threads and other programs.
-DEFAULT_MEMORY_SHARE = 0.8
+DEFAULT_MEMORY_FRACTION = 0.8
 #: Memory limit if the system does not report the available memory.
 FALLBACK_MEMORY_BYTES = 2 << 30
 _SYSTEM_ROOT = Path("/")
@@ -52,7 +52,7 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
                 f"{MEMORY_VARIABLE}={text!r} is not a memory size; give bytes, or a number with K, M, G or T"
             )
         return count
-    return int(DEFAULT_MEMORY_SHARE * (available_memory(system) or FALLBACK_MEMORY_BYTES / DEFAULT_MEMORY_SHARE))
+    return int(DEFAULT_MEMORY_FRACTION * (available_memory(system) or FALLBACK_MEMORY_BYTES / DEFAULT_MEMORY_FRACTION))
 
 
 def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
@@ -70,7 +70,7 @@ def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
     return max(min(amounts), 1)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="ascii", errors="replace")
     except OSError:
@@ -78,7 +78,7 @@ def _text(path: Path) -> str:
 
 
 def _kernel_available_bytes(system: Path) -> list[int]:
-    match = re.search(r"^MemAvailable:\s+([0-9]+) kB", _text(system / "proc/meminfo"), re.MULTILINE)
+    match = re.search(r"^MemAvailable:\s+([0-9]+) kB", _read_text(system / "proc/meminfo"), re.MULTILINE)
     return [int(match[1]) << 10] if match else []
 
 
@@ -92,7 +92,7 @@ _CGROUP_FILES = {
 def _cgroup_available_bytes(system: Path) -> list[int]:
     """Return the free memory [bytes] of each control group with a limit; reclaimable page cache counts as free."""
     amounts = []
-    for line in _text(system / "proc/self/cgroup").splitlines():
+    for line in _read_text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
         version = 2 if number == "0" and not controllers else 1 if "memory" in controllers.split(",") else None
         if version is None:
@@ -101,10 +101,10 @@ def _cgroup_available_bytes(system: Path) -> list[int]:
         parts = [part for part in name.split("/") if part not in ("", "..")]
         for depth in range(len(parts), -1, -1):
             folder = system.joinpath(root, *parts[:depth])
-            limit, usage = _text(folder / limit_file).strip(), _text(folder / usage_file).strip()
+            limit, usage = _read_text(folder / limit_file).strip(), _read_text(folder / usage_file).strip()
             # In version 2 "max" means no limit, and in version 1 a huge number does.
             if limit.isdecimal() and usage.isdecimal() and int(limit) < 1 << 60:
-                match = re.search(rf"^{cache_key} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
+                match = re.search(rf"^{cache_key} ([0-9]+)$", _read_text(folder / "memory.stat"), re.MULTILINE)
                 amounts.append(int(limit) - int(usage) + (int(match[1]) if match else 0))
     return amounts
 
@@ -181,7 +181,7 @@ def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
             raise
 
 
-def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
+def subprocess_arguments(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
     """Return arguments for :func:`subprocess.run` with which a script runs in an isolated Python process.
 
     The process must not import an uploaded or downloaded file as a module. Python therefore runs in the folder of its

@@ -15,7 +15,7 @@ from ftlm.utils.validation import Floats
 REST_SIGMAS = 5.0
 #: Additional tolerance of the first value, as a fraction of the standard deviation of the signal, for signals without
 #: noise.
-REST_SHARE = 1e-3
+REST_FRACTION = 1e-3
 #: Median absolute deviation of a normal variable in standard deviations.
 MAD_OVER_SIGMA = 0.6744897501960817
 #: Residuals below this fraction of the standard deviation of an output are rounding and discretization errors.
@@ -36,7 +36,7 @@ def is_rest(samples: Floats) -> bool:
     """
     finite = samples[~np.isnan(samples)]
     noise = white_noise(samples)
-    return bool(abs(finite[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(finite)))
+    return bool(abs(finite[0]) <= REST_SIGMAS * noise + REST_FRACTION * float(np.std(finite)))
 
 
 def estimate_noise(samples: Floats) -> float:

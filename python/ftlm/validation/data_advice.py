@@ -19,7 +19,7 @@ from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.formatting import attributes, columns, plural, wrap_text
+from ftlm.utils.formatting import attributes, line_length, plural, wrap_text
 from ftlm.utils.linalg import orthonormal
 from ftlm.utils.parameters import Note, parameter
 from ftlm.utils.statistics import estimate_noise, is_rest, quantization_step
@@ -33,38 +33,38 @@ LINE_BINS = 8
 BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
 #: A mean of an input above this fraction of its standard deviation counts as a constant level. A smaller mean may come
 #: from truncated periods.
-LEVEL_SHARE = 0.3
+LEVEL_FRACTION = 0.3
 #: Two inputs with a larger absolute correlation are reported as collinear.
 MAX_INPUT_CORRELATION = 0.999
 #: Fewer samples than this are reported as too short for an estimate.
 MIN_USEFUL_SAMPLES = 100
 #: An output that is constant for longer than this fraction of the run while an input changes is a dead channel.
-DEAD_SHARE = 0.005
+DEAD_FRACTION = 0.005
 #: Fraction of an interval at rest, at its end, in which an input may already change because of a dead time.
-DEAD_TIME_SHARE = 0.1
+DEAD_TIME_FRACTION = 0.1
 MIN_DEAD_SAMPLES = 50
 #: Minimum number of consecutive samples at an extreme value that count as clipped, and fraction of clipped samples in a
 #: run from which saturation is reported.
 MIN_CLIPPED_SAMPLES = 3
-CLIPPED_SHARE = 0.002
+CLIPPED_FRACTION = 0.002
 #: A spike differs from both neighbors by more than this number of noise standard deviations and this fraction of the
-#: range. If a larger fraction of the samples than `MAX_SPIKE_SHARE` are spikes, none is reported.
+#: range. If a larger fraction of the samples than `MAX_SPIKE_FRACTION` are spikes, none is reported.
 SPIKE_SIGMAS = 12.0
-SPIKE_SHARE = 0.03
-MAX_SPIKE_SHARE = 0.01
+SPIKE_FRACTION = 0.03
+MAX_SPIKE_FRACTION = 0.01
 #: An encoder wrap is a jump of more than this fraction of the range against the slope on both sides. The slope is taken
 #: over `WRAP_SLOPE` samples.
-WRAP_SHARE = 0.6
+WRAP_FRACTION = 0.6
 WRAP_SLOPE = 5
 #: Thresholds of the change by an unexplained trend over a run: fraction of the standard deviation of the output, and
 #: number of standard errors, which are estimated from blocks.
-DRIFT_SHARE = 0.15
+DRIFT_FRACTION = 0.15
 DRIFT_SIGMAS = 6.0
 DRIFT_BLOCKS = 16
 DRIFT_PULSES = 1024
 DRIFT_LAGS = 12
 #: Minimum fraction of the power of a linear trend that the responses to inputs do not explain, for a drift test.
-MIN_TREND_RESIDUAL_SHARE = 1e-3
+MIN_TREND_RESIDUAL_FRACTION = 1e-3
 #: Maximum number of samples of the test for feedback.
 MAX_FEEDBACK_SAMPLES = 8_000
 #: Ratio of the test statistic to its limit above which inconclusive feedback is reported. Sweeps in open loop may
@@ -191,14 +191,14 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         return
     at = int(np.argmax(lengths))
     start, rows = int(starts[at]), int(lengths[at]) + 1
-    if rows < max(MIN_DEAD_SAMPLES, DEAD_SHARE * run.length):
+    if rows < max(MIN_DEAD_SAMPLES, DEAD_FRACTION * run.length):
         return
     # Clipping at an extreme is reported as saturation; rest at any level before the first input, and under no input,
     # is legitimate.
     if _entered_steeply(y, start, rows):
         return
     # The output may be at rest while an input already changes, because it responds after a dead time.
-    tail = max(1, int(DEAD_TIME_SHARE * rows))
+    tail = max(1, int(DEAD_TIME_FRACTION * rows))
     head_samples = [run[n][start : start + rows - tail] for n in run.inputs]
     tail_samples = [run[n][start + rows - tail : start + rows + 1] for n in run.inputs]
     is_moving = any(np.any(after != before[0]) for before, after in zip(head_samples, tail_samples, strict=True))
@@ -260,7 +260,7 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
             clipped = int(np.sum(lengths[long][np.array(is_steep, dtype=bool)]))
         else:
             clipped = int(np.sum(lengths[long]))
-        if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_SHARE * y.size):
+        if clipped >= max(MIN_CLIPPED_SAMPLES, CLIPPED_FRACTION * y.size):
             level = _with_unit(run, name, float(extreme))
             details = {"extreme": extreme_name, "level": level, "rows": clipped, "share": 100 * clipped / y.size}
             yield make_finding(code, run=run.name, **{role: name}, **details)
@@ -273,7 +273,7 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
     rises, falls = np.diff(y)[:-1], np.diff(y)[1:]
     range_width = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
     height = np.minimum(np.abs(rises), np.abs(falls))
-    limit = max(SPIKE_SIGMAS * estimate_noise(y), SPIKE_SHARE * range_width)
+    limit = max(SPIKE_SIGMAS * estimate_noise(y), SPIKE_FRACTION * range_width)
     out = (rises * falls < 0) & (height > limit)
     # A fast signal may turn that sharply everywhere; a spike is isolated between quiet neighbors.
     neighbor_differences = np.abs(y[2:] - y[:-2])
@@ -284,7 +284,7 @@ def _spikes(run: Run, name: str) -> Iterator[Finding]:
         is_pulse = (jump > 0.2 * np.ptp(run[n])) & (np.ptp(run[n]) > 0)
         out &= ~(is_pulse[:-1] & is_pulse[1:])
     rows = np.flatnonzero(out) + 1
-    if not rows.size or rows.size > MAX_SPIKE_SHARE * y.size:
+    if not rows.size or rows.size > MAX_SPIKE_FRACTION * y.size:
         return
     highest_row = rows[int(np.argmax(height[rows - 1]))]
     yield make_finding(
@@ -304,7 +304,7 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     increments = np.diff(y)
     range_width, typical = float(np.ptp(y)), float(np.median(np.abs(increments)))
-    jumps = np.flatnonzero((np.abs(increments) > WRAP_SHARE * range_width) & (np.abs(increments) > 10 * typical))
+    jumps = np.flatnonzero((np.abs(increments) > WRAP_FRACTION * range_width) & (np.abs(increments) > 10 * typical))
     rows = []
     for at in jumps.tolist():
         if at < WRAP_SLOPE or at + WRAP_SLOPE + 1 >= y.size:
@@ -332,9 +332,9 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
 
 
 def _jumps_near(u: Floats, at: int) -> bool:
-    """Whether an input jumps by more than the fraction `WRAP_SHARE` of its range within one sample of index `at`."""
+    """Whether an input jumps by more than the fraction `WRAP_FRACTION` of its range within one sample of index `at`."""
     nearby_increments = np.abs(np.diff(u[at - 1 : at + 3]))
-    return bool(np.any(nearby_increments > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
+    return bool(np.any(nearby_increments > WRAP_FRACTION * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
@@ -385,7 +385,7 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
             continue
         varying_inputs = [n for n in inputs if np.ptp(run[n]) > 0]
         line_count = sum(2 * spectral_lines(run[n])[0] for n in varying_inputs)
-        line_count += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
+        line_count += sum(abs(float(np.mean(run[n]))) > LEVEL_FRACTION * float(np.std(run[n])) for n in inputs)
         free = len(equation.order_names) + len(equation.coefficient_names)
         if free > line_count:
             inputs_text = ", ".join(inputs)
@@ -449,14 +449,14 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         # The part of trend and output that the regressors explain does not count as drift, so it is removed.
         q = orthonormal(basis.T, 1e-8)
         y_residual, t_residual = y - q @ (q.T @ y), t - q @ (q.T @ t)
-        if float(t_residual @ t_residual) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
+        if float(t_residual @ t_residual) < MIN_TREND_RESIDUAL_FRACTION * float(t @ t):
             continue
         slope = float(t_residual @ y_residual) / float(t_residual @ t_residual)
         remainder = y_residual - slope * t_residual
         blocks = np.array_split(remainder * t_residual, DRIFT_BLOCKS)
         slope_error = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_residual @ t_residual)
         deviation = float(np.std(y))
-        if abs(slope) > DRIFT_SHARE * deviation and abs(slope) > DRIFT_SIGMAS * slope_error:
+        if abs(slope) > DRIFT_FRACTION * deviation and abs(slope) > DRIFT_SIGMAS * slope_error:
             details = {"slope": _with_unit(run, name, slope), "share": 100 * abs(slope) / deviation}
             yield make_finding("drift", run=run.name, output=name, **details)
 
@@ -566,7 +566,7 @@ class Inspection:
             f"carries up to {self.rows - 1} block pulses"
         )
         # Columns for which a narrow terminal has no room follow in a second table.
-        columns_per_line = max((columns() - width - 16) // 11, 1)
+        columns_per_line = max((line_length() - width - 16) // 11, 1)
         for start in range(0, len(headings), columns_per_line):
             lines += [
                 row_start + "".join(f"{cell:>11}" for cell in cells[start : start + columns_per_line])

@@ -28,32 +28,32 @@ MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 8_000
 MAX_INPUT_LAGS, MAX_OTHER_LAGS, MAX_OUTPUT_LAGS = 60, 20, 40
 #: Maximum number of distinct values, and maximum ratio of this number to the number of samples, of an input that
 #: switches between few levels. A linear prediction of such an input has no meaningful innovation.
-MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE = 6, 0.01
+MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_FRACTION = 6, 0.01
 #: Minimum number of changes of an input that is constant between its changes.
 MIN_CHANGES = 80
 #: One-step prediction error of an input, relative to its standard deviation, below which its own past determines it.
-PREDICTED_SHARE = 3e-4
+PREDICTED_FRACTION = 3e-4
 #: Innovation of an output, relative to its standard deviation, below which it is a rounding error.
-QUIET_SHARE = 1e-6
+QUIET_FRACTION = 1e-6
 #: Limits [standard deviations] at which input innovations, output innovations, and residuals are clipped.
 INPUT_CLIP, OUTPUT_CLIP, RESIDUAL_CLIP = 3.0, 5.0, 12.0
 #: Threshold [robust standard deviations] and number of iterations of the robust prediction of the input.
 ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
 #: Feedback is certain from these values on: the fraction of the input innovation that past outputs explain, the
 #: relative prediction error of the input, and the ratio of the test statistic to its limit.
-CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
+CERTAIN_FRACTION, ROUGH_FRACTION, CERTAIN_RATIO = 0.5, 2e-3, 5.0
 #: Minimum of samples x explained fraction x (relative prediction error)^2, below which feedback hardly biases
 #: estimates.
 MIN_FEEDBACK_POWER = 0.01
 #: Assumed variances of the noise on a measured input, as fractions of the largest possible variance.
-INPUT_NOISE_SHARES = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
+INPUT_NOISE_FRACTIONS = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
 #: Number of time shifts of the outputs that serve as placebos, and minimum ratio of the test statistic to the largest
 #: placebo statistic for detected feedback.
 PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
 #: Minimum ratio to the placebo statistic, and to the limit, if the input innovation is not white in all parts of a run.
 PLACEBO_RATIO_IN_DOUBT = 10.0
 #: Number of parts of a run, and minimum explained power of the median part relative to that of all parts together.
-STEADY_PARTS, STEADY_SHARE = 8, 0.05
+STEADY_PARTS, STEADY_FRACTION = 8, 0.05
 #: Number of samples of the short blocks in which whiteness and independence from past inputs are tested, and maximum
 #: lag of the test of whiteness.
 LOCAL_ROWS, LOCAL_LAGS = 50, 4
@@ -63,7 +63,7 @@ MAX_LINES, LINE_RATIO, LINE_NEIGHBORS = 16, 40.0, 400
 #: Weight of the newest residual in low-pass filtered residuals, which integral control feeds back, and length of the
 #: filter [samples].
 SLOW_FORGETTING, SLOW_MEMORY_ROWS = 0.1, 100
-RIDGE_SHARE = 1e-10
+RIDGE_FRACTION = 1e-10
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def feedback_test(
     levels = np.unique(np.concatenate(inputs)).size
     if all(_is_periodic(u) for u in inputs):
         return FeedbackTest("command", "it repeats itself exactly", rows=longest)
-    if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE * longest):
+    if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_FRACTION * longest):
         if _has_common_change_interval(changes):
             return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
         return FeedbackTest("undecided", f"{levels} levels: a relay and a command are indistinguishable", rows=longest)
@@ -271,7 +271,7 @@ def _line_regressors(u: Floats) -> list[Floats]:
 def _ridge_gram(weighted: Floats, regressors: Floats) -> Floats:
     """Return the normal matrix ``weighted.T @ regressors`` of a weighted regression, plus a small ridge."""
     gram: Floats = weighted.T @ regressors
-    gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
+    gram[np.diag_indices_from(gram)] += RIDGE_FRACTION * np.trace(gram) / len(gram)
     return gram
 
 
@@ -452,7 +452,7 @@ class _Innovations:
         count = self.inputs.size
         clipped = np.clip(self.innovation / max(self.scale, 1e-300), -INPUT_CLIP, INPUT_CLIP)
         clipped = clipped - clipped.mean()
-        if robust_deviation(self.same_row_output) < QUIET_SHARE:
+        if robust_deviation(self.same_row_output) < QUIET_FRACTION:
             return FeedbackTest("none", "the output has no noise that could come back", rows=count)
         signed = self._same_sample_ratio(clipped)
         same_row_ratio = abs(signed)
@@ -460,7 +460,7 @@ class _Innovations:
             f"it is correlated with the output of the same row (ratio {same_row_ratio:.2g}): a controller, or a "
             "feedthrough"
         )
-        if self.scale < PREDICTED_SHARE or self.noise < QUIET_SHARE:
+        if self.scale < PREDICTED_FRACTION or self.noise < QUIET_FRACTION:
             if same_row_ratio > 1:
                 return FeedbackTest("undecided", same_row_text, rows=count, same_row=signed)
             return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
@@ -474,7 +474,7 @@ class _Innovations:
             return FeedbackTest(state, reason, ratio, power_fraction, count, same_row=signed, response=response)
 
         # Without feedback, past outputs cannot explain most of the innovation of a rough input.
-        if power_fraction >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
+        if power_fraction >= CERTAIN_FRACTION and self.scale >= ROUGH_FRACTION and ratio >= CERTAIN_RATIO:
             return result("found")
         objection = ""
         if _local_autocorrelation(clipped) > 1:
@@ -491,7 +491,7 @@ class _Innovations:
             return result("undecided", "a closed loop, or noise in the measured input")
         # A loop acts during the whole run. Independent signals are correlated by chance on one part only.
         gains = np.array([gain_part.sum() for gain_part in np.array_split(fit * target, STEADY_PARTS)])
-        if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
+        if np.median(gains) < STEADY_FRACTION * max(float(gains.sum()), 1e-300):
             return result("undecided", "only one part of the run shows it")
         min_lag = max(INNOVATION_COUNTS) + self.input_lags
         max_lag = min(stop - start for start, stop in self.row_ranges) // 3
@@ -536,7 +536,7 @@ class _Innovations:
         columns = self._regressors(rows, 0)
         at, from_columns = weighted.T @ y, weighted.T @ columns
         lowest_ratio = math.inf
-        for fraction in INPUT_NOISE_SHARES:
+        for fraction in INPUT_NOISE_FRACTIONS:
             reduced_gram = gram + ridge * np.eye(len(gram))
             reduced_gram[input_indices, input_indices] -= fraction * largest_noise
             inverse = np.linalg.inv(reduced_gram)
