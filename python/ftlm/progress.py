@@ -196,9 +196,9 @@ class Progress:
     def _show(self, text: str, pruned: str = "", time_left: str = "", **state: Any) -> None:
         """Update the texts of the bar; the label is truncated to the width of the terminal."""
         bar, columns = self._current_bar(), len(text) + len(pruned) + len(time_left) + 3
-        room = max(bar.console.width - columns - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
+        width = max(bar.console.width - columns - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
         label = escape_controls(self._label)
-        label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
+        label = label if len(label) <= width else f"{label[: width - 1].rstrip(' ,')}…"
         bar.update(bar.task_ids[0], description=label, counted=text, pruned=pruned, left=time_left, **state)
 
     def _stop(self) -> None:

@@ -114,9 +114,9 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         table = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
         structure = self._structure(X.shape[1], table.shape[1])
         inputs = tuple(s for s in structure.signals if s not in structure.outputs)
-        for what, names, count in (("X", inputs, X.shape[1]), ("y", structure.outputs, table.shape[1])):
+        for argument, names, count in (("X", inputs, X.shape[1]), ("y", structure.outputs, table.shape[1])):
             if len(names) != count:
-                raise ValueError(f"{what} has {count} columns; give those of the structure: {', '.join(names)}")
+                raise ValueError(f"{argument} has {count} columns; give those of the structure: {', '.join(names)}")
         by_name = not isinstance(self.structure, str) or self.structure != "auto"
         self._inputs = _signals_by_column("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
         self._outputs = _signals_by_column("y", structure.outputs, columns if by_name else None)
@@ -163,13 +163,13 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             )
         if not isinstance(self.structure, str):
             return self.structure.with_orders(self.orders or {})
-        words = self.structure
-        if words == "auto":
-            words = "; ".join(
+        text = self.structure
+        if text == "auto":
+            text = "; ".join(
                 f"D^alpha y{k} = a{k} y{k}" + "".join(f" + b{k}_{j} u{j}" for j in range(inputs))
                 for k in range(outputs)
             )
-        return equation(words, orders=self.orders)
+        return equation(text, orders=self.orders)
 
     def _run(self, X: Floats, y: Floats, name: str) -> Run:
         inputs, outputs = (dict(zip(n, v.T, strict=True)) for n, v in ((self._inputs, X), (self._outputs, y)))
@@ -182,18 +182,18 @@ def _columns(table: Any) -> list[str] | None:
     return names if names and all(isinstance(name, str) for name in names) else None
 
 
-def _signals_by_column(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
+def _signals_by_column(argument: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
     """Return the name of the signal in each column. Several named columns are matched by name, all others by position.
 
-    Raise ValueError if the column names are not the signal names; `what` ("X" or "y") is named in the message.
+    Raise ValueError if the column names are not the signal names; `argument` ("X" or "y") is named in the message.
     """
     if columns is None or len(signals) < 2:
         return signals
     names = tuple(map(str, columns))
     if sorted(names) != sorted(signals):
         raise ValueError(
-            f"{what} has the columns {', '.join(names)}, and the structure has {', '.join(signals)}; rename the "
-            f"columns, or pass {what}.to_numpy() in the order of the structure"
+            f"{argument} has the columns {', '.join(names)}, and the structure has {', '.join(signals)}; rename the "
+            f"columns, or pass {argument}.to_numpy() in the order of the structure"
         )
     return names
 
@@ -213,8 +213,8 @@ def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
     `fit_rows` is the number of fitted rows at the start of the index, for the message.
     """
     steps = np.diff(index) if index is not None else np.zeros(0)
-    usual = float(np.median(steps)) if steps.size else 1.0
-    bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_FRACTION * usual)))
+    median_step = float(np.median(steps)) if steps.size else 1.0
+    bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - median_step) <= MAX_INDEX_JITTER_FRACTION * median_step)))
     if not bad.size:
         return index
     where = "between the fitted rows and those of X" if fit_rows == bad[0] + 1 else f"after row {bad[0]} of X"

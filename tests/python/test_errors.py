@@ -472,7 +472,7 @@ def test_what_others_say_is_shown_whatever_it_is():
     assert seen == ["1.5", "an integer of 16610 bits", "a MuteError", r"'\ud800'"]
     assert short_repr("x" * 100, 10) == "'xxxxxxxxx…"
     said = [error_text(e, 10) for e in (ValueError("why"), MuteError(), ValueError("\ud800"), ValueError("x" * 10**6))]
-    assert said == ["why", "what it says cannot be read", r"\ud800", "x" * 10 + "…"]
+    assert said == ["why", "its message cannot be read", r"\ud800", "x" * 10 + "…"]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -260,7 +260,7 @@ def test_readings_keep_what_was_read() -> None:
     assert np.array_equal(run.sample_times.times, t)
     assert np.array_equal(run.sample_times.data["y"], y)
     assert np.array_equal(run.sample_times.data["u"], u)
-    assert "outputs keep their own times in output-error fits" in run.warnings[0]
+    assert "outputs at their original times in output-error fits" in run.warnings[0]
     regular = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=STEP, resample=0.2)
     assert regular.sample_times is None
     part = run.window(5.0, 20.0)

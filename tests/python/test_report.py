@@ -274,7 +274,7 @@ def test_a_saved_model_has_a_report_of_its_own(tmp_path, small_run, small_model,
     assert "the run has the name of a run from which the model was identified" in again.read_text("utf-8")
     alone = report.model_page(small_model, tmp_path / "alone.html").read_text("utf-8")
     assert "No validation run was given" in alone
-    assert "No standard errors are given" in alone
+    assert "Without standard errors, the number of significant digits" in alone
 
 
 def test_the_landscape_is_the_search(small_run, with_noise):

@@ -142,7 +142,7 @@ BAD = {
     "complex": (lambda bad: (0.1j, 0.0), "returned a complex for motor 1"),
     "exception": (fails, r"failed \(ZeroDivisionError: in the controller\)"),
     # What is told of an error must neither fail by itself nor leave a file that cannot be read.
-    "mute": (lambda bad: raises(MuteError()), r"failed \(MuteError: what it says cannot be read\)"),
+    "mute": (lambda bad: raises(MuteError()), r"failed \(MuteError: its message cannot be read\)"),
     "endless": (lambda bad: raises(ValueError("x" * 10**7)), r"failed \(ValueError: x{500}…\)"),
     "half a pair": (lambda bad: raises(ValueError("\ud800")), r"failed \(ValueError: \\ud800\)"),
     "a liar": (lambda bad: Liar((0.1, 0.1)), r"returned cannot be read \(ValueError: "),

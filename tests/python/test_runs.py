@@ -213,9 +213,9 @@ def test_a_run_never_changes():
             values[0] = 1.0
         with pytest.raises(ValueError, match="WRITEABLE"):
             values.setflags(write=True)
-    with pytest.raises(AttributeError, match="never changes"):
+    with pytest.raises(AttributeError, match="a Run is immutable"):
         run.step = 3.0
-    with pytest.raises(AttributeError, match="never changes"):
+    with pytest.raises(AttributeError, match="a Run is immutable"):
         del run.name
     run.units["u"] = "kg"
     run.intersample["u"] = "foh"
@@ -431,7 +431,7 @@ def test_resample_of_irregular_times_holds_and_interpolates_and_says_so():
     np.testing.assert_array_equal(run["held"], [0, 0, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 4])
     assert run.start == 3.0
     assert len(run.warnings) == 1
-    for word in ("resampled to 0.5 s", "0.5 to 2.5 s", "after row 2", "held: held"):
+    for word in ("resampled to 0.5 s", "0.5 to 2.5 s", "after row 2", "means over the new intervals for held"):
         assert word in run.warnings[0]
 
 
@@ -483,7 +483,7 @@ def test_resample_of_a_run():
     np.testing.assert_allclose(finer["v"], np.linspace(-1, 1, 99), atol=1e-15)
     assert (finer.step, finer.length, finer.duration) == (0.005, 99, run.duration)
     assert (
-        "resampled from 0.01 s to 0.005 s (held: u, by means over the new intervals; outputs keep their own times"
+        "resampled from 0.01 s to 0.005 s (means over the new intervals for u; outputs at their original times"
         in finer.warnings[0]
     )
     # Values between the rows are not measurements; every second row is.

@@ -160,7 +160,9 @@ def orders(
     """
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
-        result = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.print_label, progress=progress)
+        result = cross_validate_orders(
+            runs, filtered=filtered, threads=threads, log=progress.print_label, progress=progress
+        )
         progress.print_label("writing the page")
         page = cross_validation_page(result, out, force=force)
     if as_json:

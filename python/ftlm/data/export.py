@@ -173,7 +173,7 @@ UTF8_BOM = b"\xef\xbb\xbf"
 #: Maximum length of the first line; without it, a file without line breaks would be read into memory as a whole.
 MAX_HEADER_BYTES = 1 << 20
 #: Note in files of runs with nonuniform samples: the files contain only the samples on the uniform grid.
-OMITTED_TIMES_NOTE = "written on its grid: the times at which outputs were read are not written"
+OMITTED_TIMES_NOTE = "written on the uniform grid, without the original sample times of the outputs"
 
 
 class Header(msgspec.Struct, frozen=True, omit_defaults=True):

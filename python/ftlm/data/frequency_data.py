@@ -68,13 +68,13 @@ class FrequencyData:
         frequency = _column(f"{self.name}: frequency", self.frequency)
         if frequency.size == 0:
             raise DataError(f"{self.name}: there is no frequency, 0 rows; give at least one")
-        _refuse(~(frequency > 0), frequency, f"{self.name}: frequency", "is not above 0; leave such rows out")
+        _reject(~(frequency > 0), frequency, f"{self.name}: frequency", "is not above 0")
         response = as_complex(f"{self.name}: response", self.response)
         if response.shape != frequency.shape:
             raise DataError(
                 f"{self.name}: response has shape {response.shape}, frequency {frequency.shape}; give one value each"
             )
-        _refuse(~np.isfinite(response), response, f"{self.name}: response", "is not finite; leave such rows out")
+        _reject(~np.isfinite(response), response, f"{self.name}: response", "is not finite")
         object.__setattr__(self, "frequency", make_read_only(frequency.copy()))
         object.__setattr__(self, "response", make_read_only(response.copy()))
         if self.deviation is not None:
@@ -83,8 +83,8 @@ class FrequencyData:
                 raise DataError(
                     f"{self.name}: deviation has {deviation.size} values, frequency {frequency.size}; give one each"
                 )
-            words = "is not above 0; leave such rows out, or weight without deviations"
-            _refuse(~(deviation > 0), deviation, f"{self.name}: deviation", words)
+            remedy = "leave such rows out, or weight without deviations"
+            _reject(~(deviation > 0), deviation, f"{self.name}: deviation", "is not above 0", remedy)
             object.__setattr__(self, "deviation", make_read_only(deviation.copy()))
 
     @classmethod
@@ -175,12 +175,12 @@ class FrequencyData:
         magnitude = np.abs(self.response)
         unit = f" {self.unit}" if self.unit else ""
         pair = f" of {self.output} from {self.input}" if self.output and self.input else ""
-        with_or_without = "with" if self.deviation is not None else "without"
+        deviations = "with" if self.deviation is not None else "without"
         return "\n".join(
             [
                 f"{self.name}: frequency response{pair}, {self.frequency.size} frequencies from {low:.5g} to "
                 f"{high:.5g} rad/s ({low / (2 * math.pi):.4g} to {high / (2 * math.pi):.4g} Hz)",
-                f"  size {magnitude.min():.5g} to {magnitude.max():.5g}{unit}, {with_or_without} standard deviations",
+                f"  magnitude {magnitude.min():.5g} to {magnitude.max():.5g}{unit}, {deviations} standard deviations",
                 *(f"  note: {w}" for w in self.warnings),
             ]
         )
@@ -191,7 +191,7 @@ def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
     items = (data,) if isinstance(data, FrequencyData) else data
     if not isinstance(items, Sequence) or isinstance(items, str):
         raise DataError(
-            f"data is {type(data).__name__}; give frequency data, as load_frequency or FrequencyData.from_arrays makes"
+            f"data is {type(data).__name__}; give frequency data of load_frequency or FrequencyData.from_arrays"
         )
     for k, item in enumerate(items):
         if not isinstance(item, FrequencyData):
@@ -214,12 +214,11 @@ def _column(name: str, values: object) -> Floats:
     array = as_floats(name, values)
     if array.ndim != 1:
         raise DataError(f"{name} has shape {array.shape}; give a vector")
-    _refuse(~np.isfinite(array), array, name, "is not finite; leave such rows out")
+    _reject(~np.isfinite(array), array, name, "is not finite")
     return array
 
 
-def _refuse(bad: np.ndarray, values: np.ndarray, name: str, way_out: str) -> None:
+def _reject(bad: np.ndarray, values: np.ndarray, name: str, problem: str, remedy: str = "leave such rows out") -> None:
     if np.any(bad):
-        at = int(np.argmax(bad))
-        what, _, rest = way_out.partition(";")
-        raise DataError(f"{name} {what}: {values[at]} at row {at}, {int(np.sum(bad))} in all;{rest}")
+        row = int(np.argmax(bad))
+        raise DataError(f"{name} {problem}: {values[row]} at row {row}, {int(np.sum(bad))} in all; {remedy}")

@@ -95,10 +95,10 @@ class Run:
         raise TypeError("a Run cannot be created directly; use Run.from_arrays, Run.from_frame or ftlm.load")
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise AttributeError(f"a Run never changes; {name!r} cannot be set")
+        raise AttributeError(f"a Run is immutable; {name!r} cannot be set")
 
     def __delattr__(self, name: str) -> NoReturn:
-        raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
+        raise AttributeError(f"a Run is immutable; {name!r} cannot be deleted")
 
     def __reduce__(self) -> tuple[object, ...]:
         return _restore_run, (vars(self),)
@@ -399,10 +399,10 @@ class Run:
         if not duration > 0.0:
             raise DataError(f"duration = {duration:g}, which must be above 0; give the length of a piece in seconds")
         count = max(1, int(self.length * self.step / max(duration, MIN_RUN_SAMPLES * self.step) + 1e-9))
-        ends = np.linspace(0, self.length, count + 1).astype(int) * self.step
+        limits = np.linspace(0, self.length, count + 1).astype(int) * self.step
         if count == 1:
             return [self]
-        pieces = (self.window(float(a), float(b)) for a, b in itertools.pairwise(ends))
+        pieces = (self.window(float(a), float(b)) for a, b in itertools.pairwise(limits))
         return [p._replace(name=f"{self.name} piece {k} of {count}", notes=()) for k, p in enumerate(pieces, 1)]
 
     def resample(self, step: float) -> Run:

@@ -431,13 +431,13 @@ def resample_uniform(
 def describe_resampled_signals(intersample: Mapping[str, Intersample], *, keep_times: bool) -> str:
     """Return text on how each signal is resampled.
 
-    `keep_times` states whether output-error fits use the original output samples at their own times.
+    `keep_times` states whether output-error fits use the original output samples at their original times.
     """
     signals = [signal for signal, kind in intersample.items() if kind == ZERO_ORDER_HOLD]
-    means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
+    means = f"means over the new intervals for {', '.join(signals)}; " if signals else ""
     if keep_times:
-        return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"
-    return f"{means}others linear; no anti-alias filter"
+        return f"{means}outputs at their original times in output-error fits and figures, otherwise interpolated"
+    return f"{means}linear interpolation of the others, without an anti-alias filter"
 
 
 #: Treatment of missing samples: raise an error, give missing outputs no weight, or also fill missing inputs.

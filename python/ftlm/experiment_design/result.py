@@ -179,7 +179,7 @@ class DesignedInput:
             f"{', '.join(self.run.inputs)}: {self.shape}, {self.run.duration:.6g} s in steps of {self.step:.6g} s, "
             f"{self.criterion}-optimal for {', '.join(self.parameters)}",
             "",
-            f"  {'standard error of':<18}{'now':>12}{'square':>12}{'this':>12}{'with now':>12}{'square / this':>15}",
+            f"  {'standard error of':<18}{'now':>12}{'square':>12}{'designed':>12}{'combined':>12}{'ratio':>15}",
         ]
         for name, value in self.values.items():
             now, square_error, new, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
@@ -187,18 +187,18 @@ class DesignedInput:
             ratio = square_error / new if new > 0 else math.nan
             cells = "".join(f"{format_bound(v):>12}" for v in (now, square_error, new, both))
             lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>15.2f}")
-        most, last = self.spectrum.gap, f"{100 * self.efficiency:.0f} %"
         lines += [
             "",
-            f"intervals of the numbers marked *: their product {self.gain:.3g} times smaller than with a {square} of "
-            "the same length and peak",
+            f"parameters marked *: the product of their intervals is {self.gain:.3g} times smaller than with a "
+            f"{square} of the same duration and peak",
             f"limits: {'; '.join(map(str, self.predicted_extremes))}",
-            f"the best periodic input within them, in steady state, is known to {100 * most:.2g} %: this one has "
-            f"{last} of its precision (a start from rest may tell more)",
-            "tried: "
+            f"the designed input has {100 * self.efficiency:.0f} % of the precision of the best periodic input in "
+            f"steady state within these limits, which is known to {100 * self.spectrum.gap:.2g} % (a start from rest "
+            "adds information)",
+            "candidates: "
             + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:MAX_PRINTED_INPUTS])
             + (f" and {len(self.gains) - MAX_PRINTED_INPUTS} more" if len(self.gains) > MAX_PRINTED_INPUTS else "")
-            + f" (times better than the {square})",
+            + f" (gain relative to the {square})",
         ]
         lines += [f"! {w}" for w in self.warnings]
         return "\n".join(lines)

@@ -198,7 +198,7 @@ def compared_bars(
             x_label="fit [%]",
             low=0.0,
             high=100.0,
-            caption="100 % is no error; a bar ends at 0, its number says how far below it is.",
+            caption="100 % is no error. The bar of a negative fit has no length; its value is printed.",
         )
         for o in outputs
     ]

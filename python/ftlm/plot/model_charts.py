@@ -144,7 +144,7 @@ def plane_order(model: Model) -> float:
 class BodeCurve:
     """Gain [dB] and phase [degrees] over frequency from one input to one output.
 
-    The spreads are half-widths of the 95 % confidence bands in the same units; None without a covariance.
+    The bands are half-widths of the 95 % confidence bands in the same units; None without a covariance.
     """
 
     output: str
@@ -203,7 +203,7 @@ class Bode:
         return [*curve_charts(self.frequency, self.curves)]
 
     def __str__(self) -> str:
-        pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input reaches an output"
+        pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input affects an output"
         return f"Bode: {pairs}; {self.frequency.size} frequencies from {self.frequency[0]:.4g} rad/s to " + (
             f"{self.frequency[-1]:.4g} rad/s"
         )

@@ -285,8 +285,8 @@ def _identification_content(
     sampling = [(r.step, r.duration) for r in ((() if task is None else task.runs) or validation_runs)]
     details += frequency_sections(model, sampling)
     details += _search_sections(result)
-    titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
-    initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
+    titles = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
+    initial = [t for title, c in titles if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
     return _content(model, overall_verdict, compared, main_parts, details)
@@ -487,8 +487,8 @@ def _search_sections(result: Identification) -> list[Section]:
     traces = _recursion_error_charts(result)
     if traces:
         text = (
-            "Error (45) of the simulation after every step of the recursion, at the orders found. p weighs the data "
-            "against the prior; all lines end where the closed form is."
+            "Error (45) of the simulation after every step of the recursion, at the identified orders. p is the weight "
+            "of the data relative to the prior. All lines end at the error of the closed form."
         )
         sections.append(Section("Convergence of the recursion", text, figures=traces))
     cost_landscape = output_error_landscape(result)
@@ -496,8 +496,8 @@ def _search_sections(result: Identification) -> list[Section]:
         first, second = map(symbol, cost_landscape.names)
         text = (
             f"The two orders with the most correlated estimates are {first} and {second}: their correlation is "
-            f"{number(cost_landscape.correlation, 3)}. For white residuals the 95 % region of both ends at a score of "
-            "7."
+            f"{number(cost_landscape.correlation, 3)}. For white residuals, their joint 95 % region is bounded by a "
+            "score of 7."
         )
         sections.append(Section("Order landscape", text, figures=[cost_landscape], small=True))
     return sections
@@ -507,21 +507,21 @@ def _order_search_sections(result: Identification) -> list[Section]:
     """Return a section with the best candidates of order searches, score profiles and maps; [] without a search."""
     if not result.searches:
         return []
-    tops = [search_top(name, search) for name, search in result.searches.items()]
-    maps = [] if result.task is None else _score_charts(result.task, result.searches)
-    return [Section("Order search", tables=[*tops, search_summary(result.searches)], figures=maps, small=True)]
+    tables = [search_top(name, search) for name, search in result.searches.items()]
+    charts = [] if result.task is None else _score_charts(result.task, result.searches)
+    return [Section("Order search", tables=[*tables, search_summary(result.searches)], figures=charts, small=True)]
 
 
 def _score_charts(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     """Return charts of the score over each order, and over two orders for searches that vary two or more."""
-    maps: list[Figure] = []
+    charts: list[Figure] = []
     for name, search in searches.items():
         group = task.structure if name == "stage" else task.structure.equation(name)
         group_grid = task.part_order_grid(group) or OrderGrid()
-        maps += score_profiles(task.runs, group, search, group_grid)
+        charts += score_profiles(task.runs, group, search, group_grid)
         if sum(len(v) > 1 for v in group_grid.values(group).values()) >= 2:
-            maps.append(landscape(task.runs, group, search, group_grid))
-    return maps
+            charts.append(landscape(task.runs, group, search, group_grid))
+    return charts
 
 
 def _recursion_error_charts(result: Identification) -> list[LineChart]:
@@ -608,7 +608,7 @@ def starts_table(joint: JointFit) -> Table:
     """Return a table of the best automatic initial guesses of a fit, with their costs on subsampled records."""
     best_starts = joint.starts[:MAX_STARTS_SHOWN]
     cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best_starts, 1)]
-    note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
+    note = f"{joint.origin_text}. The best ones were then optimized on all samples." if joint.starts else ""
     return Table("Automatic initial guesses", ("rank", "start from", "cost per residual"), cells, note=note)
 
 
@@ -633,7 +633,7 @@ def settings_table(result: Identification) -> Table:
         [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]
         for (name, _, _), step in zip(comparison.per_run, comparison.step, strict=True)
     ]
-    return Table("What the result depends on", ("setting", "used"), rows)
+    return Table("Settings of the identification", ("setting", "value"), rows)
 
 
 #: Phrase for each result of the test of independence between residuals and inputs.
@@ -723,7 +723,7 @@ def _model_content(model: Model, validation_runs: Sequence[Run], validated: Sequ
         model_rows += [[n.upper().replace("AICC", "AICc"), v] for n, v in estimate.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     details.append(
-        Section("Settings", tables=[Table("What the file says", ("setting", "value"), model_rows), *initial])
+        Section("Settings", tables=[Table("Content of the model file", ("setting", "value"), model_rows), *initial])
     )
     overall_verdict = saved_verdict(model, validated)
     return _content(model, overall_verdict, compared, sections, details)

@@ -185,18 +185,18 @@ def _residual_lines(result: Identification) -> list[str]:
 def _initial_condition_lines(result: Identification) -> list[str]:
     """Return text lines on offsets without an estimate, and on runs with nonzero initial conditions."""
     comparison = result.comparison
-    hidden = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)
-    lines = describe_offsets(replace(comparison, offsets=hidden))
+    unestimated = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)
+    lines = describe_offsets(replace(comparison, offsets=unestimated))
     initial_terms_text = "" if comparison.offsets else describe_initial_terms(comparison)
     if initial_terms_text and not any(f.code == "runs_split" for f in result.findings):
         lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {initial_terms_text}")
     return lines
 
 
-def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[str]:
+def finding_lines(findings: Iterable[Finding], hint: str | None = None) -> list[str]:
     """Return text lines on at most `MAX_SUMMARY_FINDINGS` groups of findings with remedies, most serious first.
 
-    If findings are omitted, the last line has their number and `how` to display them.
+    If findings are omitted, the last line has their number and `hint` to display them.
     """
     groups = group_findings(findings)
     lines = []
@@ -208,7 +208,10 @@ def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[s
             lines += wrap_text(group.remedy, "  -> ")
     hidden_text = hidden_findings_text(groups)
     return (
-        [*lines, f"  ({hidden_text}: {how or choose_text('print(result.details())', '--report FILE shows all')})"]
+        [
+            *lines,
+            f"  ({hidden_text}: {hint or choose_text('print(result.details())', '--report FILE shows all')})",
+        ]
         if hidden_text
         else lines
     )

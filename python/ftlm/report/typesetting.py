@@ -310,11 +310,11 @@ def parameter_table(
         rows.append([symbol_html(name), p.value, *cells, None, p.unit, f"{kind}, for this run only"])
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if has_errors:
-        note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."
+        note = "Intervals assume that the model is correct. A coefficient without one is fixed or follows from the law."
         if profiles:
             note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:
-        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+        note = "Without standard errors, the number of significant digits is unknown."
     omitted_columns = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
         note += " Stated values belong to the integer orders of the manufacturer's model."

@@ -196,7 +196,7 @@ def demo_text(demo: Demo) -> str:
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(texts)))
     lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
     joint = [results["output error"] for results in demo.results.values()]
-    lines += finding_lines([w for r in joint for w in r.findings], how="-v")
+    lines += finding_lines([w for r in joint for w in r.findings], hint="-v")
     others = sum(len(r.warnings) for results in demo.results.values() for r in results.values() if r not in joint)
     return "\n".join([*lines, f"{others} warnings about the other models: ftlm demo -v, or the page"])
 

@@ -173,14 +173,14 @@ class Structure:
         if not self.equations:
             raise ModelError("the structure has no equation; give at least one")
         outputs = [e.output for e in self.equations]
-        twice = next((o for i, o in enumerate(outputs) if o in outputs[:i]), None)
-        if twice is not None:
-            raise ModelError(f"two equations have the output {twice}; give each output one equation")
+        duplicate = next((o for i, o in enumerate(outputs) if o in outputs[:i]), None)
+        if duplicate is not None:
+            raise ModelError(f"two equations have the output {duplicate}; give each output one equation")
         check_choice("coupling", self.coupling, ("measured", "simulated"))
         names = [n for e in self.equations for n in e.coefficient_names]
-        twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
-        if twice is not None:
-            raise ModelError(f"coefficient {twice} occurs in two equations; give each its own name")
+        duplicate = next((n for i, n in enumerate(names) if n in names[:i]), None)
+        if duplicate is not None:
+            raise ModelError(f"coefficient {duplicate} occurs in two equations; give each its own name")
         external = [s for s in self.signals if s not in outputs]
         check_known("delayed input", [*self.delay, *self.free_delays], external)
         for name, delay in self.delay.items():
@@ -198,9 +198,9 @@ class Structure:
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
-        for one in self.equations:
-            if one.friction is not None or one.nonlinear_terms:
-                one.check_input_orders(self.outputs)
+        for equation in self.equations:
+            if equation.friction is not None or equation.nonlinear_terms:
+                equation.check_input_orders(self.outputs)
         if self.has_friction:
             self._check_friction()
 
@@ -247,9 +247,9 @@ class Structure:
                 f"use {parameter('coupling', 'simulated')}"
             )
         if self.all_filtered:
-            through = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
+            filtered = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
             raise ModelError(
-                f"{words}, and {' and '.join(through)}, an input of it, passed the sensor filter: friction acts "
+                f"{words}, and {' and '.join(filtered)}, an input of it, passed the sensor filter: friction acts "
                 "before the filter, and the unfiltered input is not known; add an equation with this signal as output "
                 f"and use {parameter('coupling', 'simulated')}, or exclude it from the filter"
             )
@@ -315,9 +315,9 @@ class Structure:
         if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
             return 0
         if not (self.all_filtered or sensor.has_impulse_transient):
-            through = [o for o in self.outputs if self.is_filtered(o)]
+            filtered = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
-                f"{' and '.join(through)} passed a sensor filter with a fractional order or a zero, and a run has "
+                f"{' and '.join(filtered)} passed a sensor filter with a fractional order or a zero, and a run has "
                 "nonzero initial conditions: the transient of such a filter is not a sum of impulse responses; use "
                 f"{parameter('initial', 'rest')} and begin the run at rest, or give the exponents of its initial "
                 "terms"
@@ -336,8 +336,8 @@ class Structure:
     def order_names(self) -> tuple[str, ...]:
         """Names of the free orders: first those that equal the order of a term, then those only in expressions."""
         orders = [o for e in self.equations for o in e.orders]
-        alone = [o.names[0] for o in orders if o.is_single]
-        return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
+        single = [o.names[0] for o in orders if o.is_single]
+        return tuple(dict.fromkeys([*single, *(n for o in orders for n in o.names)]))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
@@ -360,23 +360,23 @@ class Structure:
         """
         groups: list[tuple[set[str], list[Equation]]] = []
         for item in self.equations:
-            names, together = set(item.order_names), [item]
+            names, members = set(item.order_names), [item]
             for group in [g for g in groups if g[0] & names]:
                 names |= group[0]
-                together = group[1] + together
+                members = group[1] + members
                 groups.remove(group)
-            groups.append((names, together))
+            groups.append((names, members))
         out = {}
-        for names, together in groups:
-            single = len(together) == 1
+        for names, members in groups:
+            single = len(members) == 1
             if not names:
                 continue
-            if single and not replace(self, equations=tuple(together), coefficient_law=()).has_order_law:
-                out[together[0].output] = self.equation(together[0].output)
+            if single and not replace(self, equations=tuple(members), coefficient_law=()).has_order_law:
+                out[members[0].output] = self.equation(members[0].output)
                 continue
-            if len(together) == len(self.equations):
+            if len(members) == len(self.equations):
                 return {"stage": self}
-            out[", ".join(e.output for e in together)] = self._substructure(tuple(together), self.coupling)
+            out[", ".join(e.output for e in members)] = self._substructure(tuple(members), self.coupling)
         return out
 
     def _substructure(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:

@@ -98,8 +98,8 @@ def slider_readout(
 
 def _split_unit(label: str) -> tuple[str, str]:
     """Split an axis label such as "time [s]" into name and unit; the unit is empty without brackets."""
-    bare, bracket, unit = label.rpartition(" [")
-    return (bare, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
+    name, bracket, unit = label.rpartition(" [")
+    return (name, unit[:-1]) if bracket and unit.endswith("]") else (label, "")
 
 
 def _scaled_integers(values: Floats) -> list[object]:
@@ -226,7 +226,7 @@ class LineChart(Figure):
         if not self.lines:
             raise DataError("a chart needs at least one line; give (name, values) pairs")
         x_values = as_floats("x", self.x, gaps=True).copy()
-        drawn, notes = [], []
+        lines, notes = [], []
         x = _logarithms(x_values) if self.log_x else x_values
         bands: Iterable[Any] = (*self.bands, *(None for _ in self.lines))
         for (name, values), style, band in zip(self.lines, line_styles(n for n, _ in self.lines), bands, strict=False):
@@ -249,8 +249,8 @@ class LineChart(Figure):
                     )
                 y = _logarithms(y)
             edges = None if band is None else (self._edge(name, band[0], x), self._edge(name, band[1], x))
-            drawn.append(_Line(name, style, *self._corners(x, y), name in self.dots, edges))
-        return drawn, notes
+            lines.append(_Line(name, style, *self._corners(x, y), name in self.dots, edges))
+        return lines, notes
 
     def _corners(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return the points to connect by straight lines: those of the line, or two per value of a staircase."""

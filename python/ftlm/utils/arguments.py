@@ -152,8 +152,8 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
             inspect.Parameter.VAR_KEYWORD,
         )
         if is_single and not _fits(value, annotation):
-            words = " or ".join(dict.fromkeys(_describe_type(kind) for kind in _alternatives(annotation)))
-            raise ModelError(f"{setting(name)} {short_repr(value)} is {type_name(value)}; give {words}") from error
+            types_text = " or ".join(dict.fromkeys(_describe_type(kind) for kind in _alternatives(annotation)))
+            raise ModelError(f"{setting(name)} {short_repr(value)} is {type_name(value)}; give {types_text}") from error
 
 
 class _UnknownType:

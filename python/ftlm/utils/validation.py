@@ -43,7 +43,7 @@ def error_text(error: BaseException, max_length: int = 500) -> str:
     try:
         text = str(error)
     except Exception:
-        return "what it says cannot be read"
+        return "its message cannot be read"
     return (text if len(text) <= max_length else f"{text[:max_length]}…").encode("utf-8", "backslashreplace").decode()
 
 
