@@ -1,9 +1,13 @@
 """Fixtures that several test files share: reference files, the synthetic plants with their records, seeded noise."""
 
+import io
 import json
 import os
 import re
+import subprocess
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 # Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -15,6 +19,7 @@ from xdist.scheduler import LoadScopeScheduling
 
 import ftlm
 from ftlm.estimation.extensions import ExtensionTests
+from ftlm.io import binary_reader, isolated_reader
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
@@ -56,6 +61,26 @@ def no_extension_tests():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ftlm.estimation.identify.run_extension_tests", lambda fit, tests: ExtensionTests([]))
         yield
+
+
+@pytest.fixture
+def reader_in_process(monkeypatch):
+    """Binary files are read by the reader's own code in this process, which saves starting Python for each.
+
+    For sound files; a damaged one can crash the libraries.
+    """
+
+    def run(*, args, **_):
+        kind, told, *paths = args[args.index("-c") + 2 :]
+        out = io.BytesIO()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for path in paths:
+                binary_reader.write_result(kind, path, out, binary_reader.SIZE_LIMIT, json.loads(told)["sheet"])
+        return SimpleNamespace(stdout=out.getvalue(), returncode=0)
+
+    started = SimpleNamespace(run=run, DEVNULL=subprocess.DEVNULL, TimeoutExpired=subprocess.TimeoutExpired)
+    monkeypatch.setattr(isolated_reader, "subprocess", started)
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import ftlm
 from ftlm import rig
 from ftlm.validation.data_advice import spectral_lines
 from measured import DATA, needs_data
+from slow_cases import slow_after
 
 ARM = {
     "time": "t_s",
@@ -75,9 +76,10 @@ def with_faults(u, y, rng):
     yield "wrap", u, (4 * y / size + np.pi) % (2 * np.pi) - np.pi
 
 
-def test_injected_faults_are_found_and_clean_runs_raise_no_alarm():
+@slow_after(1, "seeds", [4, 20])
+def test_injected_faults_are_found_and_clean_runs_raise_no_alarm(seeds):
     found, injected, alarms = {}, {}, []
-    for seed, h, u, y, rng in clean_runs(20):
+    for seed, h, u, y, rng in clean_runs(seeds):
         advice = made(h, u, y).advice()
         alarms += [(seed, f.sentence) for f in advice]
         for fault, *signals in with_faults(u, y, rng):

@@ -7,6 +7,7 @@ import ftlm
 from ftlm.order_search.result import search_summary
 from ftlm.order_search.search import rank_orders
 from ftlm.utils.formatting import number
+from slow_cases import slow_after
 from small_lattice import EQUATION
 from stored_searches import bytes_of
 from stores import keep_share
@@ -97,7 +98,7 @@ def closely(run, path=None, highest=2.0, coefficients="least-squares", **options
     return ftlm.search_orders(run, equation, lattice, coefficients=coefficients, m=32, store=path, **options)
 
 
-@pytest.mark.parametrize(("p", "prior"), [(1, None), (7, 1e-3), (7, 1.0), (7, 1e6)])
+@slow_after(2, "p, prior", [(1, None), (7, 1e-3), (7, 1.0), (7, 1e6)])
 def test_close_proofs_keep_the_table_of_multi_innovation(unruly, p, prior):
     options = {"coefficients": "multi-innovation", "innovation_length": p, "prior_covariance": prior, "threads": 2}
     quick, slow = closely(unruly, **options), closely(unruly, pruning=False, **options)

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import ftlm
 from ftlm.findings import make_finding
 from ftlm.report.html_report import model_page
+from slow_cases import slow_after
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None and not os.environ.get("CI"):
@@ -281,8 +283,15 @@ def test_without_scripts_everything_but_zoom_and_sliders_is_there(browser, at, n
         assert all(b["width"] > 200 and b["height"] > 80 for b in boxes)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ALL)
+#: Each page and each scheme; make test-slow takes all pairs.
+IN_SCHEMES = [("fit", "dark"), ("search", "light"), ("model", "dark")]
+
+
+@slow_after(
+    len(IN_SCHEMES),
+    "name, scheme",
+    sorted(product((*PAGES, "paper"), ("light", "dark")), key=lambda pair: pair not in IN_SCHEMES),
+)
 def test_the_accessibility_check_passes(browser, at, name, scheme):
     # Narrow in one scheme and wide in the other: colors and widths do not interact.
     width = WIDTHS[0 if scheme == "dark" else 2]
@@ -294,17 +303,18 @@ def test_the_accessibility_check_passes(browser, at, name, scheme):
         assert len(found.response["passes"]) > 10
 
 
-@pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", ALL)
-def test_no_width_makes_a_page_scroll_sideways(browser, at, name, width):
-    with Opened(browser, at(name), viewport={"width": width, "height": 900}) as opened:
+def test_no_width_makes_a_page_scroll_sideways(browser, at, name):
+    with Opened(browser, at(name)) as opened:
         page = opened.page
         page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        narrow, wide = (page.locator(f"svg.chart.{kind}").first for kind in ("narrow", "wide"))
-        assert narrow.is_visible() == (width < 620)
-        assert wide.is_visible() == (width >= 620)
-        assert page.locator(".zoom:visible").count() == page.locator("svg.chart[data-frame]:visible").count()
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            narrow, wide = (page.locator(f"svg.chart.{kind}").first for kind in ("narrow", "wide"))
+            assert narrow.is_visible() == (width < 620)
+            assert wide.is_visible() == (width >= 620)
+            assert page.locator(".zoom:visible").count() == page.locator("svg.chart[data-frame]:visible").count()
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -7,6 +7,7 @@ import ftlm
 from ftlm.analysis.frequency_response import linear_part, parameter_vector, response_deviation, with_parameter_vector
 from ftlm.plot.comparison_charts import confidence_bands
 from ftlm.report.html_report import model_page
+from slow_cases import slow_after
 
 
 def run(seed, samples=300):
@@ -22,14 +23,15 @@ def found():
     return ftlm.identify(run(1), ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"))
 
 
-def test_band_is_the_spread_of_drawn_models(found):
+@slow_after(1, "draws", [80, 300])
+def test_band_is_the_spread_of_drawn_models(found, draws):
     other = run(2)
     low, high = confidence_bands(found.model, other, found.model.compare(other))["y"]
     rng = np.random.default_rng(3)
     values, covariance = parameter_vector(found.model), np.array(found.model.estimate.covariance)
     free = np.flatnonzero(np.diag(covariance))
-    drawn = np.tile(values, (300, 1))
-    drawn[:, free] = rng.multivariate_normal(values[free], covariance[np.ix_(free, free)], size=300)
+    drawn = np.tile(values, (draws, 1))
+    drawn[:, free] = rng.multivariate_normal(values[free], covariance[np.ix_(free, free)], size=draws)
     simulated = [with_parameter_vector(found.model, v).compare(other).simulated["y"][0] for v in drawn]
     expected = 1.96 * np.std(simulated, axis=0)
     moved = expected > 0.1 * expected.max()
@@ -135,12 +137,13 @@ def rubbing():
     return ftlm.identify(rubbing_run(1), ftlm.equation("D^2 y = -b D y + k u - fc*sign(D y)"))
 
 
-def test_band_of_a_model_with_friction_is_the_spread_of_drawn_models(rubbing):
+@slow_after(1, "draws", [60, 200])
+def test_band_of_a_model_with_friction_is_the_spread_of_drawn_models(rubbing, draws):
     other, rng = rubbing_run(2), np.random.default_rng(3)
     low, high = confidence_bands(rubbing.model, other, rubbing.model.compare(other))["y"]
     names = [n for n in rubbing.joint.names if n in ("b", "k", "fc")]
     assert names == rubbing.joint.names
-    drawn = rng.multivariate_normal(rubbing.joint.values, rubbing.covariance, size=200)
+    drawn = rng.multivariate_normal(rubbing.joint.values, rubbing.covariance, size=draws)
     structure = rubbing.task.structure
     simulated = [
         ftlm.Model(structure.with_coefficients(dict(zip(names, v, strict=True)))).compare(other).simulated["y"][0]

@@ -16,6 +16,7 @@ from ftlm import _core, cli
 from ftlm.estimation.free_parameters import FreeProblem, core_arguments
 from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -75,11 +76,12 @@ def test_a_delay_is_estimated_with_the_rest(found):
     assert found.joint.step_converged
 
 
-def test_its_score_is_that_of_a_standard_normal_number():
+@slow_after(1, "seeds", [8, 30])
+def test_its_score_is_that_of_a_standard_normal_number(seeds):
     truth = [2.2, 0.9, *[plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], DELAY]
     problem = FreeProblem.of(structure())
     scores = []
-    for seed in range(30):
+    for seed in range(seeds):
         found = fit_output_error(
             [late_run(DELAY, 40, seed)], structure(), start=dict(zip(problem.names, truth, strict=True))
         )

@@ -9,6 +9,7 @@ from scipy.signal import cont2discrete, lfilter, lsim
 import ftlm
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.utils.validation import Floats
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -93,7 +94,7 @@ def fit_and_truth(seed: int, more: int = 0) -> tuple[float, float]:
     return left**2, float(np.sum((noisy - y) ** 2) / np.sum((noisy - noisy.mean()) ** 2))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@slow_after(3, "seed", range(8))
 def test_a_random_plant_is_fitted_no_worse_than_by_the_truth(seed: int) -> None:
     cost, truth = fit_and_truth(seed)
     assert cost <= truth
@@ -133,7 +134,7 @@ def long_record_cost(seed: int, rows: int) -> float:
     return fit.noise["y"] / float(np.sqrt(np.mean(e[1:] ** 2)))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@slow_after(2, "seed", range(6))
 def test_a_long_record_is_fitted_no_worse_than_by_the_truth(seed: int) -> None:
     # Guesses are found on its first rows and on the decimated record: neither has all modes.
     assert long_record_cost(seed, 20_000) < 1.0
@@ -171,7 +172,7 @@ def two_modes_run(seed: int, level: float, trend: float = 0.0) -> ftlm.Run:
     return ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
 
 
-@pytest.mark.parametrize("seed", range(1, 4))
+@slow_after(1, "seed", range(1, 4))
 @pytest.mark.parametrize("offset", ["none", "ramp"])
 def test_the_sign_before_a_coefficient_does_not_change_the_optimum(seed: int, offset: str) -> None:
     run = two_modes_run(seed, 0.0, 0.02 if offset == "ramp" else 0.0)
@@ -188,7 +189,7 @@ def test_the_sign_before_a_coefficient_does_not_change_the_optimum(seed: int, of
             assert abs(other.coefficients[name]) == pytest.approx(abs(value), rel=1e-3, abs=1e-2)
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@slow_after(1, "seed", range(1, 5))
 @pytest.mark.parametrize("level", [0.03, 0.3, 3.0])
 def test_an_output_level_is_found_by_default(seed: int, level: float) -> None:
     # The smallest level is below the noise of one sample.

@@ -19,6 +19,7 @@ import ftlm
 from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.order_search import batches
 from ftlm.utils.checkpoint_file import CheckpointFile
+from slow_cases import slow_after
 from stores import keep_share
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
@@ -381,7 +382,7 @@ def is_running(process):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@slow_after(1, "method", ["fork", "spawn"])
 def test_a_killed_search_leaves_neither_a_lock_nor_workers(tmp_path, method):
     (tmp_path / "search.py").write_text(SEARCH_ON_WORKERS)
     words = [sys.executable, "-W", "ignore", "search.py", method]

@@ -8,6 +8,7 @@ from scipy import signal
 
 import ftlm
 from ftlm.estimation import extensions
+from slow_cases import slow_after
 
 RATE = 0.4
 #: Numerator and denominator of the plant, rows of delay of the input (negative: it was logged late), the finding.
@@ -59,11 +60,12 @@ def codes_of(run, equation="D y = a y + b u"):
     return {f.code for f in ftlm.identify(run, ftlm.equation(equation)).findings}
 
 
+@slow_after(1, "seeds", [2, 6])
 @pytest.mark.parametrize("kind", MISSING)
-def test_what_a_first_order_model_lacks_is_named(kind):
+def test_what_a_first_order_model_lacks_is_named(kind, seeds):
     *plant, expected = MISSING[kind]
-    named = [codes_of(record(*plant, seed, [1.0])) & CODES for seed in range(6)]
-    assert sum(codes == {expected} for codes in named) >= 5, named
+    named = [codes_of(record(*plant, seed, [1.0])) & CODES for seed in range(seeds)]
+    assert 6 * sum(codes == {expected} for codes in named) >= 5 * seeds, named
     assert all(named), named
 
 
@@ -106,27 +108,28 @@ def test_a_given_delay_that_is_wrong_is_named_beside_the_right_one(rows, given):
     [[1.0], [1.0, -0.95], pytest.param([1.0, -1.92 * np.cos(0.2), 0.9216], marks=pytest.mark.slow)],
     ids=["white", "AR1", "AR2"],
 )
-def test_colored_noise_is_no_missing_dynamics(noise):
-    right = [codes_of(record([1.0], [1 / RATE, 1.0], 0, seed, noise)) & CODES for seed in range(30)]
+@slow_after(1, "seeds", [5, 30])
+def test_colored_noise_is_no_missing_dynamics(noise, seeds):
+    right = [codes_of(record([1.0], [1 / RATE, 1.0], 0, seed, noise)) & CODES for seed in range(seeds)]
     assert sum(map(bool, right)) == 0, right
 
 
+@slow_after(1, "seed", range(4))
 @pytest.mark.parametrize("kind", ACTING)
-def test_how_an_input_acts_is_named(kind):
+def test_how_an_input_acts_is_named(kind, seed):
     acting, expected, limit = ACTING[kind]
-    for seed in range(4):
-        run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0], acting=acting)
-        found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
-        (said,) = (f for f in found.findings if f.code in CODES)
-        assert said.code == expected
-        assert said.reason in found.verdict.reasons
-        if limit is not None:
-            assert abs(said.numbers["value"] / limit - 1) < 0.03
-            # What the remedy says to write is read, and finds the limit.
-            (term,) = re.findall(r"(?:sat|dead)\(.*?\)", said.remedy)
-            better = ftlm.identify(run, ftlm.equation(f"D y = a y + b {term}"))
-            (value,) = better.limits.values()
-            assert abs(value / limit - 1) < 0.03
+    run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0], acting=acting)
+    found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
+    (said,) = (f for f in found.findings if f.code in CODES)
+    assert said.code == expected
+    assert said.reason in found.verdict.reasons
+    if limit is not None:
+        assert abs(said.numbers["value"] / limit - 1) < 0.03
+        # What the remedy says to write is read, and finds the limit.
+        (term,) = re.findall(r"(?:sat|dead)\(.*?\)", said.remedy)
+        better = ftlm.identify(run, ftlm.equation(f"D y = a y + b {term}"))
+        (value,) = better.limits.values()
+        assert abs(value / limit - 1) < 0.03
 
 
 def rubbing(kind, seed, friction, rows=500, steps=40):
@@ -151,22 +154,22 @@ def rubbing(kind, seed, friction, rows=500, steps=40):
     return ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": y}), friction / mass
 
 
-@pytest.mark.parametrize("friction", [0.05, 0.25])
+@slow_after(1, "friction", [0.05, 0.25])
+@slow_after(1, "seed", range(3))
 @pytest.mark.parametrize("kind", RUBBING)
-def test_dry_friction_is_named_and_its_term_finds_it(kind, friction):
+def test_dry_friction_is_named_and_its_term_finds_it(kind, seed, friction):
     poor, term = RUBBING[kind]
-    for seed in range(3):
-        run, true = rubbing(kind, seed, friction)
-        found = ftlm.identify(run, ftlm.equation(poor))
-        (said,) = (f for f in found.findings if f.code in CODES)
-        assert said.code == "friction_fits"
-        assert said.reason in found.verdict.reasons
-        assert abs(said.numbers["value"] / true - 1) < 0.1
-        assert term.split("(")[0] in said.remedy
-        added = said.remedy.removeprefix("add the term ")
-        better = ftlm.identify(run, ftlm.equation(f"{poor} {added}"))
-        assert abs(better.coefficients["fc"] / true - 1) < 0.1
-        assert not {f.code for f in better.findings} & CODES
+    run, true = rubbing(kind, seed, friction)
+    found = ftlm.identify(run, ftlm.equation(poor))
+    (said,) = (f for f in found.findings if f.code in CODES)
+    assert said.code == "friction_fits"
+    assert said.reason in found.verdict.reasons
+    assert abs(said.numbers["value"] / true - 1) < 0.1
+    assert term.split("(")[0] in said.remedy
+    added = said.remedy.removeprefix("add the term ")
+    better = ftlm.identify(run, ftlm.equation(f"{poor} {added}"))
+    assert abs(better.coefficients["fc"] / true - 1) < 0.1
+    assert not {f.code for f in better.findings} & CODES
 
 
 @pytest.mark.slow
@@ -190,12 +193,13 @@ def test_a_drag_that_drives_near_standstill_is_no_friction():
         assert not any("tanh" in str(term) for term in item.terms)
 
 
+@slow_after(1, "seeds", [2, 10])
 @pytest.mark.parametrize("equation", ["D y = a y + b u", "D^2 y = d D y + a y + b u"])
-def test_resonant_noise_is_no_friction(equation):
+def test_resonant_noise_is_no_friction(equation, seeds):
     noise = [1.0, -1.96 * np.cos(0.05), 0.9604]
     plant = [1 / RATE, 1.0] if equation.startswith("D y") else [1 / RATE**2, 0.4 / RATE, 1.0]
     named = []
-    for seed in range(10):
+    for seed in range(seeds):
         run = record([1.0], plant, 0, seed, [1.0])
         e = signal.lfilter([1.0], noise, np.random.default_rng(seed).standard_normal(run.length))
         y = run["y"] + 0.1 * run["y"].std() / e.std() * e
@@ -204,9 +208,10 @@ def test_resonant_noise_is_no_friction(equation):
     assert sum(map(bool, named)) == 0, named
 
 
-def test_a_drift_of_the_level_is_no_mode():
+@slow_after(1, "seeds", [2, 6])
+def test_a_drift_of_the_level_is_no_mode(seeds):
     found = []
-    for seed in range(6):
+    for seed in range(seeds):
         run = record([1.0], [1 / RATE, 1.0], 0, seed, [1.0])
         y = run["y"] + run["y"].std() * np.linspace(0.0, 1.0, run.length)
         drifting = ftlm.Run.from_arrays(step=STEP, inputs={"u": run["u"]}, outputs={"y": y})
@@ -214,7 +219,7 @@ def test_a_drift_of_the_level_is_no_mode():
     assert all(codes == {"drift_fits"} for codes in found), found
 
 
-@pytest.mark.parametrize("seed", range(4))
+@slow_after(1, "seed", range(4))
 def test_a_load_that_steps_in_the_record_is_named(seed):
     def acting(u):
         return u + np.where(np.arange(u.size) >= 280, 0.6, 0.0)
@@ -266,7 +271,7 @@ def test_colored_noise_alone_starts_no_multistart(monkeypatch):
 
     monkeypatch.setattr(extensions, "fit_output_error", counted)
     plant = [1.0], [1 / RATE, 1.0], 0
-    for seed in range(4):
+    for seed in range(2):
         assert codes_of(record(*plant, seed, [1.0, -0.9])) & CODES == set()
     assert automatic == []
     # A missing lag is found from an automatic start.
@@ -274,11 +279,12 @@ def test_colored_noise_alone_starts_no_multistart(monkeypatch):
     assert automatic
 
 
+@slow_after(1, "seeds", [2, 6])
 @pytest.mark.parametrize("rows", [40, 200])
-def test_color_under_a_constant_input_is_not_blamed_on_the_model(rows):
+def test_color_under_a_constant_input_is_not_blamed_on_the_model(rows, seeds):
     """A step from the first row on: residuals of the right structure are colored, and no test tells why."""
     found = []
-    for seed in range(6):
+    for seed in range(seeds):
         g = np.random.default_rng(seed)
         t = np.arange(rows) * STEP
         e = signal.lfilter([1.0], [1.0, -0.9], g.standard_normal(rows))
@@ -286,4 +292,4 @@ def test_color_under_a_constant_input_is_not_blamed_on_the_model(rows):
         found.append(codes_of(ftlm.Run.from_arrays(step=STEP, inputs={"u": np.ones(rows)}, outputs={"y": y})))
     wrong = {"residuals_not_white", "output_not_white", "noise_coloured", "dynamics_missing"}
     assert all(wrong.isdisjoint(codes) for codes in found), found
-    assert sum("color_undecided" in codes for codes in found) >= 4, found
+    assert 6 * sum("color_undecided" in codes for codes in found) >= 4 * seeds, found

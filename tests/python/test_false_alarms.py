@@ -21,6 +21,7 @@ from ftlm.utils.statistics import autoregression, portmanteau, whiten_series
 from ftlm.validation.feedback import feedback_test
 from ftlm.validation.residual_tests import NoiseModel, _independence
 from measured import needs_data
+from slow_cases import slow_after
 
 WEIGHTY = (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE)
 
@@ -105,17 +106,19 @@ def test_a_step_within_noise_of_its_size_is_not_early():
 @pytest.mark.parametrize(
     ("plant", "kind"), [("swing", "pulses"), ("lag", "multisine"), ("motor", "PRBS"), ("fractional", "PRBS")]
 )
-def test_noise_that_walks_is_no_offset(plant, kind):
+@slow_after(1, "seeds", [1, 4])
+def test_noise_that_walks_is_no_offset(plant, kind, seeds):
     # Its mean is as large as itself: a test that takes it for noise of a finite memory finds an offset in half of them.
-    for seed in range(4):
+    for seed in range(seeds):
         r = ordinary.record(plant, kind, "walking", seed)
         found = ftlm.identify(r.run, r.structure)
         assert weighty(found) == set(), seed
         assert "noise_coloured" in codes(found)
 
 
-def test_an_offset_beside_noise_that_walks_is_named():
-    for seed in range(4):
+@slow_after(1, "seeds", [1, 4])
+def test_an_offset_beside_noise_that_walks_is_named(seeds):
+    for seed in range(seeds):
         r = ordinary.record("two lags", "white", "walking", seed)
         # A load from the tenth row on, when the plant was at rest: its step is larger than those of the walk.
         load = ordinary.response("two lags", np.concatenate([np.zeros(10), np.ones(r.run.length - 10)]))
@@ -128,7 +131,7 @@ def test_an_offset_beside_noise_that_walks_is_named():
 
 @pytest.mark.parametrize("plant", ["lag", "two lags", "swing", "motor"])
 @pytest.mark.parametrize("kind", ["PRBS", "multisine", "walk"])
-@pytest.mark.parametrize("quiet", [0, 10])
+@slow_after(1, "quiet", [0, 10])
 def test_a_record_without_noise_has_no_faults(plant, kind, quiet):
     # Its residuals are rounding errors, of any color.
     rng = np.random.default_rng(3)

@@ -18,6 +18,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.simulation.output_samples import simulate_samples as one_grid
+from slow_cases import slow_after
 
 STEP = 0.1
 #: (0.5 s + 1)/(s + 1): y' = 0.5 u' + u - y.
@@ -72,10 +73,11 @@ def test_the_truth_lies_within_three_standard_errors(words, system, truth, inter
 
 
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
-def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
+@slow_after(1, "seeds", [1, 4])
+def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str, seeds: int) -> None:
     # 5 Ohm at once, a diffusive rest of order 0.78; the truth follows from its spectrum of relaxations.
     scored = []
-    for seed in range(4):
+    for seed in range(seeds):
         found = ftlm.identify(loops.cell_run(800, 0.02, hold, seed, noise=0.01), loops.CELL_STRUCTURE)
         scored.append([(found.parameters[n].value - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
         assert found.standard_errors["d"] < 0.02
@@ -83,7 +85,7 @@ def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
     assert np.mean(np.abs(scored) < 1.96) >= 0.8
 
 
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@slow_after(1, "hold", ["zoh", "foh"])
 def test_a_cell_without_noise_is_itself(hold: str) -> None:
     found = ftlm.identify(loops.cell_run(400, 0.05, hold, 1, noise=0.0), loops.CELL_STRUCTURE)
     for name, value in loops.CELL.items():

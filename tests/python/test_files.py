@@ -422,6 +422,7 @@ def table(n=30, step=0.002):
 
 
 @pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_matrices_vectors_and_what_is_skipped(tmp_path, compress):
     path = mat(
         tmp_path,
@@ -444,9 +445,6 @@ def test_mat_matrices_vectors_and_what_is_skipped(tmp_path, compress):
     for name in "bcd":
         np.testing.assert_array_equal(run[name], np.arange(30))
     np.testing.assert_array_equal(run["e"], np.arange(30) > 9)
-    if compress:
-        # Each of what follows starts a reader of its own, and is the same of what was read.
-        return
     assert load(path, outputs=["row"], step=1).step == 1
     assert load(path, outputs=["row"], time="V.1").step == 0.002
     messages(["time", "step="], lambda: load(path, outputs=["row"]))
@@ -458,6 +456,7 @@ def test_mat_matrices_vectors_and_what_is_skipped(tmp_path, compress):
 
 
 @pytest.mark.parametrize("others", [{}, {"rate": 100.0}])
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_struct_fields_are_columns_of_one_table(tmp_path, others):
     t = np.arange(50) * 0.01
     u, y = np.sign(np.sin(9 * t)), np.cos(t)
@@ -469,12 +468,14 @@ def test_mat_struct_fields_are_columns_of_one_table(tmp_path, others):
     np.testing.assert_array_equal(run["y"], y)
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_structs_that_share_field_names_stay_apart(tmp_path):
     t = np.arange(50.0)
     scipy.io.savemat(tmp_path / "s.mat", {"a": {"t": t, "u": t}, "b": {"t": t, "u": -t}})
     assert [c.name for c in open_file(tmp_path / "s.mat").columns] == ["a.t", "a.u", "b.t", "b.u"]
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_time_of_a_named_vector_single_precision_and_nan(tmp_path):
     t = np.arange(3000) * 0.002
     y = np.column_stack([np.sin(t), np.cos(t)])
@@ -488,6 +489,7 @@ def test_mat_time_of_a_named_vector_single_precision_and_nan(tmp_path):
     messages(["column 'V.1' (time)", "NaN", "row 7"], lambda: load(mat(tmp_path, V=bad), outputs={"y": "V.2"}))
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_matrices_of_one_run_must_share_their_time(tmp_path):
     other = table()
     other[10:, 0] += 0.0001
@@ -504,6 +506,7 @@ def test_mat_matrices_of_one_run_must_share_their_time(tmp_path):
     messages(["'A.3'", "'a/A.1'"], lambda: load([a, same], outputs={"y": "A.3"}))
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_with_signals_in_rows_is_refused(tmp_path):
     path = mat(tmp_path, V=table().T)
     messages(["'V'", "3 rows and 30 columns", "transpose"], lambda: load(path, outputs={"y": "V.1"}))
@@ -544,6 +547,7 @@ def test_bad_mat_files_are_refused(tmp_path, case):
     messages(["x.mat", *words], lambda: load(path, outputs={"y": "V"}, step=1))
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_with_text_only_is_refused(tmp_path):
     messages(["no real numeric matrix", "'word' (char)"], lambda: load(mat(tmp_path, word="a"), outputs=["word"]))
 

@@ -9,6 +9,7 @@ from scipy.signal import lsim, lti
 import ftlm
 from ftlm.estimation.identify import arm_findings
 from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, group_findings, make_finding
+from slow_cases import slow_after
 
 STEP = 0.05
 
@@ -46,7 +47,7 @@ def test_a_model_that_explains_nothing_stays_useless():
     assert found.verdict.level == LEVEL_DO_NOT_USE
 
 
-@pytest.mark.parametrize("seed", range(30, 34))
+@slow_after(1, "seed", range(30, 34))
 def test_an_input_that_no_equation_reads_is_named_with_the_option(seed):
     g = np.random.default_rng(seed)
     u, other = steps(g, 1500), steps(g, 1500, 15)

@@ -16,6 +16,7 @@ from ftlm.estimation.nuisance_parameters import refit_after_screening
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.initial_conditions import rest_evidence
 from measured import needs_data
+from slow_cases import slow_after
 
 H = 0.5
 
@@ -181,9 +182,10 @@ def test_a_model_from_zero_predicts_a_run_at_another_level_from_rest():
 
 
 @pytest.mark.parametrize("early", [0.0, 0.6])
-def test_an_output_that_moves_before_its_input_is_named_with_the_rows(early):
+@slow_after(1, "seeds", [2, 6])
+def test_an_output_that_moves_before_its_input_is_named_with_the_rows(early, seeds):
     said = 0
-    for seed in range(6):
+    for seed in range(seeds):
         t = np.arange(80.0)
         y = (
             7.0
@@ -196,7 +198,7 @@ def test_an_output_that_moves_before_its_input_is_named_with_the_rows(early):
                 said += 1
                 assert item.numbers["rows"] == pytest.approx(early, abs=0.3)
                 assert "y moves before its input" in item.text
-    assert said == (6 if early else 0)
+    assert said == (seeds if early else 0)
 
 
 def test_given_starts_overrule():
@@ -406,11 +408,12 @@ def test_quiet_rows_of_a_slow_motion_are_refuted():
 
 
 @pytest.mark.parametrize(("share", "color"), [(0.05, 0.0), (0.1, 0.0), (0.05, 0.6)])
-def test_a_staircase_with_an_offset_of_its_input_sensor(share, color):
+@slow_after(1, "seeds", [1, 2])
+def test_a_staircase_with_an_offset_of_its_input_sensor(share, color, seeds):
     """The plant rests until row 100, but its recorded input is 0.7 there: from rest, no model explains the record."""
     u = np.repeat(np.arange(6.0), 100)
     y = plant([2.0], [0.192, 1.04, 1.0], u, 0.02)
-    for seed in range(2):
+    for seed in range(seeds):
         g = np.random.default_rng(seed)
         noise = lfilter([np.sqrt(1 - color**2)], [1, -color], g.standard_normal(800))[200:]
         run = run_of(u + 0.7, y + share * np.std(y) * noise, 0.02)
@@ -466,7 +469,7 @@ def test_colored_noise_is_no_drift():
         assert "drift_fits" not in codes(found)
 
 
-@pytest.mark.parametrize(("name", "start"), [("fractional and a lag", "rest"), ("fractional", "rest")])
+@slow_after(1, "name, start", [("fractional and a lag", "rest"), ("fractional", "rest")])
 def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     # A lag that the structure lacks makes a past of what a run did from rest.
     record = panel_record(name, "prbs", start, 311)
@@ -502,7 +505,7 @@ def test_a_fit_under_other_initial_conditions_is_not_repeated(monkeypatch):
     assert ("caputo", "none") not in requests
 
 
-@pytest.mark.parametrize("name", ["two lags", "fractional and a lag"])
+@slow_after(1, "name", ["two lags", "fractional and a lag"])
 @pytest.mark.parametrize("seed", [311, pytest.param(312, marks=pytest.mark.slow)])
 def test_a_history_that_no_past_input_explains_is_rejected(name, seed):
     # With one lag too few, nine free powers of t fitted the response to the step: gains were 7e8, 6e8, 0.59 and 0.47.
@@ -551,10 +554,11 @@ INTEGRATORS = [
 
 
 @pytest.mark.parametrize("first", [0, 317])
-@pytest.mark.parametrize("bias", [0.03, 0.3])
+@slow_after(1, "bias", [0.03, 0.3])
 @pytest.mark.parametrize(("words", "num", "den"), INTEGRATORS)
-def test_an_integrating_plant_has_its_rate_despite_an_offset_of_its_input(words, num, den, bias, first):
-    for seed in range(3):
+@slow_after(1, "seeds", [1, 3])
+def test_an_integrating_plant_has_its_rate_despite_an_offset_of_its_input(words, num, den, bias, first, seeds):
+    for seed in range(seeds):
         g = np.random.default_rng([seed, 3])
         u = np.repeat(g.choice([-1.0, -0.5, 0.5, 1.0], 30), 40)
         y = plant(num, den, u, 0.01)
@@ -659,10 +663,11 @@ def test_residuals_of_a_warm_start_are_in_units_of_its_noise():
 
 
 @pytest.mark.parametrize("mean", [0.0, 50.0])
-def test_runs_in_motion_at_a_level_have_the_gain_of_the_plant(mean):
+@slow_after(1, "seeds", [2, 8])
+def test_runs_in_motion_at_a_level_have_the_gain_of_the_plant(mean, seeds):
     # Sampled 3/(s + 2); without the level, the fit ends at residuals whose color hides it.
     step, rows, before, pole = 0.05, 800, 637, np.exp(-0.1)
-    for seed in range(8):
+    for seed in range(seeds):
         rng = np.random.default_rng([seed, 3])
         u = mean + np.cumsum(rng.standard_normal(before + rows))
         y = lfilter([0.0, 1.5 * (1 - pole)], [1.0, -pole], u)[before:]

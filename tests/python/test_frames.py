@@ -138,6 +138,7 @@ def test_dates_of_python_count_like_those_of_numpy():
     assert ftlm.Run.from_arrays(time=day, outputs={"y": [1.0, 2.0, 4.0]}, inputs=None).step == 86400.0
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_units_survive_pandas_xarray_parquet_and_csv(tmp_path):
     pandas, xarray = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     t = np.arange(50) * 0.1
@@ -169,6 +170,7 @@ def test_units_survive_pandas_xarray_parquet_and_csv(tmp_path):
 
 
 @pytest.mark.parametrize("units", [{}, {"units": "s"}])
+@pytest.mark.usefixtures("reader_in_process")
 def test_groups_of_an_hdf5_file_have_a_time_each(tmp_path, units):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "two.h5", "w") as file:

@@ -17,6 +17,7 @@ from ftlm.estimation.linear import Streaming
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.output_samples import simulate_samples
 from numbered_problem import NumberedProblem
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -316,11 +317,12 @@ def test_a_delayed_motor_converges_with_the_square_of_the_step(delay: float) -> 
     assert all(fine < coarse / 10.0 for coarse, fine in pairwise(errors)), errors
 
 
-def test_intervals_of_a_delayed_motor_hold() -> None:
+@slow_after(1, "seeds", [1, 3])
+def test_intervals_of_a_delayed_motor_hold(seeds: int) -> None:
     """At a delay of 4.6 rows and little noise, where an error of the scheme would show in every interval."""
     truth = {"b": 8.0, "k": 120.0, "fc": 90.0, "delay_u": 0.023}
     inside = []
-    for seed in range(3):
+    for seed in range(seeds):
         u = motor_levels(seed, 1500)
         y, _ = friction.delayed_motor(u, 0.005, truth["delay_u"], truth["b"], truth["k"], truth["fc"])
         noise = 0.01 * np.random.default_rng(1000 + seed).standard_normal(y.size)
@@ -330,7 +332,7 @@ def test_intervals_of_a_delayed_motor_hold() -> None:
             one = found.parameters[name]
             assert abs(one.value - value) < 1e-2 * value, name
             inside.append(one.interval[0] <= value <= one.interval[1])
-    assert sum(inside) >= 10, inside
+    assert 12 * sum(inside) >= 10 * len(inside), inside
 
 
 def test_a_file_keeps_it(tmp_path) -> None:
@@ -472,7 +474,7 @@ def hub(seed: int, load: float, disturbance: float) -> ftlm.Run:
     return run_of(np.array(currents), step, np.array(angles) + 0.02 * g.standard_normal(reference.size))
 
 
-@pytest.mark.parametrize(("seed", "load", "disturbance"), [(21, 0.0, 50.0), (2, 60.0, 150.0), (24, 60.0, 50.0)])
+@slow_after(1, "seed, load, disturbance", [(21, 0.0, 50.0), (2, 60.0, 150.0), (24, 60.0, 50.0)])
 def test_friction_never_fits_worse_than_the_equation_without_it(seed, load, disturbance):
     run, linear = hub(seed, load, disturbance), "D^2 y = a1 D y + b u"
     frictionless, dry = (

@@ -11,6 +11,7 @@ import ftlm
 from ftlm.estimation.methods import method_with_options
 from ftlm.estimation.model_checks import MAX_PARAMETER_CORRELATION, MAX_RELATIVE_STANDARD_ERROR
 from ftlm.structure_selection.cross_validation import fit
+from slow_cases import slow_after
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 TRUTH = {"alpha": 1.8, "nu": 0.8, "a1": -2.0, "a0": -25.0, "b0": 25.0}
@@ -154,7 +155,7 @@ def test_a_lattice_of_one_point_is_that_point(method):
     assert [w for w in one.warnings if "the discretization changes" not in w] == []
 
 
-@pytest.mark.parametrize(("noise", "fit"), [(1.0, 30), (3.2, 5)])
+@slow_after(1, "noise, fit", [(1.0, 30), (3.2, 5)])
 def test_noise_as_large_as_the_signal_widens_the_intervals(noise, fit):
     found = identified(run(square(), noise=noise), "output-error")
     assert found.fit["y"] == pytest.approx(fit, abs=2)

@@ -169,6 +169,7 @@ def parquet(tmp_path_factory):
     return path
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_a_parquet_run_that_lost_rows_or_values_is_refused(parquet, tmp_path):
     import pyarrow.parquet
 

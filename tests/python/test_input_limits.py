@@ -11,6 +11,7 @@ import ftlm
 from ftlm import cli
 from ftlm.report.typesetting import equation_html, parameter_table
 from ftlm.structure.input_nonlinearity import InputNonlinearity
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -143,9 +144,9 @@ def test_an_input_that_is_linear_in_between_is_limited_at_its_samples():
         ("sat(dead(u, 0.2), 0.1:5)", "sat_u", 0.7, {"sat": 0.7, "dead": 0.2}),
     ],
 )
-def test_a_limit_is_found_within_its_interval(words, name, value, by_hand):
+@slow_after(1, "seeds", [3, 12])
+def test_a_limit_is_found_within_its_interval(words, name, value, by_hand, seeds):
     within = np.zeros(4)
-    seeds = 12
     for seed in range(seeds):
         u = levels(600, 100 + seed)
         y = response(bent(u, **by_hand))
@@ -157,7 +158,7 @@ def test_a_limit_is_found_within_its_interval(words, name, value, by_hand):
             within[k] += low <= v <= high
         assert found.limits[name] == pytest.approx(value, abs=4 * found.standard_errors[name])
     # 95 % intervals of twelve seeds miss three or more of one number in two of a hundred cases.
-    assert within.min() >= seeds - 3, within
+    assert within.min() >= 0.75 * seeds - 0.5, within
 
 
 def test_without_its_limit_the_plant_is_another():

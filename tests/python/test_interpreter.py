@@ -119,7 +119,7 @@ def assert_flat(
 
 @pytest.mark.parametrize("work", [simulate, compare, identify, identify_friction, search, select])
 def test_no_call_for_each_sample(work):
-    assert_flat(work, (100, 4), (400, 4), 2.0)
+    assert_flat(work, (60, 4), (240, 4), 2.0)
 
 
 def test_no_call_for_each_candidate():

@@ -306,6 +306,7 @@ BAD_SHEETS = {
 
 
 @pytest.mark.parametrize("case", BAD_SHEETS)
+@pytest.mark.usefixtures("reader_in_process")
 def test_bad_sheets_are_refused_in_words(tmp_path, case):
     lines, words = BAD_SHEETS[case]
     path = sheet(tmp_path, lines)
@@ -377,6 +378,7 @@ def test_bytes_behind_an_array_of_numpy_are_refused(tmp_path):
     messages(["'y'", *words], lambda: ftlm.load(tmp_path / "x.npz", outputs={"y": "y"}, step=1.0))
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_arrays_of_numpy(tmp_path):
     t, u, y = unknown_files.record()
     np.savez(

@@ -14,6 +14,7 @@ from ftlm.estimation.objective import Objective
 from ftlm.estimation.output_error import start_from_values
 from ftlm.simulation.output_samples import simulate_samples
 from nonlinear_plants import PLANTS
+from slow_cases import slow_after
 
 
 def run_of(step, rows, **inputs):
@@ -401,8 +402,9 @@ def tally(plant, seeds):
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_plants_are_found_from_automatic_starts(name):
-    hits, count = tally(PLANTS[name], range(2))
+@slow_after(1, "seeds", [1, 2])
+def test_plants_are_found_from_automatic_starts(name, seeds):
+    hits, count = tally(PLANTS[name], range(seeds))
     assert hits >= 0.6 * count
 
 

@@ -16,6 +16,7 @@ from ftlm.order_search.options import SearchSettings
 from ftlm.simulation.nonlinear_columns import differentiate
 from ftlm.simulation.output_samples import OutputSamples, simulate_samples
 from nonlinear_plants import PLANTS
+from slow_cases import slow_after
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +253,7 @@ def test_selection_finds_the_nonlinear_term(runs):
     assert {"c", "w"} <= {t.name for t in selection.model.equations[0].terms}
 
 
-@pytest.mark.parametrize("start", [1.1, 1.6])
+@slow_after(1, "start", [1.1, 1.6])
 def test_an_order_may_fall_below_an_integer_in_motion(start):
     # Of two initial values at the start one is left at the optimum.
     time = np.arange(400) * 0.02

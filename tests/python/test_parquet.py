@@ -38,6 +38,7 @@ def test_a_run_comes_back_bit_for_bit(run, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["run.parquet"]
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_a_record_is_written_as_parquet_where_its_name_says_so(tmp_path):
     path = tmp_path / "run.parquet"
     run = rig.record(duration=0.5, seed=4, out=path)
@@ -47,6 +48,7 @@ def test_a_record_is_written_as_parquet_where_its_name_says_so(tmp_path):
         rig.record(duration=0.5, out=tmp_path / "run.txt")
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_columns_of_other_peoples_files_are_named(tmp_path):
     path = tmp_path / "x.parquet"
     t = np.arange(50) * 0.01
@@ -59,6 +61,7 @@ def test_columns_of_other_peoples_files_are_named(tmp_path):
         ftlm.load(path, outputs=["z"])
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_missing_values_are_rows_that_are_refused(tmp_path):
     path = tmp_path / "x.parquet"
     pd.DataFrame({"time": np.arange(5) * 0.1, "y": [1.0, None, 2.0, 3.0, 4.0]}).to_parquet(path)

@@ -10,6 +10,7 @@ import ftlm
 from ftlm.validation.comparison import compare_means
 from measured import DATA, needs_data
 from plants import resonant_plant
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -94,7 +95,7 @@ def mittag_leffler(alpha, second, arguments):
 
 
 @pytest.mark.parametrize("kind", ["zoh", "foh"])
-@pytest.mark.parametrize("through", [0.0, 0.5])
+@slow_after(1, "through", [0.5, 0.0])
 @pytest.mark.parametrize("alpha", ["0.4", "0.9", "1.3", "1.9"])
 def test_simulation_of_a_fractional_order_is_that_of_sixty_digits(alpha, through, kind):
     # D^alpha y = -a y + b u + d D^alpha u: the response to a step is d E_{alpha, 1} + b t^alpha E_{alpha, alpha + 1},
@@ -211,7 +212,7 @@ def test_a_real_arm_with_feed_through_prints_what_it_simulates():
     assert result.fit["y"] == pytest.approx(nrmse_fit(acceleration, simulated), abs=1e-3)
 
 
-@pytest.mark.parametrize(("seed", "rows"), [(0, 401), (1, 201), (3, 201)])
+@slow_after(1, "seed, rows", [(0, 401), (1, 201), (3, 201)])
 def test_the_printed_fit_is_that_of_the_residuals_where_numbers_cannot_be_told_apart(seed, rows):
     """Three own terms whose orders end beside each other: a flat, bent valley, out of which a straight line leads."""
     whole = resonant_plant(seed, wrong=True)

@@ -15,6 +15,7 @@ from ftlm.plot.comparison_charts import residual_charts
 from ftlm.utils.statistics import autoregression, chi_squared_99, is_white, whiten_series
 from ftlm.validation import residual_tests
 from ftlm.validation.residual_tests import NoiseModel, residual_findings
+from slow_cases import slow_after
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 
@@ -282,10 +283,11 @@ def motor_record(seed, *, coloured=False):
 MOTOR = "D y = a y + b u"
 
 
-def test_a_missing_dead_time_is_found():
-    found = [ftlm.identify(motor_record(seed), ftlm.equation(MOTOR)).residuals for seed in range(10)]
-    assert sum(t.outputs["y"].inputs["u"].failed for t in found) >= 9
-    assert sum(not t.white["y"] for t in found) >= 9
+@slow_after(1, "seeds", [2, 10])
+def test_a_missing_dead_time_is_found(seeds):
+    found = [ftlm.identify(motor_record(seed), ftlm.equation(MOTOR)).residuals for seed in range(seeds)]
+    assert 10 * sum(t.outputs["y"].inputs["u"].failed for t in found) >= 9 * seeds
+    assert 10 * sum(not t.white["y"] for t in found) >= 9 * seeds
 
 
 @pytest.mark.slow
@@ -389,12 +391,13 @@ SLOW_INPUTS = {
 
 
 @pytest.mark.parametrize("kind", SLOW_INPUTS)
-def test_a_missing_lag_is_found_under_slow_inputs(kind):
+@slow_after(1, "seeds", [1, 3])
+def test_a_missing_lag_is_found_under_slow_inputs(kind, seeds):
     """What the model lacks has the colour of such an input, which a spectrum of the residuals takes for noise."""
     step, tau = 0.05, 0.9
     t = step * np.arange(900)
     u = SLOW_INPUTS[kind](t)
-    for seed in range(3):
+    for seed in range(seeds):
         y = hold_response([1.0], np.polymul([tau, 1.0], [0.2 * tau, 1.0]), u, step)
         y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
         run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y})
@@ -451,13 +454,14 @@ def test_the_arx_model_is_that_of_least_squares():
 
 
 @pytest.mark.parametrize("true", ["foh", "zoh"])
-def test_a_wrong_behavior_between_samples_is_found(true):
+@slow_after(1, "seeds", [1, 3])
+def test_a_wrong_behavior_between_samples_is_found(true, seeds):
     """Half a sample of delay lies between the two; the finding has the estimate of the other one."""
     step, a, b = 0.05, -1.2, 2.5
     t = step * np.arange(900)
     u = SLOW_INPUTS["two sines"](t)
     other = {"foh": "zoh", "zoh": "foh"}[true]
-    for seed in range(3):
+    for seed in range(seeds):
         y = scipy.signal.lsim(([b], [1.0, -a]), u, t)[1] if true == "foh" else hold_response([b], [1.0, -a], u, step)
         y += np.random.default_rng(seed).normal(0.0, 0.02 * np.std(y), t.size)
         run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y}, intersample={"u": true})
@@ -500,7 +504,7 @@ def rubbing_motor(seed: int, friction: float) -> ftlm.Run:
     return ftlm.Run.from_arrays(step=step, inputs={"u": voltage}, outputs={"w": y})
 
 
-@pytest.mark.parametrize("seed", range(3))
+@slow_after(1, "seed", range(3))
 def test_friction_that_a_linear_model_lacks_is_named_with_the_term(seed):
     run, other = rubbing_motor(seed, 9.0), rubbing_motor(seed + 50, 9.0)
     found = ftlm.identify(run, ftlm.equation("D w = a w + b u"), threads=1)
@@ -515,10 +519,11 @@ def test_friction_that_a_linear_model_lacks_is_named_with_the_term(seed):
         assert whole.parameters[name].value == pytest.approx(true, rel=0.02)
 
 
-def test_a_linear_motor_has_no_friction():
+@slow_after(1, "seeds", [4, 20])
+def test_a_linear_motor_has_no_friction(seeds):
     said = [
         f
-        for seed in range(20)
+        for seed in range(seeds)
         for f in ftlm.identify(rubbing_motor(seed, 0.0), ftlm.equation("D w = a w + b u"), threads=1).findings
     ]
     assert not [f for f in said if f.code == "friction_fits"]

@@ -18,6 +18,7 @@ from ftlm.rig import quanser, watchdog
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import shut_down
 from rig_bench import Bench, drive, recorded
+from slow_cases import slow_after
 
 HERE = Path(__file__).parent
 LOOSE = rig.ArmParameters(**{**rig.ArmParameters.of("effective").__dict__, "travel": (1e6, 1e6)})
@@ -208,7 +209,7 @@ def until_expired(page):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("kind", ["virtual", "q8"])
+@slow_after(1, "kind", ["q8", "virtual"])
 def test_a_killed_program_leaves_the_motors_off(kind, tmp_path):
     process, page, out = child(kind, tmp_path)
     process.send_signal(signal.SIGKILL)
@@ -222,7 +223,7 @@ def test_a_killed_program_leaves_the_motors_off(kind, tmp_path):
     assert "did not end" in kept.notes[0]
 
 
-@pytest.mark.parametrize("kind", ["virtual", "q8"])
+@slow_after(1, "kind", ["virtual", "q8"])
 def test_a_frozen_program_leaves_the_motors_off_and_wakes_to_a_fault(kind, tmp_path):
     process, page, out = child(kind, tmp_path)
     process.send_signal(signal.SIGSTOP)
@@ -384,7 +385,7 @@ def checked_writes(volts, rate, limits):
     return over.max(), jump.max(), heat.max()
 
 
-@pytest.mark.parametrize(("kind", "count"), [("virtual", 100_000), ("q8", 20_000)])
+@pytest.mark.parametrize(("kind", "count"), [("virtual", 50_000), ("q8", 10_000)])
 def test_no_write_is_outside_the_limits(kind, count, tmp_path, monkeypatch):
     bench = Bench(kind, tmp_path, monkeypatch, parameters=LOOSE, rate=8000.0)
     rng = np.random.default_rng(11)

@@ -11,6 +11,7 @@ from ftlm.estimation import model_checks
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.model_checks import multistart_findings
 from ftlm.estimation.objective import Objective
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -33,7 +34,7 @@ def codes(found):
     return [f.code for f in found.findings]
 
 
-@pytest.mark.parametrize("seed", range(900, 906))
+@slow_after(2, "seed", range(900, 906))
 def test_the_exponent_of_a_constant_phase_element_is_at_most_1(seed):
     found = ftlm.identify_frequency(spectrum(randles, seed), RANDLES)
     low, high = found.intervals["alpha"]
@@ -82,7 +83,7 @@ def test_elements_that_change_places_are_one_optimum():
     assert "second_optimum" not in codes(ftlm.identify_frequency(data, two))
 
 
-@pytest.mark.parametrize("seed", range(40, 50))
+@slow_after(3, "seed", range(40, 50))
 def test_a_second_optimum_of_a_run_is_named(seed):
     """A long tone burst: half a period of delay more is a gain with the other sign."""
     step, omega, rows, g = 0.05, 20.0, 1600, np.random.default_rng(seed)

@@ -106,7 +106,7 @@ def test_a_store_stopped_anywhere_goes_on_and_one_that_is_damaged_is_refused(run
         with CheckpointFile(place, "selection") as file:
             assert file.read() == (payloads, None)
     rng, damaged = np.random.default_rng(8), 0
-    for at in rng.integers(0, len(data), 200).tolist():
+    for at in rng.integers(0, len(data), 60).tolist():
         flipped = bytearray(data)
         flipped[at] ^= 0x10
         for content in (bytes(flipped), data[: at + 1]):
@@ -120,7 +120,7 @@ def test_a_store_stopped_anywhere_goes_on_and_one_that_is_damaged_is_refused(run
                 # Some bytes of a page hold nothing.
                 with CheckpointFile(place, "selection") as file:
                     assert file.read() == (payloads, None)
-    assert damaged > 250
+    assert damaged > 75
 
 
 def _asked(runs):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -44,15 +45,17 @@ ASKED = {
 }
 
 
+@slow_after(1, "seeds", [12, 60])
 @pytest.mark.parametrize("name", ASKED)
-def test_a_short_record_ends_in_a_result_or_in_words(name):
-    for seed in range(60 if name.startswith("identify") else 15):
+def test_a_short_record_ends_in_a_result_or_in_words(name, seeds):
+    for seed in range(seeds if name.startswith("identify") else seeds // 4):
         with contextlib.suppress(*IN_WORDS):
             str(ASKED[name](record(seed)))
 
 
-def test_three_rows_in_small_steps_and_large_numbers():
-    for seed in range(40):
+@slow_after(1, "seeds", [10, 40])
+def test_three_rows_in_small_steps_and_large_numbers(seeds):
+    for seed in range(seeds):
         g = np.random.default_rng(seed)
         walk = np.cumsum(g.standard_normal(3)) * 1e5
         run = ftlm.Run.from_arrays(step=1e-4, inputs={"u": g.standard_normal(3)}, outputs={"y": walk})
@@ -75,9 +78,10 @@ def test_poles_out_of_the_range_of_numbers_are_refused():
     np.testing.assert_allclose(slow, [-1e-200], rtol=1e-9)
 
 
-def test_rows_that_a_model_fits_exactly_end_in_a_result_or_in_words():
+@slow_after(1, "seeds", [12, 60])
+def test_rows_that_a_model_fits_exactly_end_in_a_result_or_in_words(seeds):
     # Residuals of 0 have no size with which other initial conditions could be compared.
-    for seed in range(60):
+    for seed in range(seeds):
         g = np.random.default_rng(seed)
         run = ftlm.Run.from_arrays(
             step=1e3,

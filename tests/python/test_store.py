@@ -244,7 +244,7 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_is_recovered(run, who
     path = tmp_path / "cut.ftlm"
     path.write_bytes(whole)
     rows, found = rows_of(read_store(path)), []
-    for size in range(0, len(whole), 5):
+    for size in range(0, len(whole), 15):
         path.write_bytes(whole[:size])
         try:
             contents = read_store(path)
@@ -262,7 +262,7 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_is_recovered(run, who
         assert path.read_bytes() == whole[:size]
         assert bytes_of(ftlm.resume_search(path, recover=True)["y"]) == expected
         (tmp_path / "cut.ftlm.damaged").unlink()
-    assert len(found) > len(whole) // 40
+    assert len(found) > len(whole) // 120
     path.write_bytes(b"")
     assert bytes_of(search(run, path)) == expected
 
@@ -322,7 +322,7 @@ def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
     assert section.processed_count == 5
 
 
-@pytest.mark.parametrize(("mask", "stride"), [pytest.param(0xFF, 1, marks=pytest.mark.slow), (0xFF, 5), (0x01, 5)])
+@pytest.mark.parametrize(("mask", "stride"), [pytest.param(0xFF, 1, marks=pytest.mark.slow), (0xFF, 25), (0x01, 25)])
 def test_a_store_flipped_at_any_byte_never_gives_a_wrong_row(run, whole, expected, tmp_path, mask, stride):
     path = tmp_path / "flipped.ftlm"
     path.write_bytes(whole)

@@ -10,6 +10,7 @@ import ftlm
 from ftlm import _core
 from ftlm.errors import DataError, ModelError
 from numbered_problem import NumberedProblem
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -185,7 +186,8 @@ def test_stages_that_do_not_meet_are_two_machines(tmp_path) -> None:
             assert np.ptp(alone[name]) > 1e-3
 
 
-@pytest.mark.parametrize(
+@slow_after(
+    2,
     "leans",
     [
         (),

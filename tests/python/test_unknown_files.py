@@ -93,6 +93,7 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
 
 
 @pytest.mark.parametrize("name", unknown_files.MAKERS)
+@pytest.mark.usefixtures("reader_in_process")
 def test_the_record_is_the_one_that_was_written_and_open_says_all_that_was_assumed(files, name):
     folder, made = files
     path, stranger = folder / made[name].name, made[name]

@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 import ftlm
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -35,7 +36,7 @@ def codes(found):
     return [f.code for f in found.findings]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@slow_after(1, "seed", [1, 2, 3])
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
 def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
     run = controlled_run(4.0, 2.0, 5.0, seed=seed, noise=noise)
@@ -76,7 +77,7 @@ def test_the_structure_of_an_unstable_plant_is_found(seed):
     g, rate, step = np.random.default_rng(seed), 0.4, 0.12
     move = expm(np.array([[0.0, 1.0, 0.0], [rate**2, 0.0, rate**2], [0.0, 0.0, 0.0]]) * step)
     state, inputs, outputs = np.zeros(2), [], []
-    for r in np.repeat(g.choice([-0.2, 0.2], 80), 10):
+    for r in np.repeat(g.choice([-0.2, 0.2], 50), 10):
         y = state[0] + 0.004 * g.standard_normal()
         u = -3.0 * y - 2.0 / rate * state[1] + 2.0 * r
         state = move[:2, :2] @ state + move[:2, 2] * u

@@ -11,6 +11,7 @@ from ftlm import rig
 from ftlm.rig.recording import STOCK_FILTER
 from planar_arm import Planar
 from real_arm import correlations, filtered
+from slow_cases import slow_after
 
 STEP = 0.002
 ANGLES = ("theta11", "theta12", "theta21", "theta22")
@@ -59,7 +60,7 @@ def errors(found, truth):
 # Against the energies
 
 
-@pytest.mark.parametrize("coupling", [1.0, 0.4])
+@slow_after(1, "coupling", [1.0, 0.4])
 def test_hubs_that_stick_slip_and_turn_are_those_of_the_energies_event_by_event(coupling):
     parameters, driven = whole(exact(coupling=coupling, current_offset=(0.01, -0.02))), currents(1251)
     found = states_of(parameters, driven)
