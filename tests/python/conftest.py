@@ -11,6 +11,8 @@ from types import SimpleNamespace
 
 # Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Otherwise each program that a test starts compiles the package anew, which takes it a second.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
@@ -180,5 +182,5 @@ def small_run(small_model):
 def reproduction():
     """The paper's section 5 on a coarse lattice, with few evaluations of the other optimizers and two arms."""
     return ftlm.reproduce(
-        increment=0.25, genetic=ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800), arms=["whole orders"], records=1
+        increment=0.25, genetic=ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=400), arms=["whole orders"], records=1
     )

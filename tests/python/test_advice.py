@@ -96,7 +96,7 @@ def test_a_measured_current_that_follows_its_command_is_no_encoder_that_wraps():
         assert "wrap" not in run.advice().codes
 
 
-@pytest.mark.parametrize("seed", range(8))
+@slow_after(3, "seed", range(8))
 @pytest.mark.parametrize("closed", [True, False])
 def test_feedback_is_told_from_a_command(closed, seed):
     # x' = -a x + b u sampled exactly; the controller reads the noisy output and drives it along a random reference.

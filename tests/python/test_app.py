@@ -23,6 +23,7 @@ from ftlm.app.subprocess_task import Task
 from ftlm.app.web_application import WebApplication
 from ftlm.errors import DataError, ModelError
 from ftlm.svg.html_page import read_resource
+from slow_cases import slow_after
 
 HOSTILE = "<script>hacked=1</script><img src=x onerror=hacked=1>\"' & {{70707*7}}"
 
@@ -427,7 +428,8 @@ def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
 
 
-@pytest.mark.parametrize(
+@slow_after(
+    3,
     "structure",
     [
         "D y = a0 y + k y^3 + b0 u",

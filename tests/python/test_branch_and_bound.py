@@ -110,11 +110,11 @@ def test_close_proofs_keep_the_table_of_multi_innovation(unruly, p, prior):
         assert quick.exclusion_counts["bound"] == pytest.approx(expected, rel=0.01)
 
 
-def test_boxes_keep_the_table_of_squared_equation_errors_of_multi_innovation(run):
+@slow_after(1, "prior", [1.0, None])
+def test_boxes_keep_the_table_of_squared_equation_errors_of_multi_innovation(run, prior):
     options = {"criterion": "equation-error", "norm": "l2", "coefficients": "multi-innovation"}
-    for prior in (None, 1.0):
-        whole = search(run, prior_covariance=prior, **options)
-        check_one_by_one(run, whole, prior_covariance=prior, **options)
+    whole = search(run, prior_covariance=prior, **options)
+    check_one_by_one(run, whole, prior_covariance=prior, **options)
 
 
 def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tmp_path):

@@ -264,7 +264,7 @@ def test_a_click_on_a_chart_moves_its_slider(browser, folder):
         assert opened.said == []
 
 
-@pytest.mark.parametrize("name", ALL)
+@slow_after(2, "name", ["fit", "search", "model", "paper"])
 def test_without_scripts_everything_but_zoom_and_sliders_is_there(browser, at, name):
     def open_details(page):
         for summary in page.locator("details.part > summary").all():

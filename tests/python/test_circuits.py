@@ -217,7 +217,7 @@ def test_a_small_resistance_has_an_interval_on_the_scale_of_the_data(resistance,
         assert 0 <= low < high < 2e-5
         covered += low <= resistance <= high
         absent += [f.code for f in found.findings if f.parameter == "R0"] == ["parameter_at_limit"]
-    assert 20 * covered >= 18 * seeds
+    assert covered > 0.9 * seeds - 1
     if resistance == 0:
         assert absent == seeds
     else:

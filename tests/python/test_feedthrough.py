@@ -63,9 +63,13 @@ def test_without_noise_the_coefficients_are_those_of_the_system(words, system, t
 @pytest.mark.parametrize(
     ("words", "system", "truth"), [(LEAD, LEAD_SYSTEM, LEAD_TRUTH), (SECOND, SECOND_SYSTEM, SECOND_TRUTH)]
 )
-def test_the_truth_lies_within_three_standard_errors(words, system, truth, intersample: str) -> None:
+@slow_after(1, "seeds", [6, 10])
+def test_the_truth_lies_within_three_standard_errors(words, system, truth, intersample: str, seeds: int) -> None:
     z = np.array(
-        [scores(fit_output_error([sampled(system, 600, seed, intersample, 0.01)], words), truth) for seed in range(10)]
+        [
+            scores(fit_output_error([sampled(system, 600, seed, intersample, 0.01)], words), truth)
+            for seed in range(seeds)
+        ]
     )
     assert np.max(np.abs(z)) < 3.0
     # A bias of half an error, or errors of half the size, would show.
@@ -73,7 +77,7 @@ def test_the_truth_lies_within_three_standard_errors(words, system, truth, inter
 
 
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
-@slow_after(1, "seeds", [1, 4])
+@slow_after(1, "seeds", [2, 4])
 def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str, seeds: int) -> None:
     # 5 Ohm at once, a diffusive rest of order 0.78; the truth follows from its spectrum of relaxations.
     scored = []
@@ -114,7 +118,7 @@ def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
                 )
 
 
-@pytest.mark.parametrize("excess", [0.3, 0.6, 0.9, 0.99])
+@slow_after(3, "excess", [0.3, 0.6, 0.9, 0.99])
 def test_a_ramp_that_starts_with_a_jump_is_differentiated_more_often_than_the_output(excess: float) -> None:
     """y' = -2 y + D^(1 + e) u answers with D^e u and its convolution with an exponential, by their closed forms."""
     jump, slope, rows = 0.17, 0.5, 401

@@ -7,6 +7,7 @@ from scipy import signal
 import friction
 import ftlm
 from ftlm.errors import ModelError
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -95,9 +96,7 @@ def test_a_filter_in_motion_is_found_with_the_start(names: str) -> None:
         np.testing.assert_allclose(again[name], found.simulated[name][0], atol=1e-5 * np.ptp(run[name]))
 
 
-@pytest.mark.parametrize(
-    ("level", "rate", "filter_state"), [(0.0, 0.0, (0.0, 0.0)), (0.3, 0.8, (0.25, 0.5))], ids=["rest", "motion"]
-)
+@slow_after(1, "level, rate, filter_state", [(0.0, 0.0, (0.0, 0.0)), (0.3, 0.8, (0.25, 0.5))], ids=["rest", "motion"])
 def test_a_cart_is_recovered_behind_its_filter(level: float, rate: float, filter_state: tuple[float, float]) -> None:
     run = cart_run(level, rate, filter_state, 3)
     initial = "rest" if rate == 0 else "caputo"

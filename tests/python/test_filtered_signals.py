@@ -20,6 +20,7 @@ from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.discretization import recording
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -80,7 +81,7 @@ def sensor(filtered: tuple[str, ...]) -> ftlm.SensorFilter | None:
     return ftlm.SensorFilter.low_pass(filtered, frequency=1.0) if filtered else None
 
 
-@pytest.mark.parametrize("filtered", SUBSETS[1:], ids="+".join)
+@slow_after(1, "filtered", SUBSETS[:0:-1], ids="+".join)
 @pytest.mark.parametrize(
     ("method", "m"),
     [(ftlm.OutputError(intervals="quadratic"), None), ("least-squares", COUNT - 1)],
@@ -168,7 +169,7 @@ def above_run(filtered: tuple[str, ...], begin: float, every: int) -> ftlm.Run:
     )
 
 
-@pytest.mark.parametrize("filtered", SUBSETS, ids="+".join)
+@slow_after(1, "filtered", SUBSETS[::-1], ids="+".join)
 def test_a_derivative_above_its_equations_order_takes_none_of_the_beginning(filtered):
     # Signals begin at a level, and what came through a filter with the motion of what that held: neither is a jump.
     run = above_run(filtered, 1.7, 4)
@@ -282,7 +283,7 @@ def carried(names: str, **options) -> ftlm.Structure:
 
 
 @pytest.mark.parametrize("own_times", [False, True], ids=["grid", "own times"])
-@pytest.mark.parametrize("names", ["q", "xq"])
+@slow_after(1, "names", ["xq", "q"])
 def test_equations_that_follow_together_start_with_their_filters_in_motion(names, own_times):
     run = carried_run(names, own_times=own_times)
     model = ftlm.Model(carried(names, fixed=CARRIED_TRUTH))
@@ -309,7 +310,7 @@ def test_equations_that_follow_together_start_with_their_filters_in_motion(names
         np.testing.assert_allclose(means[name][0][8:], middles[8:], atol=0.02 * np.ptp(run[name]))
 
 
-@pytest.mark.parametrize("names", ["q", "xq"])
+@slow_after(1, "names", ["xq", "q"])
 def test_numbers_of_equations_that_follow_together_behind_filters_in_motion(names):
     run = carried_run(names)
     start = {n: 1.3 * v for n, v in CARRIED_TRUTH.items()}

@@ -3,16 +3,18 @@
 import pytest
 
 from fuzz import REGRESSIONS, fault, fuzz
+from slow_cases import slow_after
 from targets import NEEDS, SLOW, TARGETS
 
 KEPT = sorted(path for path in REGRESSIONS.rglob("*") if path.is_file())
 
 
+@slow_after(1, "count", [100, 200])
 @pytest.mark.parametrize("target", TARGETS)
-def test_mutations_end_well_or_in_an_error_of_ftlm(target):
+def test_mutations_end_well_or_in_an_error_of_ftlm(target, count):
     if target in NEEDS:
         pytest.importorskip(NEEDS[target])
-    count = 4 if target in SLOW else 200
+    count //= 50 if target in SLOW else 1
     tried, faults = fuzz(target, seed=1, inputs=count)
     assert (tried, faults) == (count, {})
 

@@ -30,7 +30,7 @@ def at_true_orders(name):
 
 
 @pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("method", ["least-squares", "multi-innovation"])
+@slow_after(1, "method", ["least-squares", "multi-innovation"])
 def test_equation_error_at_the_true_orders(runs, name, method):
     result = ftlm.identify(runs[name], at_true_orders(name), method=method)
     for parameter, estimate in result.parameters.items():

@@ -553,7 +553,8 @@ print("again", ftlm.search_orders(run, small, m=64).candidates)
 """
 
 
-@pytest.mark.parametrize(
+@slow_after(
+    1,
     "large",
     [
         EQUATION,

@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from ftlm import _core
+from slow_cases import slow_after
 
 MOST = 8
 
@@ -64,7 +65,7 @@ NOISES = {"white": [1.0], "of a lag": [1.0, -0.9], "of motion": [1.0, -1.6, 0.8]
 
 
 @pytest.mark.parametrize("kind", NOISES)
-@pytest.mark.parametrize("seed", range(3))
+@slow_after(1, "seed", range(3))
 def test_the_ratio_is_that_of_regressions_one_by_one(kind, seed):
     g = np.random.default_rng([seed, 3])
     outputs = [[(0, 150), (150, 240)], [(240, 300)]]

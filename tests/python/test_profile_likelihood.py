@@ -25,6 +25,7 @@ from ftlm.simulation.discretization import recording
 from measured import DATA, needs_data
 from profile_oracle import likelihood_of, nonlinear_parameters
 from profile_oracle import profile_intervals as intervals_in_python
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -190,8 +191,9 @@ def naive_rise(
     return 2.0 * (rest.cost - whole.cost) / variance
 
 
-@pytest.mark.parametrize(
-    ("words", "answer", "truth", "noise"),
+@slow_after(
+    1,
+    "words, answer, truth, noise",
     [
         ("D^2 y = c D y + a y + b u", fast_pole, {"c": -26.0, "a": -25.0, "b": 25.0}, 0.1),
         ("D^alpha y = a y + b u", relaxation, {"alpha": 0.6, "a": -0.8, "b": 1.0}, 1.1),

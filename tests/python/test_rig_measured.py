@@ -6,6 +6,7 @@ import pytest
 import real_arm
 from measured import needs_data
 from real_arm import ANGLES, UNITS, beside, correlations, factor
+from slow_cases import slow_after
 
 #: Bands of the arm's motion and of the sensors' noise [Hz].
 MOTION, NOISE = [(0.2, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, 3.0), (3.0, 5.0)], [(80.0, 160.0)]
@@ -20,7 +21,7 @@ def measured(request):
     return real_arm.commanded(request.param)
 
 
-@pytest.mark.parametrize(("name", "motion"), [("own", 4.5), ("effective", 13.0)])
+@slow_after(1, "name, motion", [("own", 4.5), ("effective", 13.0)])
 def test_spectra_and_noise_are_within_the_stated_factors(measured, name, motion):
     run = beside(measured, UNITS[measured.name] if name == "own" else name)
     assert run.metadata["faults"] == []

@@ -6,6 +6,7 @@ import pytest
 import friction
 import ftlm
 from oracles import held_response
+from slow_cases import slow_after
 
 #: What time, outputs and inputs are multiplied by.
 UNITS = {"time in ms": (1e3, 1.0, 1.0), "time in min": (1 / 60, 1.0, 1.0), "y x 1000, u x 0.001": (1.0, 1e3, 1e-3)}
@@ -44,9 +45,7 @@ CARTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "kind", [*list(CARTS)[:2], *(pytest.param(k, marks=pytest.mark.slow) for k in list(CARTS)[2:])]
-)
+@slow_after(1, "kind", ["damping of free order", *(k for k in CARTS if k != "damping of free order")])
 def test_friction_is_the_same_in_any_unit(kind):
     words, orders = CARTS[kind]
     structure, run = ftlm.equation(words, orders=orders), cart(0)

@@ -77,7 +77,7 @@ def test_the_structure_of_an_unstable_plant_is_found(seed):
     g, rate, step = np.random.default_rng(seed), 0.4, 0.12
     move = expm(np.array([[0.0, 1.0, 0.0], [rate**2, 0.0, rate**2], [0.0, 0.0, 0.0]]) * step)
     state, inputs, outputs = np.zeros(2), [], []
-    for r in np.repeat(g.choice([-0.2, 0.2], 50), 10):
+    for r in np.repeat(g.choice([-0.2, 0.2], 80), 10):
         y = state[0] + 0.004 * g.standard_normal()
         u = -3.0 * y - 2.0 / rate * state[1] + 2.0 * r
         state = move[:2, :2] @ state + move[:2, 2] * u
