@@ -50,6 +50,7 @@ def test_there_are_forty_cases_in_four_formats(page):
 
 
 @pytest.mark.parametrize(("case", "kind"), QUICK)
+@pytest.mark.usefixtures("reader_in_process")
 def test_bad_data_is_refused_or_taken_with_a_word(case, kind, tmp_path, page):
     check(case, kind, tmp_path, page)
 

@@ -9,6 +9,8 @@ from fractions import Fraction
 import pytest
 import sympy as sp
 
+from slow_cases import slow_after
+
 s = sp.Symbol("s", positive=True)
 # The hub has odd numbers and the link even ones, as in print: stage 1 is (1, 2), stage 2 is (3, 4).
 STAGES = pytest.mark.parametrize("stage", [1, 2])
@@ -157,7 +159,7 @@ def test_link_equation_19_and_21_lacks_a_derivative_of_the_current(stage):
     assert vanishes((derived - printed).subs(integer))
 
 
-@STAGES
+@slow_after(1, "stage", [1, 2])
 def test_solved_equations_are_the_linear_solution_of_the_motion(stage):
     # A second route: solve (14) and (15) for the two angles and put them into the eliminated forms.
     arm = Stage(stage)
@@ -167,7 +169,7 @@ def test_solved_equations_are_the_linear_solution_of_the_motion(stage):
     assert vanishes(sp.together((deriv(arm.a2, arm.link) - link).subs(angles)))
 
 
-@STAGES
+@slow_after(1, "stage", [1, 2])
 def test_shifting_the_link_orders_together_changes_nothing_without_link_friction(stage):
     # With the derived input order, alpha_2 enters through the friction term only: alpha_2 is fixed unless freed.
     arm = Stage(stage)

@@ -15,6 +15,7 @@ import ftlm
 from ftlm.cli.main import app
 from ftlm.estimation.methods import METHODS_BY_NAME
 from ftlm.utils.validation import available_threads, check_threads
+from slow_cases import slow_after
 
 WORDS = "D^1.5 y = a y + b u"
 
@@ -90,7 +91,7 @@ def test_a_shell_completes_commands_options_and_their_values(typed, offered):
     assert set(done.stdout.split()) == offered
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@slow_after(1, "shell", ["bash", "zsh", "fish"])
 def test_what_a_shell_is_to_read_is_shown(shell):
     # Without the variable typer looks for the shell that runs it, and there is none here.
     script = "import sys; sys.argv[0] = 'ftlm'; from ftlm.cli import main; main()"

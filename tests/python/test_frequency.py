@@ -308,7 +308,7 @@ def test_laws_carry_their_uncertainty_to_every_number(fits):
 
 
 def test_the_covariance_of_a_tied_coefficient_is_that_of_its_product(plant, drive, with_noise):
-    clean = plant("A").simulate(drive("A", 1500), tolerance=1e-5)
+    clean = plant("A").simulate(drive("A", 600), tolerance=1e-5)
     fit = ftlm.identify(with_noise(clean, 1e-4, 1), ftlm.flexible_link(form="published", stage=1))
     numbers = parameter_vector(fit.model)
     deviation = np.sqrt(np.diag(np.array(fit.model.estimate.covariance)))

@@ -382,7 +382,7 @@ def cart_run(seed: int, *, noise: float = 0.005, offset: float = 0.0, rate: floa
 
 
 def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
-    runs = [cart_run(1, offset=0.15)[0], cart_run(2, offset=-0.1)[0]]
+    runs = [cart_run(1, offset=0.15, rows=501)[0], cart_run(2, offset=-0.1, rows=501)[0]]
     found = ftlm.identify(runs, ftlm.equation(CART + " + c", initial="caputo"))
     for name, truth in {"v": 1.0, "g": 1.0, "fc": 0.8}.items():
         error = found.standard_errors[name]

@@ -26,6 +26,7 @@ from ftlm.simulation.initial_conditions import (
 )
 from ftlm.simulation.output_samples import with_initial_conditions
 from ftlm.structure.structure import History
+from slow_cases import slow_after
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -265,7 +266,7 @@ def test_a_run_in_motion_is_judged_with_its_own_history(halves):
 
 
 @pytest.mark.parametrize(("name", "seed"), [("0.4", 1), ("0.7", 1), ("1.3", 1), ("1.7, 0.6", 1)])
-@pytest.mark.parametrize("coupling", ["measured", "simulated"])
+@slow_after(1, "coupling", ["measured", "simulated"])
 def test_a_history_explains_no_more_of_a_run_than_a_past_input_could(name, seed, coupling):
     # Free powers of t alone explain 73, 77, 65 and 57 % of these runs, whose input changes four times.
     plant = motion.PLANTS[name]

@@ -412,6 +412,7 @@ def test_arrays_of_numpy(tmp_path):
     messages(["more than 1073741824 bytes"], lambda: read(tmp_path, head + bytes(64), "d.npy"))
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_matrices_of_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
     t, u, y = unknown_files.record()
@@ -439,6 +440,7 @@ def test_matrices_of_hdf5(tmp_path):
     )
 
 
+@pytest.mark.usefixtures("reader_in_process")
 def test_mat_of_version_4_is_read(tmp_path):
     scipy_io = pytest.importorskip("scipy.io")
     t, u, y = unknown_files.record()

@@ -20,7 +20,8 @@ ARM = plants.truth("A")
 @pytest.fixture(scope="module")
 def fitted() -> ftlm.Identification:
     """Plant A at 40 dB by output error."""
-    return ftlm.identify(plants.noisy_run("A", 40, 0), plants.structure("A"))
+    start = ftlm.OutputError(start=plants.truth("A"))
+    return ftlm.identify(plants.noisy_run("A", 40, 0), plants.structure("A"), method=start)
 
 
 def law(name: str) -> dict[str, float]:
@@ -98,7 +99,7 @@ def test_instrumental_variables_are_the_same_for_any_number_of_threads() -> None
     assert tables[0] == tables[1] == tables[2]
 
 
-def test_noise_beyond_the_instruments_is_said(fitted: ftlm.Identification) -> None:
+def test_noise_beyond_the_instruments_is_said() -> None:
     constant = plants.noisy_run("3T", 0, 3)
     found = ftlm.identify(
         constant,

@@ -119,11 +119,14 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "noise"),
-    [(1, 1e-2), pytest.param(1, 1e-4, marks=pytest.mark.slow), pytest.param(2, 1e-2, marks=pytest.mark.slow)],
+    ("stage", "noise", "rows"),
+    [
+        (1, 1e-2, 1501),
+        *(pytest.param(k, noise, 3001, marks=pytest.mark.slow) for k, noise in ((1, 1e-2), (1, 1e-4), (2, 1e-2))),
+    ],
 )
-def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float) -> None:
-    run = arm_run(stage, 3001, noise, 3)
+def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float, rows: int) -> None:
+    run = arm_run(stage, rows, noise, 3)
     found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")
     plant = demo_plant(stage, form="published")
     truth = {n: v for n, v in plant.orders.items()} | plant.coefficients

@@ -70,7 +70,13 @@ def stage_store(stage_run, small_pieces, tmp_path):
             "coefficients": "least-squares",
         },
         # More candidates than the first pass follows at a time, so that some are left early and followed further.
-        {"order_grid": ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
+        pytest.param(
+            {
+                "order_grid": ftlm.OrderGrid(increment=0.1, orders={"alpha": (1.8, 2.0)}),
+                "coefficients": "least-squares",
+            },
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, small_pieces, tmp_path, options):

@@ -28,6 +28,7 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", unknown_files.MAKERS)
+@pytest.mark.usefixtures("reader_in_process")
 def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     folder, made = files
     path = folder / made[name].name
