@@ -9,10 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import ftlm
 from ftlm.estimation import objective
+from slow_cases import slow_after
 
 PACKAGE = str(Path(ftlm.__file__).parent)
 #: Functions that the core reports its progress to.
@@ -92,7 +92,7 @@ def search(rows: int, points: int) -> object:
 
 
 def select(rows: int, _: int) -> object:
-    return ftlm.select(make_run(rows), ftlm.equation("D^alpha y = a y + c D^nu y + b u"), threads=1)
+    return ftlm.select(make_run(rows), ftlm.equation(FREE), threads=1)
 
 
 def test_a_fit_with_friction_is_computed_by_the_core(monkeypatch):
@@ -117,7 +117,7 @@ def assert_flat(
     assert grown == {}
 
 
-@pytest.mark.parametrize("work", [simulate, compare, identify, identify_friction, search, select])
+@slow_after(5, "work", [simulate, compare, identify, search, select, identify_friction])
 def test_no_call_for_each_sample(work):
     assert_flat(work, (60, 4), (240, 4), 2.0)
 

@@ -94,7 +94,7 @@ def mittag_leffler(alpha, second, arguments):
         return [mpmath.polyval(weights[::-1], z) for z in arguments]
 
 
-@pytest.mark.parametrize("kind", ["zoh", "foh"])
+@slow_after(1, "kind", ["foh", "zoh"])
 @slow_after(1, "through", [0.5, 0.0])
 @pytest.mark.parametrize("alpha", ["0.4", "0.9", "1.3", "1.9"])
 def test_simulation_of_a_fractional_order_is_that_of_sixty_digits(alpha, through, kind):

@@ -177,6 +177,7 @@ def test_fifty_kills():
     assert same
 
 
+@pytest.mark.slow
 def test_control_c_leaves_a_store_that_goes_on(tmp_path):
     data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
     bench.run().to_csv(data)
