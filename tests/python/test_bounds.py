@@ -16,7 +16,7 @@ from ftlm.cli.main import app
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
 STEP = 0.02
-TIME = STEP * np.arange(300)
+TIME = STEP * np.arange(600)
 INPUT = np.where(np.sin(1.3 * TIME) + np.sin(3.1 * TIME + 1) > 0, 1.0, -1.0)
 OSCILLATOR = ftlm.equation("D^2 y = a1 D y + a0 y + b u")
 ARC = "D^alpha U = a U + r D^alpha I + b I"
