@@ -13,7 +13,7 @@ author = "the ftlm authors"
 copyright = "the ftlm authors, MIT license"
 version = release = ftlm.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas", "signs"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas", "signs", "tables"]
 exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 root_doc = "index"

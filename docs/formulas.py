@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,36 @@ if TYPE_CHECKING:
 SIZE_PT = 10.0
 #: Height of a lower-case letter of the formulas over that of the page's text.
 SCALE = 1.0
+#: Commands, and other characters; blanks separate them.
+TOKEN = re.compile(r"\\(?:[A-Za-z]+|.)|\S")
+OPENING, CLOSING = ("{", "(", "[", r"\left"), ("}", ")", "]", r"\right")
+RELATIONS = ("=", "<", ">", *(rf"\{name}" for name in ("leq", "geq", "approx", "equiv", "in", "to", "mapsto", "quad")))
 COMMANDS = {Path.MOVETO: "M", Path.LINETO: "L", Path.CURVE3: "Q", Path.CURVE4: "C", Path.CLOSEPOLY: "Z"}
 
 
+def parts(formula: str) -> list[str]:
+    """Return the parts of a formula between which a line may break: after relations and signs outside brackets."""
+    found, depth, begin, last = [], 0, 0, ""
+    for token in TOKEN.finditer(formula):
+        text = token.group()
+        depth += (text in OPENING) - (text in CLOSING)
+        is_sign = text in "+-" and last not in ("^", "_") and formula[begin : token.start()].strip()
+        if not depth and (text in RELATIONS or is_sign):
+            found.append(formula[begin : token.end()])
+            begin = token.end()
+        last = text
+    return [*found, formula[begin:]]
+
+
 def draw(formula: str) -> str:
-    """Return a formula as SVG, aligned with the baseline of the text."""
+    """Return the parts of a formula, as SVG each."""
+    return "".join(draw_part(part) for part in parts(" ".join(formula.split())))
+
+
+def draw_part(formula: str) -> str:
+    """Return a formula without breaks as SVG, aligned with the baseline of the text."""
     font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")
-    text = f"${' '.join(formula.split())}$"
+    text = f"${formula}$"
     width, height, depth, *_ = MathTextParser("path").parse(text, dpi=72, prop=font)
     path = TextPath((0, 0), text, size=SIZE_PT, prop=font)
     drawn = "".join(

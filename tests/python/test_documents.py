@@ -237,6 +237,15 @@ def test_every_formula_of_the_pages_is_drawn(monkeypatch: pytest.MonkeyPatch) ->
             assert len(found) > 100
 
 
+def test_lines_break_in_formulas_after_relations_and_signs_outside_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from formulas import parts
+
+    formula = r"D^\alpha y = -\frac{a + b}{2} (c - d) + e_{i+1} \leq \left(f - g\right)^+ u"
+    broken = [r"D^\alpha y =", r" -\frac{a + b}{2} (c - d) +", r" e_{i+1} \leq", r" \left(f - g\right)^+ u"]
+    assert parts(formula) == broken
+
+
 def test_the_reference_names_every_public_name() -> None:
     topics = tomllib.loads((ROOT / "docs" / "reference.toml").read_text(encoding="utf-8"))
     listed = [name for topic in topics.values() for name in topic["names"]]
