@@ -40,6 +40,8 @@ TOP_CANDIDATES = 20
 TRACE_EVERY = 16
 #: Labels of the models that are saved, by the suffix of their file name.
 SAVED_MODELS = {"paper": f"p = {LAST_P}", "output-error": "output error"}
+#: Title of the bars of all models, whose fits differ from those of verdicts and charts, which are to every sample.
+PULSE_FIT_TITLE = "Fit to pulse means"
 #: Labels of the models in the terminal summary. "p = 7" is multi-innovation with innovation length 7.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
 #: Widths [characters] of the columns after the first one, in text tables of models and of estimates.
@@ -188,13 +190,16 @@ def demo_text(demo: Demo) -> str:
         lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
     outputs = [output for stage in demo.stages.values() for output in stage.outputs]
-    lines.append(f"{'simulation fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
+    lines.append(f"{'pulse means, %':<16}" + "".join(f"{o:>16}" for o in outputs))
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
         fits = [fit for stage in demo.stages.values() for fit in stage.candidates[label].fits]
         texts = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(texts)))
-    lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
+    lines += [
+        "",
+        "The table has fits to pulse means, as in the paper; verdicts have fits to every sample.",
+    ]
     joint = [results["output error"] for results in demo.results.values()]
     lines += finding_lines([w for r in joint for w in r.findings], hint="-v")
     others = sum(len(r.warnings) for results in demo.results.values() for r in results.values() if r not in joint)
@@ -207,7 +212,7 @@ def demo_details(demo: Demo) -> str:
     for number, stage in demo.stages.items():
         lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
         lines += [*table_text(paper_table(stage.candidates), 16, PAPER_TABLE_WIDTHS), ""]
-        lines += ["Fit of the simulation in percent: on the square run, and on the sine run that no model has seen"]
+        lines += ["Fit to pulse means in percent: on the square run, and on the sine run that no model has seen"]
         lines += [*report.fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
         estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
         lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
@@ -232,7 +237,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         if checked.verdict is not None:
             boxes += verdict_box(checked.verdict, f"Stage {number}, output error: ")
         fits = [(label, [(r, getattr(c, part)) for r, part in runs.items()]) for label, c in stage.candidates.items()]
-        bars += [replace(bar, width=SMALL_WIDTH_PX, caption="") for bar in compared_bars(fits)]
+        bars += [replace(bar, width=SMALL_WIDTH_PX, caption="") for bar in compared_bars(fits, title=PULSE_FIT_TITLE)]
         # Four charts fit a laptop screen without their sliders, which the sections of the stages have.
         charts = comparison_charts(checked, units=units)
         simulations += [replace(chart, width=SMALL_WIDTH_PX, height=200, slider=False) for chart in charts]

@@ -147,8 +147,12 @@ class Circuit:
         # Reports print a true minus sign between elements.
         text = "".join(c for c in self.text if not c.isspace()).replace("−", "-")
         tokens = _TOKEN_PATTERN.findall(text)
-        if "".join(tokens) != text:
-            raise ModelError(f"circuit {self.text!r} has an invalid character; write it as in 'R0-p(R1,CPE1)-W1'")
+        invalid = _TOKEN_PATTERN.sub("", text)
+        if invalid:
+            raise ModelError(
+                f"circuit {self.text!r} has the invalid character {invalid[0]!r}, {len(invalid)} in all; write it as "
+                "in 'R0-p(R1,CPE1)-W1', where - joins elements in series and p(…,…) in parallel"
+            )
         names: set[str] = set()
 
         def group(kind: str, parts: list[Node]) -> Node:
@@ -178,7 +182,15 @@ class Circuit:
                         "branch; write p(R1,C1), or leave p( ) out"
                     )
                 return group("parallel", parts)
+            if token in ("P", "("):
+                raise ModelError(f"circuit {self.text!r}: write p( before elements in parallel, as in p(R1,C1)")
             if _letters(token) not in CIRCUIT_ELEMENTS:
+                kinds = [kind for kind in CIRCUIT_ELEMENTS if token.startswith(kind)]
+                if kinds:
+                    raise ModelError(
+                        f"circuit {self.text!r}: {token!r} is not an element; a name is a kind and a number, such as "
+                        f"{max(kinds, key=len)}1"
+                    )
                 elements = ", ".join(f"{n} ({e.description})" for n, e in CIRCUIT_ELEMENTS.items())
                 raise ModelError(
                     f"circuit {self.text!r}: {token!r} is not an element; known: {elements}, and p(…,…); an equation "

@@ -458,6 +458,8 @@ class Structure:
         for name, delay in delays.items():
             fixed.pop(name, None)
             free.pop(name, None)
+            if isinstance(delay, str):
+                raise ModelError(f"delay of {name} = {delay!r} is text; give seconds, or (minimum, maximum)")
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
                     raise ModelError(

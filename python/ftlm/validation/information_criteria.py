@@ -47,7 +47,7 @@ class InformationCriteria:
     def __str__(self) -> str:
         return (
             f"AIC {self.aic:.6g}, AICc {self.aicc:.6g}, BIC {self.bic:.6g} "
-            f"({self.parameters} parameters estimated from {self.samples} samples)"
+            f"({self.parameters} parameters, noise levels included, estimated from {self.samples} samples)"
         )
 
 
