@@ -277,7 +277,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
             "one parameter of an input",
         ),
         ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": 0.1}}, "has a delay"),
-        ("D y = a y + b u", {"delay": {"u": "0:0.2"}}, r"is text; give seconds, or \(minimum, maximum\)"),
+        ("D y = a y + b u", {"delay": {"u": "0:0.2"}}, r"is not a number; give seconds, or \(minimum, maximum\)"),
         ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": (0, 0.1)}}, "only one parameter of an input"),
         ("D y = a y + sat_u u", {"saturation": {"u": (1, 2)}}, "give the coefficient another name"),
     ],

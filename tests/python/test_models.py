@@ -202,6 +202,7 @@ def test_equation_is_read(text, output, order, terms):
         ("D^1.5 y = a D^lambda y", 15, "at character 15: order 'lambda' is neither"),
         ("D^1.5 y = a y & b u", 15, "unexpected '&' at character 15; remove it"),
         ("D^1.5 y = a y, b u", 14, "unexpected ',' at character 14; remove it"),
+        ("D y = a y + b u, D z = c z", 16, "unexpected ',' at character 16; separate equations by ';'"),
         ("D^1.5 y = a y[0]", 14, "unexpected '[' at character 14; remove it"),
         ("D^1.5 y = a y + § u", 17, "unexpected '§' at character 17; remove it"),
         ("D^1.5 y = a * * y", 15, "expected the name of a signal at character 15, found '*'"),

@@ -148,8 +148,8 @@ def as_structure(argument: str, value: Structure | str) -> Structure:
         return equation(value)
     if not isinstance(value, Structure):
         raise ModelError(
-            f"{argument} is {type(value).__name__}; give the text of an equation, ftlm.equation(…) or "
-            "ftlm.flexible_link(…)"
+            f"{argument} is {type(value).__name__}; give the text of an equation, or of several separated by "
+            "';', ftlm.equation(…) or ftlm.flexible_link(…)"
         )
     return value
 

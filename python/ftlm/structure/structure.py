@@ -459,7 +459,7 @@ class Structure:
             fixed.pop(name, None)
             free.pop(name, None)
             if isinstance(delay, str):
-                raise ModelError(f"delay of {name} = {delay!r} is text; give seconds, or (minimum, maximum)")
+                raise ModelError(f"delay of {name} = {delay!r} is not a number; give seconds, or (minimum, maximum)")
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
                     raise ModelError(

@@ -102,7 +102,8 @@ class TokenReader:
         kind, value, position = self._peek()
         found = value if kind == "end" else repr(value)
         if kind == "symbol" and value in ",:'":
-            return self._error(f"unexpected {value!r} at character {position + 1}; remove it")
+            remedy = "separate equations by ';'" if value == "," and "=" in self.text[position:] else "remove it"
+            return self._error(f"unexpected {value!r} at character {position + 1}; {remedy}")
         if value == "D" or (expectation == "the name of a signal" and self._index > 0 and self._peek(-1)[1] == "D"):
             return self._error(
                 f"expected {expectation} at character {position + 1}, found {found}; D is the derivative in an "
