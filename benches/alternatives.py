@@ -1,11 +1,11 @@
-"""Free orders of ftlm beside those of SciPy's least_squares with a Grünwald-Letnikov simulator, and of FOMCON's fid.
+"""Estimates with free orders by ftlm, by SciPy's least_squares with a Grünwald-Letnikov simulator, and by FOMCON's fid.
 
 ``python benches/alternatives.py [SEEDS] [FOMCON]``: a motor's speed, a heated rod and a flexible tip, 400 samples with
 noise of 2 % of the standard deviation, validated on another input without noise. The records are Grünwald-Letnikov
-simulations at a fortieth of the step, which is the scheme of none of the three. SciPy and FOMCON start at coefficients
-of one with the right signs and at integer orders; SciPy also at five more points, of which the best fit counts. The
-intervals of SciPy follow from its Jacobian; FOMCON has none. FOMCON needs Octave with its packages optim and control,
-and FOMCON is the folder of its sources (github.com/AlekseiTepljakov/fomcon-matlab).
+simulations at a fortieth of the sampling interval, so that no program fits its own discretization. SciPy and FOMCON
+start at coefficients of one with the right signs and at integer orders; SciPy also at five more points, of which the
+best fit counts. The intervals of SciPy follow from its Jacobian; FOMCON has none. It needs Octave with its packages
+optim and control; the argument FOMCON is the folder of its sources (github.com/AlekseiTepljakov/fomcon-matlab).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Plant:
 
     @property
     def words(self) -> str:
-        """The structure that both fit."""
+        """The structure that all programs fit."""
         return f"D^alpha y = {'' if self.mu is None else 'a1 D^mu y + '}a0 y + b0 u"
 
     @property
@@ -54,8 +54,8 @@ class Plant:
 
     @property
     def first(self) -> dict[str, float]:
-        """Where someone starts who knows the signs and the next whole orders."""
-        whole = {"alpha": float(round(self.alpha)), "a0": -1.0, "b0": 1.0}
+        """Initial guess of someone who knows the signs and the nearest positive integer orders."""
+        whole = {"alpha": max(1.0, float(round(self.alpha))), "a0": -1.0, "b0": 1.0}
         return whole if self.mu is None else {**whole, "mu": 1.0, "a1": -1.0}
 
 
@@ -111,17 +111,20 @@ def by_scipy(plant: Plant, u: np.ndarray, y: np.ndarray, starts: Sequence[dict[s
 def by_fomcon(
     sources: str, plant: Plant, inputs: tuple[np.ndarray, np.ndarray], outputs: Sequence[np.ndarray]
 ) -> list[tuple[float, float, np.ndarray]]:
-    """Processor time [s], alpha and response to the second input of a fit by fid to each output.
+    """Return processor time [s], alpha and response to the second input, for a fit by fid to each output.
 
-    A held input reaches the samples of FOMCON's implicit scheme one step later, as in :func:`sampled`.
+    The inputs are delayed by one sample, because an input acts at its own instant in FOMCON's implicit scheme.
     """
     t = np.arange(SAMPLES) * plant.step
-    late = [np.concatenate([[0.0], u[:-1]]) for u in inputs]
+    delayed_inputs = [np.concatenate([[0.0], u[:-1]]) for u in inputs]
     first = plant.first
     start = [first["b0"] / -first["a0"], 1 / -first["a0"], first["alpha"]]
     start += [] if plant.mu is None else [first["a1"] / first["a0"], first["mu"]]
     with tempfile.TemporaryDirectory() as folder:
-        tables = {"train": np.stack([t, late[0], *outputs], axis=1), "test": np.stack([t, late[1]], axis=1)}
+        tables = {
+            "train": np.stack([t, delayed_inputs[0], *outputs], axis=1),
+            "test": np.stack([t, delayed_inputs[1]], axis=1),
+        }
         for name, table in {**tables, "start": np.array([start])}.items():
             np.savetxt(Path(folder, f"{name}.csv"), table, delimiter=",", fmt="%.17g")
         script = Path(__file__).with_name("fomcon_fid.m")
@@ -181,19 +184,19 @@ def measure(plant: Plant, seeds: int, fomcon: str | None) -> list[str]:
     for name, each in ways.items():
         seconds, fits, hits, off = (np.array(v) for v in zip(*each, strict=True))
         ratio = float(np.median(seconds) / np.median([s for s, *_ in ways["ftlm, no start"]]))
-        held = "–" if name.startswith("FOMCON") else f"{100 * np.sum(hits) / (count * seeds):.0f}"
+        coverage = "–" if name.startswith("FOMCON") else f"{100 * np.sum(hits) / (count * seeds):.0f}"
         rows.append(
             f"| {plant.name} | {name} | {np.median(fits):.1f} | {np.min(fits):.1f} | {np.median(off):.3f} | "
-            f"{held} | {ratio:.2g} |"
+            f"{coverage} | {ratio:.2g} |"
         )
     return rows
 
 
 def main() -> None:
     """Measure, print and keep."""
-    words = [word for word in sys.argv[1:] if word != "--write"]
-    seeds = next((int(word) for word in words if word.isdigit()), 5)
-    fomcon = next((word for word in words if not word.isdigit()), None)
+    arguments = [word for word in sys.argv[1:] if word != "--write"]
+    seeds = next((int(word) for word in arguments if word.isdigit()), 5)
+    fomcon = next((word for word in arguments if not word.isdigit()), None)
     lines = [
         f"{SAMPLES} samples, noise {NOISE:.0%}, seeds 0 to {seeds - 1}.",
         "",

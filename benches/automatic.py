@@ -3,9 +3,10 @@
 ``python benches/automatic.py [--plants known,drawn,measured] [--seeds 1] [--kept FILE]`` compares the fit of the
 simulation on data that were not fitted, in percent, and the processor time. The known plants are those of
 ``tests/python/automatic_plants.py``, the drawn ones random ones of seed 2026, drawn after the rules of the selection
-were fixed. Of ``robot_arm`` and ``heating`` the first half is fitted, the second validates. The others use an order of
-1 to 6, chosen by a fit of the first three quarters on the last one. They are optional: what is not installed has no
-column. Of ``heating``, which rests at a level, the other programs see deviations from the first sample.
+were fixed. Of ``robot_arm`` and ``heating`` the first half is for estimation, the second for validation. The other
+programs use orders 1 to 6; a fit to the first three quarters, validated on the last quarter, selects the order. A
+program that is not installed has no column. For ``heating``, which starts from a nonzero steady state, the other
+programs get deviations from the first sample.
 """
 
 from __future__ import annotations

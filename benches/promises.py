@@ -282,7 +282,7 @@ def numpy_solve(run: ftlm.Run, equation: ftlm.Structure, count: int = 200_000) -
 
 
 def kernels() -> None:
-    """P4, P5 and P6: the core's own figures, each beside its transforms, and other packages in Python."""
+    """P4, P5 and P6: times of operators of the core, relative to their transforms and to other Python packages."""
     from scipy.linalg import solve_triangular, toeplitz  # noqa: PLC0415
     from scipy.signal import fftconvolve  # noqa: PLC0415
 

@@ -22,34 +22,39 @@ if TYPE_CHECKING:
 SIZE_PT = 10.0
 #: Height of a lower-case letter of the formulas over that of the page's text.
 SCALE = 1.0
-#: Commands, and other characters; blanks separate them.
+#: Tokens of a formula: a command or a single character.
 TOKEN = re.compile(r"\\(?:[A-Za-z]+|.)|\S")
 OPENING, CLOSING = ("{", "(", "[", r"\left"), ("}", ")", "]", r"\right")
-RELATIONS = ("=", "<", ">", *(rf"\{name}" for name in ("leq", "geq", "approx", "equiv", "in", "to", "mapsto", "quad")))
+BREAK_AFTER = (
+    "=",
+    "<",
+    ">",
+    *(rf"\{name}" for name in ("leq", "geq", "approx", "equiv", "in", "to", "mapsto", "quad")),
+)
 COMMANDS = {Path.MOVETO: "M", Path.LINETO: "L", Path.CURVE3: "Q", Path.CURVE4: "C", Path.CLOSEPOLY: "Z"}
 
 
-def parts(formula: str) -> list[str]:
+def split_at_breaks(formula: str) -> list[str]:
     """Return the parts of a formula between which a line may break: after relations and signs outside brackets."""
     found, depth, begin, last = [], 0, 0, ""
     for token in TOKEN.finditer(formula):
         text = token.group()
         depth += (text in OPENING) - (text in CLOSING)
         is_sign = text in "+-" and last not in ("^", "_") and formula[begin : token.start()].strip()
-        if not depth and (text in RELATIONS or is_sign):
+        if not depth and (text in BREAK_AFTER or is_sign):
             found.append(formula[begin : token.end()])
             begin = token.end()
         last = text
-    return [*found, formula[begin:]]
+    return [part for part in (*found, formula[begin:]) if part.strip()]
 
 
 def draw(formula: str) -> str:
-    """Return the parts of a formula, as SVG each."""
-    return "".join(draw_part(part) for part in parts(" ".join(formula.split())))
+    """Return a formula as a sequence of SVG drawings, between which a line may break."""
+    return "".join(draw_part(part) for part in split_at_breaks(" ".join(formula.split())))
 
 
 def draw_part(formula: str) -> str:
-    """Return a formula without breaks as SVG, aligned with the baseline of the text."""
+    """Return a part of a formula as one SVG drawing, aligned with the baseline of the text."""
     font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")
     text = f"${formula}$"
     width, height, depth, *_ = MathTextParser("path").parse(text, dpi=72, prop=font)
@@ -74,7 +79,7 @@ def in_line(self: HTML5Translator, node: nodes.math) -> None:
 
 
 def in_block(self: HTML5Translator, node: nodes.math_block) -> None:
-    """Write formulas in a block of their own, one drawing per line."""
+    """Write formulas in a block of their own, one formula per line."""
     lines = "<br/>".join(draw(part) for part in node.astext().replace("\\frac", "\\dfrac").split("\\\\"))
     self.body.append(f'<div class="formula">{lines}</div>')
 

@@ -1,4 +1,4 @@
-"""Tables of the pages on narrow screens: every row is a block whose cells state the heads of their columns."""
+"""Tables on narrow screens: each row becomes a block whose cells repeat their column headers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from sphinx.transforms.post_transforms import SphinxPostTransform
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
-#: Tables of this many columns are stacked; fewer columns fit a telephone's screen side by side.
+#: Minimum number of columns of a table that is stacked; tables with fewer columns fit a narrow screen.
 STACKED_MIN_COLUMNS = 3
-#: Characters of the longest cell from which on a column takes a line of its own, not a share of one.
+#: Length of the longest cell [characters] from which a column fills a whole line of the block.
 LONG_CELL_CHARS = 20
 
 
 class StackedRows(SphinxPostTransform):
-    """Copies of the heads of the columns in the cells of each row, which pages.css shows on narrow screens only."""
+    """Transform that copies the column headers into the cells of each row; pages.css shows them on narrow screens."""
 
     default_priority = 900
     formats = ("html",)
@@ -26,15 +26,16 @@ class StackedRows(SphinxPostTransform):
         """Mark the tables of a page."""
         for table in self.document.findall(nodes.table):
             heads, *rows = ([*row.findall(nodes.entry)] for row in table.findall(nodes.row))
-            if len(heads) < STACKED_MIN_COLUMNS or not any(table.findall(nodes.thead)):
+            if len(heads) < STACKED_MIN_COLUMNS or not table.next_node(nodes.thead) or len({*map(len, rows)}) > 1:
+                # A table with few columns, without headers or with merged cells stays as it is.
                 continue
             table["classes"].append("stacked")
             for head, *column in list(zip(heads, *rows, strict=True))[1:]:
                 is_long = max((len(cell.astext()) for cell in column), default=0) >= LONG_CELL_CHARS
                 for cell in column:
                     cell["classes"] += ["long"] * is_long + ["empty"] * (not cell.astext())
-                    written = [child.deepcopy() for part in head.children for child in part.children]
-                    cell.insert(0, nodes.paragraph("", "", *written, classes=["head"]))
+                    header_nodes = [child.deepcopy() for part in head.children for child in part.children]
+                    cell.insert(0, nodes.paragraph("", "", *header_nodes, classes=["head"]))
 
 
 def setup(app: Sphinx) -> None:

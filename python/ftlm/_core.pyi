@@ -408,8 +408,8 @@ class _JointFit(TypedDict):
     left: list[_Matrix]
     #: (number of down-weighted residuals, number of outliers, number of residuals); None without a robust loss.
     robust: tuple[int, int, int] | None
-    #: Share of the information on a parameter that its prior contributes, for each prior in the sequence of parameters.
-    prior_shares: list[float]
+    #: Fraction of the information on a parameter that its prior contributes, one per prior, in the order of parameters.
+    prior_fractions: list[float]
     on_grid: _Vector
     #: Estimated initial states of each run, for models with friction.
     states: list[list[float]]
@@ -500,7 +500,7 @@ def cost_surface(
 ) -> tuple[float, _Vector, _Vector, _Matrix]: ...
 def covariance_of(jacobian: _Floats, series: Sequence[_Floats], squares: float) -> _Matrix: ...
 def fit_covariance(
-    jacobian: _Floats, series: Sequence[_Floats], shares: _Floats | None, priors: int = 0
+    jacobian: _Floats, series: Sequence[_Floats], robust_weights: _Floats | None, priors: int = 0
 ) -> _Matrix: ...
 def long_run_covariance(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
 def prediction_ratio(

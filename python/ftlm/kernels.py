@@ -803,7 +803,7 @@ def _with_kernels(
     name: str,
     vectors: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Broadcast kernels against vectors, and return ``work(kernels, rows, kernel index of each row)`` reshaped."""
+    """Broadcast kernels against vectors, and return ``function(kernels, rows, kernel index of each row)`` reshaped."""
     columns, shape = _rows("kernel", kernel)
     values = finite_floats(name, vectors)
     m = _length(name, values)

@@ -99,7 +99,7 @@ pub(super) struct Point {
 }
 
 impl Point {
-    /// Value of a parameter, numbered as orders, then coefficients, then input parameters; NaN if it does not exist.
+    /// Value of the parameter with this index, in the order: orders, coefficients, input parameters; NaN if there is none.
     pub(super) fn value(&self, parameter: usize) -> f64 {
         let mut values = self.orders.iter().chain(&self.coefficients).chain(&self.inputs);
         values.nth(parameter).copied().unwrap_or(f64::NAN)

@@ -251,7 +251,7 @@ def test_a_profile_interval_ends_at_a_user_bound():
         ("R0-p(R1-C1)", {}, "joins two or more elements in parallel"),
         ("R0-p(R1,C1))", {}, r"'\)' is out of place"),
         ("R0-", {}, "ends where an element is expected"),
-        ("R0+C1+C2", {}, r"has the invalid character '\+', 2 in all; write it as in"),
+        ("R0+C1+C2", {}, r"contains invalid characters \(2, first '\+'\); write it as in"),
         ("R0-P(R1,C1)", {}, r"write p\( before elements in parallel"),
         ("R0-(R1,C1)", {}, r"write p\( before elements in parallel"),
         ("Rs-p(R1,C1)", {}, "'Rs' is not an element; a name is a kind and a number, such as R1"),

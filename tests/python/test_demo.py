@@ -51,7 +51,7 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_measured_and_simulated(t
     assert bars.count(f"{PULSE_FIT_TITLE} of") >= 4
     assert f"{mean:.2f}" in bars
     assert f"{sampled:.2f}" not in bars
-    assert "Verdicts and charts of measured and simulated angles state the fit to every sample." in bars
+    assert "Verdicts and charts of measured and simulated angles give the fit to all samples" in bars
     assert f"fit {sampled:.3f} %" in charts
     assert f"theta11 {sampled:.2f} %" in demo_text(demo)
     assert sum("fits to pulse means" in line and "verdicts have fits to every sample" in line for line in lines) == 1

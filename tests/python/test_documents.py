@@ -239,11 +239,11 @@ def test_every_formula_of_the_pages_is_drawn(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_lines_break_in_formulas_after_relations_and_signs_outside_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    from formulas import parts
+    from formulas import split_at_breaks
 
     formula = r"D^\alpha y = -\frac{a + b}{2} (c - d) + e_{i+1} \leq \left(f - g\right)^+ u"
     broken = [r"D^\alpha y =", r" -\frac{a + b}{2} (c - d) +", r" e_{i+1} \leq", r" \left(f - g\right)^+ u"]
-    assert parts(formula) == broken
+    assert split_at_breaks(formula) == broken
 
 
 def test_the_reference_names_every_public_name() -> None:

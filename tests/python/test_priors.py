@@ -1,4 +1,4 @@
-"""Normal priors of parameters beside the maximum of the posterior density that SciPy finds by its own simulation."""
+"""Normal priors of parameters, compared with the posterior mode that SciPy finds from the exact response."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def oscillator(a1: float, a0: float, b: float) -> np.ndarray:
     """Return exact samples of the oscillator for a held input."""
     whole = expm(STEP * np.array([[0, 1, 0], [a0, a1, b], [0, 0, 0]]))
     states = [np.zeros(2)]
-    for held in INPUT[:-1]:
-        states.append(whole[:2, :2] @ states[-1] + whole[:2, 2] * held)
+    for input_value in INPUT[:-1]:
+        states.append(whole[:2, :2] @ states[-1] + whole[:2, 2] * input_value)
     return np.array(states)[:, 0]
 
 
@@ -45,11 +45,11 @@ def errors(found: ftlm.Identification, names: tuple[str, ...] = tuple(TRUTH)) ->
     return [found.parameters[n].standard_error for n in names]
 
 
-def assert_prior_is_fixed(sharp: ftlm.Identification, fixed: ftlm.Identification) -> None:
-    """Check that a sharp prior gives the estimates and the standard errors of a fit with a fixed value."""
+def assert_same_as_fixed(narrow: ftlm.Identification, fixed: ftlm.Identification) -> None:
+    """Check that a narrow prior gives the estimates and the standard errors of a fit with a fixed value."""
     names = tuple(fixed.parameters)
-    assert np.abs(np.subtract(values(sharp, names), values(fixed, names)) / errors(fixed, names)).max() < 0.05
-    assert errors(sharp, names) == pytest.approx(errors(fixed, names), rel=0.02)
+    assert np.abs(np.subtract(values(narrow, names), values(fixed, names)) / errors(fixed, names)).max() < 0.05
+    assert errors(narrow, names) == pytest.approx(errors(fixed, names), rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -78,19 +78,19 @@ def test_the_estimate_is_the_maximum_of_the_posterior_and_its_errors_are_the_inv
 
 
 def test_standardized_errors_of_drawn_parameters_have_unit_mean_square():
-    """Parameters are drawn from the prior, with which the posterior is calibrated."""
+    """If true parameters are drawn from the prior, errors over posterior deviations have unit variance."""
     squares = []
     random = np.random.default_rng(5)
     prior = {"a1": (-0.05, 0.02), "b": (3.0, 0.05)}
-    for _ in range(40):
+    for _ in range(24):
         truth = {**TRUTH, **{n: mean + s * random.standard_normal() for n, (mean, s) in prior.items()}}
         y = oscillator(**truth) + 0.5 * random.standard_normal(COUNT)
         run = ftlm.Run.from_arrays(outputs={"y": y}, inputs={"u": INPUT}, step=STEP)
         method = ftlm.OutputError(priors=prior, start=TRUTH, intervals="quadratic")
         found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", method=method)
         squares.append(np.square((np.array(values(found)) - [*truth.values()]) / errors(found)))
-    # Mean of 120 squares of normal numbers, of which those of a0 and b are correlated.
-    assert 0.7 < np.mean(squares) < 1.35
+    # Mean of 72 squared standard normal variables; those of a0 and b are correlated.
+    assert 0.6 < np.mean(squares) < 1.45
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_standardized_errors_of_drawn_parameters_have_unit_mean_square():
     ],
     ids=["linear", "huber", "autoregression", "cube", "delay"],
 )
-def test_a_sharp_prior_is_a_fixed_value_and_a_vague_one_changes_nothing(structure, options):
+def test_a_narrow_prior_is_a_fixed_value_and_a_wide_one_changes_nothing(structure, options):
     rng = np.random.default_rng(2)
     delay = {"u": 0.06} if "0:0.2" in structure else {}
     model = ftlm.Model(ftlm.equation("D^0.8 y = -1.5 y + 2 u", delay=delay))
@@ -112,18 +112,18 @@ def test_a_sharp_prior_is_a_fixed_value_and_a_vague_one_changes_nothing(structur
     y = model.simulate(ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": 0 * u}, step=0.04))["y"]
     y = y + 0.01 * rng.standard_normal(u.size)
     run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.04)
-    sharp = ftlm.identify(run, structure, priors={"alpha": (0.75, 1e-7)}, **options)
+    narrow = ftlm.identify(run, structure, priors={"alpha": (0.75, 1e-7)}, **options)
     fixed = ftlm.identify(run, structure.replace("alpha", "0.75"), **options)
-    assert sharp.parameters["alpha"].value == pytest.approx(0.75, abs=1e-5)
-    assert_prior_is_fixed(sharp, fixed)
+    assert narrow.parameters["alpha"].value == pytest.approx(0.75, abs=1e-5)
+    assert_same_as_fixed(narrow, fixed)
     free = ftlm.identify(run, structure, **options)
-    vague = ftlm.identify(run, structure, priors={n: (p.value, 1e4) for n, p in free.parameters.items()}, **options)
+    wide = ftlm.identify(run, structure, priors={n: (p.value, 1e4) for n, p in free.parameters.items()}, **options)
     names = tuple(free.parameters)
-    assert np.abs(np.subtract(values(vague, names), values(free, names)) / errors(free, names)).max() < 0.02
-    assert errors(vague, names) == pytest.approx(errors(free, names), rel=0.02)
+    assert np.abs(np.subtract(values(wide, names), values(free, names)) / errors(free, names)).max() < 0.02
+    assert errors(wide, names) == pytest.approx(errors(free, names), rel=0.02)
 
 
-def test_a_sharp_prior_of_friction_is_a_fixed_friction():
+def test_a_narrow_prior_of_friction_is_a_fixed_friction():
     rng, step, position, speed, rows = np.random.default_rng(0), 0.01, 0.0, 0.0, []
     force = np.repeat(rng.choice([-3.0, 0.0, 3.0], 30), 20)
     for applied in force:
@@ -131,13 +131,13 @@ def test_a_sharp_prior_of_friction_is_a_fixed_friction():
         for _ in range(20):
             drive = applied - 0.5 * speed
             friction = 0.8 * np.sign(speed) if speed else np.clip(drive, -0.8, 0.8)
-            following = speed + step / 20 * (drive - friction)
-            speed = 0.0 if speed * following < 0 else following
+            next_speed = speed + step / 20 * (drive - friction)
+            speed = 0.0 if speed * next_speed < 0 else next_speed
             position += step / 20 * speed
     y = np.array(rows) + 1e-3 * rng.standard_normal(force.size)
     run = ftlm.Run.from_arrays(inputs={"u": force}, outputs={"y": y}, step=step)
-    sharp = ftlm.identify(run, "D^2 y = -a D y + b u - fc*sign(D y)", priors={"fc": (0.7, 1e-6)})
-    assert_prior_is_fixed(sharp, ftlm.identify(run, "D^2 y = -a D y + b u - 0.7*sign(D y)"))
+    narrow = ftlm.identify(run, "D^2 y = -a D y + b u - fc*sign(D y)", priors={"fc": (0.7, 1e-6)})
+    assert_same_as_fixed(narrow, ftlm.identify(run, "D^2 y = -a D y + b u - 0.7*sign(D y)"))
 
 
 @pytest.mark.parametrize("coupling", ["simulated", "measured"])
@@ -147,9 +147,9 @@ def test_a_prior_holds_in_coupled_equations(coupling):
     system[:4, :4] = [[0, 1, 0, 0], [-9, -0.3, 2, 0], [0, 0, 0, 1], [1, 0, -4, -0.2]]
     system[1, 4] = 3.0
     transition, u = expm(step * system), np.repeat(rng.choice([-1.0, 1.0], 40), 15)
-    for held in u:
+    for input_value in u:
         rows.append(state[[0, 2]])
-        state = transition @ [*state[:4], held]
+        state = transition @ [*state[:4], input_value]
     y, z = np.transpose(rows) + [[0.01], [0.002]] * rng.standard_normal((2, u.size))
     run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y, "z": z}, step=step)
     second = ftlm.equation("D^2 z = d D z + e z + g y").equations[0]
@@ -158,12 +158,12 @@ def test_a_prior_holds_in_coupled_equations(coupling):
         first = ftlm.equation(f"D^2 y = a D y + c y + {k} z + b u")
         return replace(first, equations=(first.equations[0], second), coupling=coupling)
 
-    sharp = ftlm.identify(run, structure("k"), offset="none", priors={"k": (1.8, 1e-7)})
-    assert_prior_is_fixed(sharp, ftlm.identify(run, structure("1.8"), offset="none"))
+    narrow = ftlm.identify(run, structure("k"), offset="none", priors={"k": (1.8, 1e-7)})
+    assert_same_as_fixed(narrow, ftlm.identify(run, structure("1.8"), offset="none"))
 
 
 def test_a_prior_contributes_what_a_short_run_lacks():
-    """In 40 rows, damping is hardly visible; the same record and a prior determine it."""
+    """In 40 rows the damping is poorly identifiable; a prior in addition determines it."""
     run = noisy(1, 0.02, 40)
     alone = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none")
     found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", priors={"a1": (-0.05, 0.005)})
@@ -190,28 +190,28 @@ def test_a_prior_that_the_runs_contradict_is_named(mean, contradicts):
         assert any("the runs contradict the prior of b" in reason for reason in found.verdict.reasons)
 
 
-def test_the_distance_of_a_true_prior_is_a_normal_number():
-    """Means are drawn around the truth; the estimate without the prior is then as far from them as computed."""
+def test_a_correct_prior_rarely_contradicts_the_runs():
+    """Prior means are drawn around the true value; a finding is then a false alarm."""
     random, exceeded = np.random.default_rng(8), []
-    for seed in range(60):
+    for seed in range(30):
         run, mean = noisy(seed, 0.5), 3.0 + 0.05 * random.standard_normal()
         method = ftlm.OutputError(priors={"b": (mean, 0.05)}, start=TRUTH, intervals="quadratic")
         found = ftlm.identify(run, OSCILLATOR, initial="rest", offset="none", method=method)
         exceeded += [f.code for f in found.findings if f.code == "prior_contradicts_runs"]
-    assert len(exceeded) <= 2
+    assert len(exceeded) <= 1
 
 
 def test_the_command_line_has_priors(tmp_path):
     run = noisy(0, 0.5)
     run.to_csv(tmp_path / "run.csv")
-    called = ["identify", str(tmp_path / "run.csv"), "--structure", OSCILLATOR, "--priors", "b=3.2:0.05"]
-    done = CliRunner().invoke(app, [*called, "-u", "u", "-y", "y"])
-    assert done.exit_code == 0, done.output
+    arguments = ["identify", str(tmp_path / "run.csv"), "--structure", OSCILLATOR, "--priors", "b=3.2:0.05"]
+    outcome = CliRunner().invoke(app, [*arguments, "-u", "u", "-y", "y"])
+    assert outcome.exit_code == 0, outcome.output
     expected = ftlm.identify(run, OSCILLATOR, priors={"b": (3.2, 0.05)}).parameters["b"].value
-    assert f"b = {expected:.3f}: its prior 3.2 ± 0.05" in done.output
-    done = CliRunner().invoke(app, [*called[:-1], "b=3.2", "-u", "u", "-y", "y"])
-    assert done.exit_code != 0
-    assert "prior of b = 3.2 is not a finite mean and a positive standard deviation" in done.output.replace("\n", " ")
+    assert f"b = {expected:.3f}: its prior 3.2 ± 0.05 contributes" in outcome.output
+    outcome = CliRunner().invoke(app, [*arguments[:-1], "b=3.2", "-u", "u", "-y", "y"])
+    assert outcome.exit_code != 0
+    assert "'3.2' is not MEAN:DEVIATION; write it as in 2:0.1" in outcome.output.replace("\n", " ")
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_the_command_line_has_priors(tmp_path):
         ({"b": (0, math.inf)}, {}, "is not a finite mean"),
         ([("b", 1)], {}, "priors = .* is not a mapping; write"),
         ({"b": (0, 1)}, {"method": "least-squares"}, "priors= is not used by method='least-squares'"),
-        ({"b": (0, 1)}, {"method": ftlm.OutputError(reference="r")}, "priors= needs a cost that has its minimum"),
+        ({"b": (0, 1)}, {"method": ftlm.OutputError(reference="r")}, "priors= cannot be used with reference="),
     ],
 )
 def test_invalid_priors_are_refused(priors, options, words):

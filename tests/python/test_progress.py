@@ -211,8 +211,8 @@ ASKED = {
         "run.csv -u u -y y --increment 0.1 --structure",
         "D^alpha y = a0 y + b0 u",
     ),
-    "consistency": ("fitting all segments", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
-    "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "consistency": ("the fits of all segments", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "select": ("the selection of a structure", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
     "search": ("the search", "run.csv -u u -y y --increment 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
     "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),
     "design-input": ("the design", "model.json --peak 1 --duration 5 --step", "0.05"),
@@ -271,7 +271,7 @@ def test_cross_validate_orders_says_how_long_all_of_their_fits_take(monkeypatch,
     with pytest.raises(SystemExit, match="begun"):
         unseen.cross_validate_orders(runs, threads=1, progress=Progress(""))
     ((words, least, most),) = estimates
-    assert words == "all of it"
+    assert words == "the cross-validation"
     # Thirty-two fits of some ten numbers.
     assert 0.4 < least < most < math.inf
 

@@ -117,7 +117,8 @@ def select_structure(
     seconds = sum(fit_seconds(runs, candidate, threads) for candidate in largest)
     with Progress("fitting candidates", quiet=quiet) as progress:
         progress.announce(
-            "choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if is_listed else STEPWISE_TIME_FACTORS)
+            "the selection of a structure",
+            *duration_bounds(seconds, LIST_TIME_FACTORS if is_listed else STEPWISE_TIME_FACTORS),
         )
         return choice.select(
             runs,
@@ -661,7 +662,7 @@ def consistency(
     method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting segments", quiet=as_json) as progress:
         count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
-        progress.announce("fitting all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
+        progress.announce("the fits of all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
         result = consistency_module.consistency(
             runs, target, segments=segments, method=method, threads=threads, progress=progress
         )

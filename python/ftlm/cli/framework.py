@@ -62,16 +62,16 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
 
     Raise ModelError for other text.
     """
-    description, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
-    pair_form = "MEAN:DEVIATION" if option == "--priors" else "LOW:HIGH"
+    forms = {
+        "--delay": "neither seconds nor LOW:HIGH; give one, such as 0:0.02",
+        "--priors": "not MEAN:DEVIATION; write it as in 2:0.1",
+    }
+    problem = forms.get(option, "neither a number nor LOW:HIGH; give one, such as 0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, texts).items():
         bounds = split_numbers(value)
-        if len(bounds) not in (1, 2):
-            raise ModelError(
-                f"{option} {name}={value}: {value!r} is neither {description} nor {pair_form}; give one, such as "
-                f"{example}"
-            )
+        if len(bounds) not in ((2,) if option == "--priors" else (1, 2)):
+            raise ModelError(f"{option} {name}={value}: {value!r} is {problem}")
         values[name] = bounds[0] if len(bounds) == 1 else (bounds[0], bounds[1])
     return values
 

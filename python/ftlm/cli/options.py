@@ -335,7 +335,7 @@ class OutputErrorOptions(MethodOptions):
     noise
         Noise of the output; ar: an autoregression; default white.
     priors : NAME=MEAN:DEVIATION
-        Mean and standard deviation of a parameter before the fit.
+        Normal prior of a parameter: its mean and standard deviation.
     """
 
     loss: Loss | None = None

@@ -110,7 +110,7 @@ def reproduce(
     records
         Records per arm, with different noise.
     comparison_increment
-        Minimum order increment in the genetic comparison.
+        Minimum order increment in the comparison of optimizers.
     """
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)

@@ -214,7 +214,7 @@ class RunArguments:
         common = [signal for signal in self.inputs if signal in self.outputs]
         if common:
             raise DataError(
-                f"signal {common[0]!r} is both an input and an output, {len(common)} in all; give it two names"
+                f"signal {common[0]!r} is both an input and an output ({len(common)} in all); use different names"
             )
         if not self.outputs:
             raise DataError(f"{parameter('outputs')}: no output is given; name at least one output")

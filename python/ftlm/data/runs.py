@@ -69,7 +69,7 @@ class Runs(tuple[Run, ...]):
         return Runs, (tuple(self),)
 
     def get_or_compute(self, key: str, compute: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
-        """Return the cached items for a key; if there are none, collect the items of ``make()`` and cache them.
+        """Return the cached items for a key; if there are none, collect the items of ``compute()`` and cache them.
 
         The oldest result is removed when the cache is full.
         """

@@ -178,15 +178,26 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     level_suffices = structure.is_linear and not structure.integrates
     if level_suffices or has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
         return None
+    # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a constant.
+    margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
+
+    def is_better(candidate: JointFit, *, joint: JointFit = fit.joint) -> bool:
+        return fits_better(candidate, joint, margin)
+
     request = replace(structure, offset="constant")
     try:
+        has_history = isinstance(fit.joint.initial, History)
+        if structure.is_linear and fits.complete_fit is not None and not has_history:
+            # A missing constant improves the fit near any optimum, so that automatic initial guesses can wait for this.
+            # With a history, the constant may replace its powers of t instead.
+            nearby = replace(request, initial=fit.joint.initial)
+            if fits.refit(nearby, fit, is_better) is None:
+                return None
         candidate = fits.fit(request)
     except FtlmError:
         return None
     joint = candidate.joint
-    # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a constant.
-    margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
-    if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
+    if joint is None or joint.unstable_optimum is not None or not is_better(joint):
         return None
     complete_fit = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}

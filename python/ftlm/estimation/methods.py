@@ -24,8 +24,8 @@ from ftlm.estimation.prior_knowledge import (
     Bounds,
     Priors,
     check_bounds,
-    check_distributions,
     check_intervals,
+    check_priors,
     fit_within_bounds,
     prior_findings,
     with_priors,
@@ -258,9 +258,10 @@ class OutputError:
         (lower, upper) of coefficients and orders by name; infinite without a bound on that side. A coefficient that
         ends on a bound is fixed at the bound, has no confidence interval, and is named by a finding.
     priors
-        (mean, standard deviation) of normal priors of orders, coefficients, delays and limits by name. The estimate
-        maximizes the posterior density, and its intervals include the priors. Findings name a prior that the runs
-        contradict by more than three standard deviations, and a parameter that its prior determines.
+        (mean, standard deviation) of normal priors of orders, coefficients, delays and actuator limits by name. The
+        estimate maximizes the posterior density, and its intervals include the priors. Findings name a prior whose mean
+        differs by more than three standard deviations from the estimate without it, and a parameter that its prior
+        determines.
 
     Raises
     ------
@@ -283,7 +284,7 @@ class OutputError:
         check_choice("intervals", self.intervals, get_args(Intervals))
         check_choice("noise", self.noise, get_args(Noise))
         check_intervals(self.bounds or {})
-        check_distributions(self.priors or {})
+        check_priors(self.priors or {})
         if not (self.start is None or isinstance(self.start, (Identification, Model, Mapping))):
             raise ModelError(
                 f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
@@ -297,8 +298,8 @@ class OutputError:
             )
         if self.priors and self.reference is not None:
             raise ModelError(
-                f"{parameter('priors')} needs a cost that has its minimum at the estimate, and "
-                f"{parameter('reference')} has none; leave one of the two out"
+                f"{parameter('priors')} cannot be used with {parameter('reference')}: an instrumental-variable "
+                "estimate minimizes no cost to which a prior could be added; leave one of the two out"
             )
         if self.noise == "ar" and (self.reference is not None or self.intervals == "profile" or self.loss != "squares"):
             conflicting_option = (

@@ -172,9 +172,9 @@ class JointFit:
         95 % profile-likelihood intervals of the parameters that have one.
     unstable_optimum
         Comparison of an unstable optimum with a stable one; None if the optimum is stable.
-    prior_shares
-        Share of the information on a parameter that its prior contributes, by name: the variance of the posterior for
-        white noise divided by that of the prior.
+    prior_fractions
+        Fraction of the information on a parameter that its prior contributes, by name: posterior variance, computed for
+        white noise, divided by the prior variance.
     """
 
     orders: dict[str, float]
@@ -199,7 +199,7 @@ class JointFit:
     survivors: Sequence[tuple[float, Sequence[float]]] = field(default=(), repr=False)
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
     unstable_optimum: UnstableOptimum | None = None
-    prior_shares: Mapping[str, float] = field(default_factory=dict)
+    prior_fractions: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def values_by_name(self) -> dict[str, float]:
@@ -374,7 +374,7 @@ def fit_output_error(
         initial=structure.initial,
         initial_terms=result["initial_terms"] + level_count(runs, structure),
         unstable_optimum=None if result["growth"] is None else UnstableOptimum(*result["growth"]),
-        prior_shares=dict(zip((n for n in problem.names if n in priors), result["prior_shares"], strict=True)),
+        prior_fractions=dict(zip((n for n in problem.names if n in priors), result["prior_fractions"], strict=True)),
     )
 
 

@@ -42,7 +42,7 @@ def check_intervals(bounds: object, *, finite: bool = False) -> None:
             )
 
 
-def check_distributions(priors: object) -> None:
+def check_priors(priors: object) -> None:
     """Raise ModelError unless `priors` maps names to pairs of a finite mean and a positive standard deviation."""
     if not isinstance(priors, Mapping):
         raise ModelError(f"priors = {priors!r} is not a mapping; write {{name: (mean, standard deviation)}}")
@@ -55,8 +55,8 @@ def check_distributions(priors: object) -> None:
             )
 
 
-def _check_independent(option: str, names: Iterable[str], structure: Structure) -> None:
-    """Raise ModelError for a coefficient that follows from a coefficient law, and so is not a free parameter."""
+def _check_not_in_law(option: str, names: Iterable[str], structure: Structure) -> None:
+    """Raise ModelError for a name that a coefficient law determines; such a coefficient is not a free parameter."""
     laws = {name: (factor, factors) for name, factor, factors in structure.coefficient_law}
     for name in names:
         if name in laws:
@@ -77,10 +77,10 @@ def with_priors(structure: Structure, priors: Priors | None) -> Structure:
     ModelError
         If a name is not a free parameter, or a prior is not a pair of a finite mean and a positive deviation.
     """
-    check_distributions(priors or {})
+    check_priors(priors or {})
     if not priors:
         return structure
-    _check_independent("priors", priors, structure)
+    _check_not_in_law("priors", priors, structure)
     check_known("prior of", priors, FreeProblem.of(replace(structure, initial="rest", offset="none")).names)
     return replace(
         structure, priors={name: (float(mean), float(deviation)) for name, (mean, deviation) in priors.items()}
@@ -90,25 +90,25 @@ def with_priors(structure: Structure, priors: Priors | None) -> Structure:
 #: Distance of the estimate without a prior from the mean of the prior, in standard deviations of their difference,
 #: above which the two disagree.
 MAX_PRIOR_DISTANCE = 3.0
-#: Share of the information on a parameter above which its prior determines it.
-DETERMINING_SHARE = 0.5
+#: Fraction of the information on a parameter above which its prior determines it.
+DETERMINING_FRACTION = 0.5
 
 
 def prior_findings(priors: Priors, joint: JointFit) -> list[Finding]:
     """Return findings on priors that the runs contradict, and on parameters that the priors determine.
 
-    If a prior of variance s² contributes the share w of the information, the estimate without it differs from the mean
-    of the prior by (estimate - mean) / (1 - w), and the variance of this difference is s² / (1 - w).
+    Let e be the estimate, and w the fraction of the information that its prior (mean m, variance s²) contributes. The
+    estimate without the prior differs from m by (e - m) / (1 - w), and the variance of this difference is s² / (1 - w).
     """
     findings = []
-    for name, share in joint.prior_shares.items():
+    for name, fraction in joint.prior_fractions.items():
         (mean, deviation), value = priors[name], joint.values_by_name[name]
         numbers = {"parameter": name, "value": value, "mean": mean, "deviation": deviation}
-        distance = abs(value - mean) / (deviation * math.sqrt(1.0 - share)) if share < 1.0 else 0.0
+        distance = abs(value - mean) / (deviation * math.sqrt(1.0 - fraction)) if fraction < 1.0 else 0.0
         if distance > MAX_PRIOR_DISTANCE:
             findings.append(make_finding("prior_contradicts_runs", distance=distance, **numbers))
-        if share > DETERMINING_SHARE:
-            findings.append(make_finding("prior_determines_parameter", share=100.0 * share, **numbers))
+        if fraction > DETERMINING_FRACTION:
+            findings.append(make_finding("prior_determines_parameter", share=100.0 * fraction, **numbers))
     return findings
 
 
@@ -124,7 +124,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     check_intervals(bounds or {})
     out, limits = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
-    _check_independent("bounds", limits, structure)
+    _check_not_in_law("bounds", limits, structure)
     laws = {name for name, _, _ in structure.coefficient_law}
     free = [n for n in structure.coefficient_names if n not in laws]
     check_known("bound of", limits, [*free, *structure.order_names, *inputs])

@@ -58,7 +58,7 @@ def scaled_design(
 def exchange_holds(
     initial: Design, hold: int, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
 ) -> Design:
-    """Return the candidate input to which the exchange algorithm improves the candidate input `initial`.
+    """Return the locally optimal input that the exchange algorithm finds from the candidate input `initial`.
 
     A hold is an interval of `hold` samples with constant input. First, `initial` is rounded to the levels -1, 0 and 1
     times the peak. An exchange then changes the level of one hold, or of two holds by opposite amounts. The Fisher

@@ -179,22 +179,22 @@ class DesignedInput:
             f"{', '.join(self.run.inputs)}: {self.shape}, {self.run.duration:.6g} s in steps of {self.step:.6g} s, "
             f"{self.criterion}-optimal for {', '.join(self.parameters)}",
             "",
-            f"  {'standard error of':<18}{'now':>12}{'square':>12}{'designed':>12}{'combined':>12}{'ratio':>15}",
+            f"  {'standard error of':<18}{'now':>12}{'square':>12}{'designed':>12}{'combined':>12}"
+            f"{'square/designed':>17}",
         ]
         for name, value in self.values.items():
             now, square_error, new, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
             mark = "*" if name in self.parameters else " "
             ratio = square_error / new if new > 0 else math.nan
             cells = "".join(f"{format_bound(v):>12}" for v in (now, square_error, new, both))
-            lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>15.2f}")
+            lines.append(f"{mark} {f'{name} = {value:.6g}':<18}{cells}{ratio:>17.2f}")
         lines += [
             "",
             f"parameters marked *: the product of their intervals is {self.gain:.3g} times smaller than with a "
             f"{square} of the same duration and peak",
             f"limits: {'; '.join(map(str, self.predicted_extremes))}",
-            f"the designed input has {100 * self.efficiency:.0f} % of the precision of the best periodic input in "
-            f"steady state within these limits, which is known to {100 * self.spectrum.gap:.2g} % (a start from rest "
-            "adds information)",
+            f"precision: {100 * self.efficiency:.0f} % of that of the best periodic input in steady state within these "
+            f"limits (upper bound, computed to {100 * self.spectrum.gap:.2g} %; a start from rest adds information)",
             "candidates: "
             + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:MAX_PRINTED_INPUTS])
             + (f" and {len(self.gains) - MAX_PRINTED_INPUTS} more" if len(self.gains) > MAX_PRINTED_INPUTS else "")

@@ -144,7 +144,8 @@ def plane_order(model: Model) -> float:
 class BodeCurve:
     """Gain [dB] and phase [degrees] over frequency from one input to one output.
 
-    The bands are half-widths of the 95 % confidence bands in the same units; None without a covariance.
+    `gain_band` and `phase_band` are half-widths of the 95 % confidence band in the same units, or None without a
+    covariance.
     """
 
     output: str

@@ -354,7 +354,7 @@ def cross_validate_orders(
         numbers = [len(s.order_names) + len(s.coefficient_names) for s in structures]
         each = sum(output_error_cost(run.length, count) for count in numbers for run in used)
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
-        progress.announce("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
+        progress.announce("the cross-validation", *duration_bounds(estimate_duration(fits, check_threads(threads))))
 
     def cross_validate(structure: Structure, suffix: str = "") -> Deflection:
         """Fit a structure with each set of free orders to every run; return the cross-validation of its output."""

@@ -40,7 +40,7 @@ TOP_CANDIDATES = 20
 TRACE_EVERY = 16
 #: Labels of the models that are saved, by the suffix of their file name.
 SAVED_MODELS = {"paper": f"p = {LAST_P}", "output-error": "output error"}
-#: Title of the bars of all models, whose fits differ from those of verdicts and charts, which are to every sample.
+#: Title of the bar charts; their fits refer to pulse means, those of verdicts and other charts to all samples.
 PULSE_FIT_TITLE = "Fit to pulse means"
 #: Labels of the models in the terminal summary. "p = 7" is multi-innovation with innovation length 7.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
@@ -198,7 +198,7 @@ def demo_text(demo: Demo) -> str:
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(texts)))
     lines += [
         "",
-        "The table has fits to pulse means, as in the paper; verdicts have fits to every sample.",
+        "The table shows fits to pulse means, as in the paper; verdicts state fits to all samples.",
     ]
     joint = [results["output error"] for results in demo.results.values()]
     lines += finding_lines([w for r in joint for w in r.findings], hint="-v")

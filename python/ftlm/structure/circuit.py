@@ -150,8 +150,8 @@ class Circuit:
         invalid = _TOKEN_PATTERN.sub("", text)
         if invalid:
             raise ModelError(
-                f"circuit {self.text!r} has the invalid character {invalid[0]!r}, {len(invalid)} in all; write it as "
-                "in 'R0-p(R1,CPE1)-W1', where - joins elements in series and p(…,…) in parallel"
+                f"circuit {self.text!r} contains invalid characters ({len(invalid)}, first {invalid[0]!r}); write it "
+                "as in 'R0-p(R1,CPE1)-W1', where - joins elements in series and p(…,…) in parallel"
             )
         names: set[str] = set()
 

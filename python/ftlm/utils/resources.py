@@ -208,7 +208,7 @@ def subprocess_arguments(script: Path, *arguments: str, site: bool = True) -> di
 
 
 def run_in_worker(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return ``work(*arguments)``; a worker process that calls this function ends when its parent process ends."""
+    """Return ``function(*arguments)``; a worker process that calls this function ends when its parent process ends."""
     # Tasks of a process pool run in the main thread, those of a thread pool do not.
     if threading.current_thread() is threading.main_thread():
         _end_with_parent(os.getpid())

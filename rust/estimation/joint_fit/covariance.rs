@@ -42,8 +42,8 @@ pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<
 /// `robust_weights` contains the robust weight of each column; it is None for a squared loss.
 ///
 /// # Errors
-/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals or `robust_weights` have
-/// another length than its rows. [`Error::Structure`] if its singular values are not found.
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if `robust_weights` has
+/// another length than its rows, or the residuals another length than its rows without `priors`. [`Error::Structure`] if its singular values are not found.
 pub fn robust_covariance(
     jacobian: &[Vec<f64>],
     series: Vec<Vec<f64>>,
@@ -58,11 +58,11 @@ pub fn robust_covariance(
         return covariance_of_residuals(jacobian, &series, squares(&series), priors);
     };
     jacobian.iter().try_for_each(|row| check_length("robust weights of residuals", row.len(), robust_weights.len()))?;
-    let (series, moving) = huber_pseudo_residuals(series, jacobian.len());
-    let compared = robust_weights.len().saturating_sub(priors);
+    let (series, unclipped_fraction) = huber_pseudo_residuals(series, jacobian.len());
+    let samples = robust_weights.len().saturating_sub(priors);
     // The curvature of the loss is that of least squares times the fraction of residuals that are not clipped.
     let unweighted = |(k, (value, &robust_weight)): (usize, (&f64, &f64))| {
-        let curvature = if k < compared { moving.sqrt() } else { 1.0 };
+        let curvature = if k < samples { unclipped_fraction.sqrt() } else { 1.0 };
         curvature * value / if robust_weight > 0.0 { robust_weight } else { 1.0 }
     };
     let rows: Vec<Vec<f64>> =
@@ -81,13 +81,16 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<
         0.0 => 1.0,
         level => level,
     };
-    let (most, count) = (HUBER_THRESHOLD * level, finite.len().max(1) as f64);
-    let moving = (finite.iter().filter(|e| e.abs() < most).count() as f64 / count).max(1.0 / count);
+    let (clip_level, count) = (HUBER_THRESHOLD * level, finite.len().max(1) as f64);
+    let unclipped_fraction = (finite.iter().filter(|e| e.abs() < clip_level).count() as f64 / count).max(1.0 / count);
     // Huber's small-sample correction.
-    let few = 1.0 + parameters as f64 / count * (1.0 - moving) / moving;
-    let scale = few / moving.sqrt();
-    series.iter_mut().flatten().for_each(|e| *e = if e.is_nan() { *e } else { e.clamp(-most, most) * scale });
-    (series, moving)
+    let small_sample_factor = 1.0 + parameters as f64 / count * (1.0 - unclipped_fraction) / unclipped_fraction;
+    let scale = small_sample_factor / unclipped_fraction.sqrt();
+    series
+        .iter_mut()
+        .flatten()
+        .for_each(|e| *e = if e.is_nan() { *e } else { e.clamp(-clip_level, clip_level) * scale });
+    (series, unclipped_fraction)
 }
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian, residuals and their sum of squares.
@@ -96,8 +99,8 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<
 /// are in standard deviations of the priors. `series` contains the residuals of samples by run and output, NaN for
 /// missing samples. `squares` is their sum of squares.
 ///
-/// With priors, the result is the mean square error of the estimate over noise and priors. For white noise, this is the
-/// covariance of the posterior distribution, linearized.
+/// With priors, the result is the mean square error of the estimate, averaged over the noise and over parameters drawn
+/// from the priors. For white noise, this is the linearized covariance of the posterior distribution.
 ///
 /// The computation uses the singular values of the Jacobian with rows scaled to unit norm, because the normal equations
 /// would lose half of the digits. Singular values at rounding level count as zero, and the corresponding parameter
@@ -106,7 +109,7 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if
-/// autocorrelated residuals have another length. [`Error::Structure`] if its singular values are not found.
+/// the length of autocorrelated residuals is not that of its rows without `priors`. [`Error::Structure`] if its singular values are not found.
 #[allow(clippy::cast_precision_loss)]
 pub fn covariance_of_residuals(
     jacobian: &[Vec<f64>],
@@ -157,20 +160,20 @@ pub fn covariance_of_residuals(
     // Rows of the pseudoinverse in the singular basis: the outer factor of the sandwich covariance.
     let inverse: Vec<Vec<f64>> =
         (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
-    let compared = count.saturating_sub(priors);
-    let prior_basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][compared..count]).collect();
+    let samples = count.saturating_sub(priors);
+    let prior_basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][samples..count]).collect();
     let prior_rows: Vec<Vec<f64>> =
-        inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, count - compared)).collect();
+        inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, count - samples)).collect();
     let from_priors = |at: usize| inner(&prior_rows[at / p], &prior_rows[at % p]);
     let mut middle: Vec<f64> = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
         // Number of parameters that the samples determine; the priors determine the others.
-        let degrees = p as f64 - prior_basis.iter().map(|row| inner(row, row)).sum::<f64>();
-        let level = squares / (finite_count as f64 - degrees).max(1.0);
+        let sample_degrees = p as f64 - prior_basis.iter().map(|row| inner(row, row)).sum::<f64>();
+        let level = squares / (finite_count as f64 - sample_degrees).max(1.0);
         (0..p * p).map(|at| level * (inner(&inverse[at / p], &inverse[at % p]) - from_priors(at))).collect()
     } else {
-        check_length("residuals", compared, series.iter().map(Vec::len).sum())?;
-        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..compared]).collect();
-        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, compared)).collect::<Vec<_>>();
+        check_length("residuals", samples, series.iter().map(Vec::len).sum())?;
+        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..samples]).collect();
+        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, samples)).collect::<Vec<_>>();
         widen_covariance(
             autoregressive_covariance(&pseudoinverse_rows, &basis, series),
             &long_run_covariance(&pseudoinverse_rows, series)?,

@@ -62,10 +62,10 @@ pub struct OptimumStatistics {
     pub residuals: Vec<Vec<Vec<f64>>>,
     /// Counts of downweighted residuals of a robust loss; None for a squared loss.
     pub robust: Option<RobustSummary>,
-    /// Share of the information on a parameter that its prior contributes, for each prior of the problem.
+    /// Fraction of the information on a parameter that its prior contributes, for each prior of the problem.
     ///
-    /// It is the variance of the posterior for white noise divided by that of the prior.
-    pub prior_shares: Vec<f64>,
+    /// It is the posterior variance, computed for white noise, divided by the prior variance.
+    pub prior_fractions: Vec<f64>,
 }
 
 /// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
@@ -245,7 +245,7 @@ impl<'a> Optimum<'a> {
             robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
             weights: grid.weights,
             pulses_per_sample: grid.sampling.pulses_per_sample,
-            prior_shares: prior_shares(&attempt, &grid.problem.model.priors),
+            prior_fractions: prior_fractions(&attempt, &grid.problem.model.priors),
             attempt,
             step_converged: has_converged,
             covariance,
@@ -253,8 +253,8 @@ impl<'a> Optimum<'a> {
     }
 }
 
-/// Return the share of each prior in the information on its parameter; NaN if this is not computable.
-fn prior_shares(attempt: &OptimizationResult, priors: &[Prior]) -> Vec<f64> {
+/// Return the fraction of the information on its parameter that each prior contributes; NaN if not computable.
+fn prior_fractions(attempt: &OptimizationResult, priors: &[Prior]) -> Vec<f64> {
     let size = attempt.jacobian.len();
     let posterior = covariance_of_residuals(&attempt.jacobian, &[], 1.0, priors.len()).unwrap_or_default();
     let variance = |parameter: usize| posterior.get(parameter * size + parameter).copied().unwrap_or(f64::NAN);

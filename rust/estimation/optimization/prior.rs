@@ -100,10 +100,13 @@ impl<P: LeastSquaresProblem> LeastSquaresProblem for ProblemWithPriors<'_, P> {
     }
 }
 
+/// Minimum of a problem, and its residuals followed by those of the priors.
+type PosteriorMode<P> = (Minimum<<P as LeastSquaresProblem>::Point, <P as LeastSquaresProblem>::Evaluation>, Vec<f64>);
+
 /// Minimize half the sum of squared residuals of a problem and its priors.
 ///
-/// `value` returns the value of a parameter at a point. No parameter with a prior may be eliminated by the evaluations
-/// of the problem. Return the minimum, and its residuals including those of the priors. The Jacobian includes the
+/// `value` returns the value of a parameter at a point. A parameter with a prior must not be eliminated (variable
+/// projection). Return the minimum and its residuals, followed by those of the priors. The Jacobian includes the
 /// derivatives of these residuals.
 ///
 /// # Errors
@@ -114,7 +117,7 @@ pub(crate) fn minimize_with_priors<P: LeastSquaresProblem>(
     value: fn(&P::Point, usize) -> f64,
     start: P::Point,
     settings: MinimizationSettings,
-) -> Result<(Minimum<P::Point, P::Evaluation>, Vec<f64>)> {
+) -> Result<PosteriorMode<P>> {
     if priors.is_empty() {
         let minimum = minimize(problem, start, settings)?;
         let residuals = problem.residuals(&minimum.evaluation).to_vec();

@@ -361,6 +361,7 @@ pub fn fit_until(
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
     // If at most one evaluation is allowed, no coefficient is eliminated.
     let mut linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
+    // Variable projection would ignore a prior.
     linear.retain(|&coefficient| !model.has_prior(coefficient));
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();

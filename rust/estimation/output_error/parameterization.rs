@@ -119,7 +119,7 @@ pub struct ParameterPoint {
 }
 
 impl ParameterPoint {
-    /// Value of a parameter, numbered as orders, then coefficients, then input parameters; NaN if it does not exist.
+    /// Value of the parameter with this index, in the order: orders, coefficients, input parameters; NaN if there is none.
     pub(crate) fn value(&self, parameter: usize) -> f64 {
         let mut values = self.orders.iter().chain(&self.coefficients).chain(&self.inputs);
         values.nth(parameter).copied().unwrap_or(f64::NAN)
@@ -141,7 +141,7 @@ pub struct FreeModel {
     pub coupled: bool,
     /// Initial terms of each record.
     pub initial: Initial,
-    /// Normal priors of free parameters, numbered as orders, then coefficients, then input parameters.
+    /// Normal priors of free parameters, whose indices count orders, then coefficients, then input parameters.
     pub priors: Vec<Prior>,
 }
 

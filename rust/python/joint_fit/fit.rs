@@ -128,7 +128,7 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
         noise,
         residuals,
         robust,
-        prior_shares,
+        prior_fractions,
     } = optimum;
     let OptimizationResult { iterate: place, cost, initial, .. } = &attempt;
     let dict = PyDict::new(py);
@@ -140,7 +140,7 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
     dict.set_item("noise", noise)?;
     dict.set_item("left", tables(py, &residuals)?)?;
     dict.set_item("robust", robust.map(|robust| (robust.reduced_weight_count, robust.outliers, robust.samples)))?;
-    dict.set_item("prior_shares", prior_shares)?;
+    dict.set_item("prior_fractions", prior_fractions)?;
     dict.set_item("on_grid", PyArray1::from_vec(py, attempt.values()))?;
     dict.set_item("states", &place.states)?;
     dict.set_item("cost", cost)?;

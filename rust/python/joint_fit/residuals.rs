@@ -35,23 +35,23 @@ pub fn covariance_of<'py>(
 }
 
 /// Return the covariance of the parameters of a fit from a Jacobian with one row per parameter, and the residuals of
-/// each run and output. `shares` holds the robust weights of the columns; None without these. The last `priors` columns
-/// are the derivatives of the residuals of priors.
+/// each run and output. `robust_weights` has one weight per column; None for a squared loss. The last `priors` columns are
+/// the derivatives of the residuals of priors.
 #[pyfunction]
-#[pyo3(signature = (jacobian, series, shares, priors=0))]
+#[pyo3(signature = (jacobian, series, robust_weights, priors=0))]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fit_covariance<'py>(
     py: Python<'py>,
     jacobian: PyReadonlyArray2<'py, f64>,
     series: List<PyReadonlyArray1<'py, f64>>,
-    shares: Option<PyReadonlyArray1<'py, f64>>,
+    robust_weights: Option<PyReadonlyArray1<'py, f64>>,
     priors: usize,
 ) -> PyResult<Table<'py>> {
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
-    let shares = shares.map(|shares| vector("shares", &shares)).transpose()?;
+    let robust_weights = robust_weights.map(|weights| vector("robust weights", &weights)).transpose()?;
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
     let covariance = run_interruptible(py, points, None, move |_| {
-        spread::robust_covariance(&jacobian, series, shares.as_deref(), priors)
+        spread::robust_covariance(&jacobian, series, robust_weights.as_deref(), priors)
     })?;
     matrix(py, covariance, size)
 }

@@ -478,6 +478,7 @@ mod tests {
             derived: Vec::new(),
             equations,
             bounds: [("beta".into(), (0.5, 0.5))].into(),
+            priors: [].into(),
             coupled: false,
             delayed: false,
             initial: Initial::Rest,
