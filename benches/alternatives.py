@@ -1,15 +1,17 @@
 """Estimates with free orders by ftlm, by SciPy's least_squares with a Grünwald-Letnikov simulator, and by FOMCON's fid.
 
-``python benches/alternatives.py [SEEDS] [FOMCON]``: a motor's speed, a heated rod and a flexible tip, 400 samples with
+``python benches/alternatives.py [SEEDS]``: a motor's speed, a heated rod and a flexible tip, 400 samples with
 noise of 2 % of the standard deviation, validated on another input without noise. The records are Grünwald-Letnikov
 simulations at a fortieth of the sampling interval, so that no program fits its own discretization. SciPy and FOMCON
 start at coefficients of one with the right signs and at integer orders; SciPy also at five more points, of which the
 best fit counts. The intervals of SciPy follow from its Jacobian; FOMCON has none. It needs Octave with its packages
-optim and control; the argument FOMCON is the folder of its sources (github.com/AlekseiTepljakov/fomcon-matlab).
+optim and control; the environment variable FOMCON names the folder of its sources
+(github.com/AlekseiTepljakov/fomcon-matlab). Without it, FOMCON has no row.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -194,9 +196,8 @@ def measure(plant: Plant, seeds: int, fomcon: str | None) -> list[str]:
 
 def main() -> None:
     """Measure, print and keep."""
-    arguments = [word for word in sys.argv[1:] if word != "--write"]
-    seeds = next((int(word) for word in arguments if word.isdigit()), 5)
-    fomcon = next((word for word in arguments if not word.isdigit()), None)
+    seeds = next((int(word) for word in sys.argv[1:] if word.isdigit()), 5)
+    fomcon = os.environ.get("FOMCON")
     lines = [
         f"{SAMPLES} samples, noise {NOISE:.0%}, seeds 0 to {seeds - 1}.",
         "",
