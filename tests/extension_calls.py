@@ -283,6 +283,7 @@ class Sound:
             "derived": [],
             "equations": [(0, (0.0, [("alpha", 1.0)]), terms, None)],
             "bounds": self.one([], [("alpha", (0.5, 2.0))]),
+            "priors": self.one([], [("b", (self.number(-2.0, 2.0), self.number(-0.1, 2.0)))]),
             "coupled": self.one(True, False),
             "delayed": False,
             "initial": self.terms(),

@@ -54,6 +54,7 @@ class NumberedProblem:
                 "derived": [],
                 "equations": equations,
                 "bounds": [(f"o{k}", ends) for k, ends in enumerate(bounds)],
+                "priors": [],
                 "coupled": True,
                 "delayed": False,
                 "initial": initial,

@@ -508,7 +508,7 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     text = str(designed)
     assert "* alpha = " in text
     assert "D-optimal for alpha" in text
-    assert "the precision of the best periodic input" in text
+    assert "% of that of the best periodic input in steady state" in text
     frame = designed.to_frame()
     assert frame.loc["a0", "designed"] == designed.errors["designed"]["a0"]
     document = json.loads(json.dumps(designed.to_dict(), allow_nan=False))

@@ -39,6 +39,7 @@ BAD_VALUES = {
     "evaluations": (100, "evaluations = 100 is less than two generations of 200"),
     "population": (4, "population = 4 is out of range; give an integer from 8"),
     "bounds": ({"a": (1.0, 0.0)}, "bounds of a = (1.0, 0.0) are not an interval"),
+    "priors": ({"a": (1.0, 0.0)}, "prior of a = (1.0, 0.0) is not a finite mean and a positive standard deviation"),
 }
 
 
