@@ -194,6 +194,13 @@ def measure(plant: Plant, seeds: int, fomcon: str | None) -> list[str]:
     return rows
 
 
+def figure(rows: Sequence[str]) -> str:
+    """Return the rows of a machine as one list item for the page of results."""
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    texts = [f"{way} {fit} % (least {least} %), time {time}" for _, way, fit, least, *_, time in cells]
+    return f"- {cells[0][0]}, fit on unseen data: {'; '.join(texts)}"
+
+
 def main() -> None:
     """Measure, print and keep."""
     seeds = next((int(word) for word in sys.argv[1:] if word.isdigit()), 5)
@@ -205,12 +212,14 @@ def main() -> None:
         "truth [%] | processor time over ftlm's |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
+    print("\n".join(lines))
+    figures = []
     for plant in PLANTS:
         rows = measure(plant, seeds, fomcon)
-        lines += rows
+        figures.append(figure(rows))
         print("\n".join(rows), flush=True)
     if "--write" in sys.argv:
-        save([f"{heading()}: {lines[0]}", *lines[1:]])
+        save([f"{heading()}: {lines[0]}", *figures])
 
 
 if __name__ == "__main__":
