@@ -191,13 +191,14 @@ def estimate_output_error(
     additional_values: Mapping[str, float] | None = None,
     single_start: bool = False,
     joint_fit: JointFit | None = None,
+    is_preliminary: bool = False,
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
     `noise_free_runs` are the runs with each input replaced by the part that a reference explains. If given, they serve
     as instruments. `begin` is an additional initial guess. If it is a model, `additional_values` adds values of
     parameters that the model lacks. If `single_start` is True, no other initial guess is used. `joint_fit` is a joint
-    fit of the same task, if one was computed before.
+    fit of the same task, if one was computed before. A preliminary fit has no findings.
     """
     # An order with a single grid value is fixed.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -232,8 +233,10 @@ def estimate_output_error(
             joint, problem, task.runs, intervals, threads=threads, progress=tracker.subtask(1.0, 0.9), loss=loss
         )
     tracker.advance_to(1.0)
-    findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
-    if noise_free_runs is None:
+    findings: list[Finding] = []
+    if not is_preliminary:
+        findings = [*lower, *identifiability_findings(joint, problem), *sample_findings(task.runs, joint, problem)]
+    if noise_free_runs is None and not is_preliminary:
         findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
         # Otherwise a comparison of the model would assume rest because of the first samples.

@@ -39,7 +39,7 @@ from ftlm.estimation.nuisance_parameters import (
     offset_errors,
     output_sensitivities,
 )
-from ftlm.estimation.output_error import JointFit, parameter_set
+from ftlm.estimation.output_error import parameter_set
 from ftlm.estimation.prior_knowledge import Bounds, Priors
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
@@ -209,7 +209,7 @@ def _fit_runs(
         request: Structure,
         method: EstimationMethod = estimator,
         report: Callable[[int, int], None] | None = progress,
-        **options: JointFit | None,
+        **options: Any,
     ) -> Fit:
         fit = method.fit(runs, request, m=m, threads=threads, progress=report, **options)
         if not isinstance(fit, Fit):
@@ -225,7 +225,12 @@ def _fit_runs(
     if preliminary_method is not None:
         tracker = FractionTracker(progress)
         initial_condition_fits = InitialConditionFits(
-            partial(estimate, method=preliminary_method, report=tracker.subtask(INITIAL_CONDITIONS_SHARE, 0.9)),
+            partial(
+                estimate,
+                method=preliminary_method,
+                report=tracker.subtask(INITIAL_CONDITIONS_SHARE, 0.9),
+                is_preliminary=True,
+            ),
             may_add_offset,
             lambda request, joint: estimate(request, report=tracker.subtask(1.0, 1.0), fitted=joint),
         )

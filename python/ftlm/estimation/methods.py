@@ -318,11 +318,12 @@ class OutputError:
         threads: int | None = None,
         progress: ProgressCallback = None,
         fitted: JointFit | None = None,
+        is_preliminary: bool = False,
     ) -> Fit:
         """Fit a structure to checked runs; see :func:`ftlm.identify`.
 
         `fitted` is a joint fit by the method that :attr:`hypothesis` returns. If given, it is completed with the
-        remaining confidence intervals, and no new fit is made.
+        remaining confidence intervals, and no new fit is made. A preliminary fit has no findings.
         """
         if self.reference is not None and structure.has_friction:
             raise ModelError(
@@ -383,6 +384,7 @@ class OutputError:
                     start_values,
                     single_start,
                     fitted,
+                    is_preliminary,
                 )
             return fit, {} if fit.joint is None else fit.joint.values_by_name
 
