@@ -404,7 +404,5 @@ def test_a_bound_of_a_coefficient_that_a_law_sets_is_refused_by_the_law():
         inputs={"I1": np.ones(50)},
         outputs={"theta11": np.linspace(0, 1, 50) ** 2, "theta12": np.linspace(0, 1, 50) ** 3},
     )
-    with pytest.raises(
-        ftlm.ModelError, match=r"a2, which follows from the coefficient law a2 = - a1 j1; use 'a1', or"
-    ):
+    with pytest.raises(ftlm.ModelError, match=r"a2, which follows from the coefficient law a2 = - a1 j1; use 'a1', or"):
         ftlm.identify(run, structure, bounds={"a2": (0.0, 1.0)})
