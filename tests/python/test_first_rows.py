@@ -12,6 +12,7 @@ from scipy.stats import beta
 
 import arm_measured
 import ftlm
+from ftlm.estimation import estimators
 from ftlm.estimation.nuisance_parameters import refit_after_screening
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.initial_conditions import rest_evidence
@@ -698,3 +699,30 @@ def test_a_run_that_begins_slowly_is_compared_as_it_was_fitted(name, stage, text
     fitted = 100 * (1 - result.joint.noise["y"] / np.std(record["y"]))
     assert result.joint.initial != "rest"
     assert result.fit["y"] == pytest.approx(fitted, abs=0.5)
+
+
+def test_a_constant_that_does_not_help_costs_no_second_search_and_findings_are_computed_once(monkeypatch):
+    offsets, findings = [], []
+    fit, multistart_findings = estimators.fit_with_initial_conditions, estimators.multistart_findings
+
+    def recorded_fit(runs, structure, *arguments, **options):
+        offsets.append(structure.offset)
+        return fit(runs, structure, *arguments, **options)
+
+    def recorded_findings(*arguments):
+        findings.append(multistart_findings(*arguments))
+        return findings[-1]
+
+    monkeypatch.setattr(estimators, "fit_with_initial_conditions", recorded_fit)
+    monkeypatch.setattr(estimators, "multistart_findings", recorded_findings)
+    random, rows = np.random.default_rng(0), 300
+    u = np.repeat(random.choice([-1.0, 1.0], 25), 12)
+    noise = lfilter([0.05], [1, -0.9], random.standard_normal(rows))
+    y = np.concatenate([[0.0], np.cumsum(0.04 * u)[:-1]]) + noise
+    found = ftlm.identify(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y}), "D y = b u")
+    assert not found.residuals.outputs["y"].whiteness.passed
+    assert found.parameters["b"].value == pytest.approx(2.0, abs=0.2)
+    assert len(findings) == 1
+    # A constant is refuted by a fit from the optimum without it, before any search from automatic guesses.
+    assert "none" in offsets
+    assert "constant" not in offsets

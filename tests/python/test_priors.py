@@ -13,23 +13,13 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
+from test_bounds import INPUT, STEP, oscillator
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
-STEP, COUNT = 0.02, 600
-TIME = STEP * np.arange(COUNT)
-INPUT = np.where(np.sin(1.3 * TIME) + np.sin(3.1 * TIME + 1) > 0, 1.0, -1.0)
+COUNT = INPUT.size
 OSCILLATOR = "D^2 y = a1 D y + a0 y + b u"
 TRUTH = {"a1": -0.05, "a0": -4.0, "b": 3.0}
-
-
-def oscillator(a1: float, a0: float, b: float) -> np.ndarray:
-    """Return exact samples of the oscillator for a held input."""
-    whole = expm(STEP * np.array([[0, 1, 0], [a0, a1, b], [0, 0, 0]]))
-    states = [np.zeros(2)]
-    for input_value in INPUT[:-1]:
-        states.append(whole[:2, :2] @ states[-1] + whole[:2, 2] * input_value)
-    return np.array(states)[:, 0]
 
 
 def noisy(seed: int, deviation: float, count: int = COUNT) -> ftlm.Run:
