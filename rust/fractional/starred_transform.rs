@@ -46,8 +46,32 @@ pub(crate) struct StarredTransform {
     logarithms: Vec<Bin>,
     /// Index of the first bin of each panel of the base band, followed by the total number of bins.
     panels: Vec<usize>,
-    /// Weight and ln s of each alias term at the frequency s, by interpolation node.
-    aliases: Vec<Vec<(f64, Bin)>>,
+    /// Damping σ, the real part of s \[1/s\].
+    damping_rate: f64,
+    /// Weight of each alias term and its point s, by interpolation node.
+    aliases: Vec<Vec<(f64, LaplacePoint)>>,
+}
+
+/// Laplace variable s, with its logarithm.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LaplacePoint {
+    /// Laplace variable s \[1/s\].
+    pub(crate) s: Bin,
+    /// Logarithm ln s.
+    pub(crate) logarithm: Bin,
+}
+
+impl LaplacePoint {
+    pub(crate) fn new(s: Bin) -> Self {
+        Self { s, logarithm: Bin::new(libm::log(s.re.hypot(s.im)), libm::atan2(s.im, s.re)) }
+    }
+
+    /// Return the Laplace transform s^−η of η-fold integration.
+    pub(crate) fn integration(self, eta: f64) -> Bin {
+        let size = libm::exp(-eta * self.logarithm.re);
+        let (sine, cosine) = libm::sincos(-eta * self.logarithm.im);
+        Bin::new(size * cosine, size * sine)
+    }
 }
 
 impl StarredTransform {
@@ -56,7 +80,7 @@ impl StarredTransform {
     pub(crate) fn new(rows: usize, step: f64) -> Self {
         let plan = fft::plan(fft::fast_length(2 * rows));
         let sigma = DAMPING_DURATIONS / (rows as f64 * step);
-        let logarithm = |omega: f64| Bin::new(libm::log(sigma.hypot(omega)), libm::atan2(omega, sigma));
+        let point = |omega: f64| LaplacePoint::new(Bin::new(sigma, omega));
         let spacing = 2.0 * PI / (plan.len() as f64 * step);
         let width = PI / step / BAND_PANEL_COUNT as f64;
         let panels = (0..=BAND_PANEL_COUNT).map(|p| {
@@ -76,20 +100,22 @@ impl StarredTransform {
         let edge = (DIRECT_ALIAS_COUNT as f64 - 0.5) * period;
         let node = |place: usize| {
             let omega = width * (0.5 + (place / PANEL_NODES) as f64 + 0.5 * chebyshev_node(place % PANEL_NODES));
-            let direct =
-                weights.iter().enumerate().skip(1).flat_map(|(n, &weight)| {
-                    [1.0, -1.0].map(|sign| (weight, logarithm(omega + sign * n as f64 * period)))
-                });
+            let direct = weights
+                .iter()
+                .enumerate()
+                .skip(1)
+                .flat_map(|(n, &weight)| [1.0, -1.0].map(|sign| (weight, point(omega + sign * n as f64 * period))));
             // d/dω of the integral from the edge to infinity is the function at the edge.
-            let tail = LEGENDRE_RULE.iter().flat_map(|&(point, weight)| {
-                [1.0, -1.0].map(|sign| (-sign * weight * omega / period, logarithm(point * omega + sign * edge)))
+            let tail = LEGENDRE_RULE.iter().flat_map(|&(place, weight)| {
+                [1.0, -1.0].map(|sign| (-sign * weight * omega / period, point(place * omega + sign * edge)))
             });
             direct.chain(tail).collect()
         };
         Self {
             step,
             damping: (0..rows).map(|k| libm::exp(-sigma * step * k as f64)).collect(),
-            logarithms: (0..plan.bins()).map(|j| logarithm(j as f64 * spacing)).collect(),
+            logarithms: (0..plan.bins()).map(|j| point(j as f64 * spacing).logarithm).collect(),
+            damping_rate: sigma,
             panels: panels.collect(),
             aliases: (0..BAND_PANEL_COUNT * PANEL_NODES).map(node).collect(),
             plan,
@@ -115,29 +141,30 @@ impl StarredTransform {
         time
     }
 
-    /// Return the starred transforms Σ f(kh) e^{−skh} of functions f, one value per frequency bin. `functions(ln s,
-    /// out)` writes their Laplace transforms at s to `out`, and `starts` contains their values at t = 0. h is the
-    /// sampling interval.
-    pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
+    /// Return the starred transforms Σ f(kh) e^{−skh} of functions f, one value per frequency bin. `functions(s, out)`
+    /// writes their Laplace transforms at s to `out`, and `starts` contains their values at t = 0. h is the sampling
+    /// interval.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(LaplacePoint, &mut [Bin])) -> Vec<Vec<Bin>> {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];
         let mut sums = vec![[Bin::default(); BAND_PANEL_COUNT * PANEL_NODES]; count];
         for (place, aliases) in self.aliases.iter().enumerate() {
-            for &(weight, logarithm) in aliases {
-                functions(logarithm, &mut values);
+            for &(weight, point) in aliases {
+                functions(point, &mut values);
                 sums.iter_mut().zip(&values).for_each(|(sum, value)| sum[place] += value * weight);
             }
         }
         let mut spectra = vec![Vec::with_capacity(self.logarithms.len()); count];
-        for &logarithm in &self.logarithms {
-            functions(logarithm, &mut values);
+        let spacing = 2.0 * PI / (self.plan.len() as f64 * self.step);
+        for (j, &logarithm) in self.logarithms.iter().enumerate() {
+            functions(LaplacePoint { s: Bin::new(self.damping_rate, j as f64 * spacing), logarithm }, &mut values);
             spectra.iter_mut().zip(&values).for_each(|(spectrum, &value)| spectrum.push(value));
         }
         for ((spectrum, sums), start) in spectra.iter_mut().zip(&sums).zip(starts) {
             self.add_aliases(spectrum, sums);
             let (bins, inner) =
                 (spectrum.len(), spectrum[1..spectrum.len() - 1].iter().map(|v| 2.0 * v.re).sum::<f64>());
-            #[allow(clippy::cast_precision_loss)]
             let mean = (spectrum[0].re + inner + spectrum[bins - 1].re) / self.plan.len() as f64;
             let scale = 1.0 / self.step;
             spectrum.iter_mut().for_each(|v| *v = (*v - mean) * scale + start);
@@ -182,22 +209,15 @@ fn chebyshev_node(k: usize) -> f64 {
     libm::cos(node_angle(k))
 }
 
-/// Return the Laplace transform s^−η of η-fold integration, given ln s.
-pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
-    let size = libm::exp(-eta * logarithm.re);
-    let (sine, cosine) = libm::sincos(-eta * logarithm.im);
-    Bin::new(size * cosine, size * sine)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     /// Return samples of the step response of a transfer function without direct feedthrough.
-    fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
+    fn step_response(rows: usize, step: f64, function: impl Fn(LaplacePoint) -> Bin) -> Vec<f64> {
         let transform = StarredTransform::new(rows, step);
-        let spectra = transform.spectra(&[0.0], |logarithm, values| {
-            values[0] = function(logarithm) * integration(logarithm, 1.0);
+        let spectra = transform.spectra(&[0.0], |point, values| {
+            values[0] = function(point) * point.integration(1.0);
         });
         spectra.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()
     }
@@ -210,17 +230,17 @@ mod tests {
     fn step_responses_of_closed_form_are_exact() {
         for (rows, step) in [(200, 0.05), (5000, 0.01)] {
             // 1/(s + 3), 9/(s² + 0.6 s + 9), 1/(s^0.5 + 1) and s^−0.01.
-            let fall = step_response(rows, step, |l| (integration(l, -1.0) + 3.0).inv());
+            let fall = step_response(rows, step, |s| (s.integration(-1.0) + 3.0).inv());
             assert!(distance(&fall, |t| (1.0 - (-3.0 * t).exp()) / 3.0, step) < 1e-9);
             let (decay, omega) = (0.3, (9.0_f64 - 0.09).sqrt());
             let ring =
-                step_response(rows, step, |l| (integration(l, -2.0) + integration(l, -1.0) * 0.6 + 9.0).inv() * 9.0);
+                step_response(rows, step, |s| (s.integration(-2.0) + s.integration(-1.0) * 0.6 + 9.0).inv() * 9.0);
             let exact = |t: f64| 1.0 - (-decay * t).exp() * ((omega * t).cos() + decay / omega * (omega * t).sin());
             assert!(distance(&ring, exact, step) < 1e-9);
-            let slow = step_response(rows, step, |l| integration(l, 0.01));
+            let slow = step_response(rows, step, |s| s.integration(0.01));
             let gamma = libm::tgamma(1.01);
             assert!(distance(&slow, |t| t.powf(0.01) / gamma, step) < 1e-9);
-            let half = step_response(rows, step, |l| (integration(l, -0.5) + 1.0).inv());
+            let half = step_response(rows, step, |s| (s.integration(-0.5) + 1.0).inv());
             let exact = |t: f64| 1.0 - t.exp() * libm::erfc(t.sqrt());
             assert!(distance(&half[..200], exact, step) < 1e-9);
         }

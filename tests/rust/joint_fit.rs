@@ -7,6 +7,7 @@ use ftlm::estimation::joint_fit::{
     best_alternative, correct_step, fit_reweighted, refine_step, Iterate, Loss, Objective, Optimum, Problem, Weights,
 };
 use ftlm::estimation::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, ParameterPoint};
+use ftlm::expression::{DerivedSignal, Expression, Instruction};
 use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
 use ftlm::signal::block_pulse::Intersample;
@@ -204,6 +205,47 @@ fn correction_ends_where_finer_grids_do(size: f64) {
         assert!((error / refined.covariance[k * 4].sqrt() - 1.0).abs() < 0.02);
     }
     close("noise", &corrected.noise, &refined.noise, 3e-3);
+}
+
+#[test]
+fn the_correction_of_nonlinear_terms_for_the_step_ends_where_finer_grids_do() {
+    // y′ = u − y², of which tanh is the step response: exact from sample to sample.
+    let (step, rows, size) = (0.2, 500, 1e-3);
+    let mut random = Random::new(5);
+    let u: Vec<f64> = random.steps(rows, 10).iter().map(|v| 1.25 + 0.75 * v.signum()).collect();
+    let mut state = 0.0;
+    let mut y = Vec::new();
+    for (u, noise) in u.iter().zip(random.signal(rows)) {
+        y.push(state + size * noise);
+        let (end, share) = (u.sqrt(), (u.sqrt() * step).tanh());
+        state = end * (state + end * share) / (end + state * share);
+    }
+    let none = || order(0.0, &[0.0]);
+    let equation = FreeEquation {
+        output: 0,
+        order: order(0.0, &[1.0]),
+        terms: vec![(2, none(), alone(0)), (1, none(), alone(1))],
+    };
+    let square = Expression::new(vec![Instruction::Channel(0), Instruction::Power(2.0)], 1).unwrap();
+    let square = DerivedSignal::new(square, vec![(0, 0.0)]).unwrap();
+    let problem = problem(equation, &[(0.5, 1.5)], 2, Initial::Rest).with_derived(vec![square]);
+    let (source, stop) = (sampled(step, &[y], &[u]), Stop::default());
+    let grid = Objective::new((&problem, &source, &stop), weighing(1.0 / size), sampling(1, 1), false).unwrap();
+    let (best, grid) = fit_reweighted(&place(&[1.0], &[-1.0, 1.0]), grid, Loss::Squares).unwrap();
+    let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
+    let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
+    assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
+    let truths = [1.0, -1.0, 1.0];
+    let errors: Vec<f64> = (0..3).map(|k| corrected.covariance[k * 4].sqrt()).collect();
+    // On the grid itself a parameter is off by more than its error.
+    let offsets: Vec<f64> = (0..3).map(|k| (best.values()[k] - truths[k]).abs() / errors[k]).collect();
+    assert!(offsets.iter().any(|offset| *offset > 2.0), "{offsets:?}");
+    for (k, truth) in truths.into_iter().enumerate() {
+        let (found, expected, error) = (corrected.estimate[k], refined.estimate[k], errors[k]);
+        assert!((found - expected).abs() < 0.2 * error, "{found} and {expected} ± {error}");
+        assert!((found - truth).abs() < 4.0 * error, "{found} ± {error}");
+    }
+    close("noise", &corrected.noise, &refined.noise, 1e-2);
 }
 
 /// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.

@@ -452,7 +452,7 @@ fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near:
     let mut last = None;
     for candidate in survivors {
         match fit(candidate, FIRST_BUDGET_EVALUATIONS) {
-            Ok(attempt) => short.push(candidate.with_result(attempt)),
+            Ok(attempt) => short.push(candidate.with_result(attempt.without_residuals())),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // This survivor has no finite simulation on this grid. Other survivors may have one.
             Err(error) => last = Some(error),
@@ -461,7 +461,7 @@ fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near:
     let (unfinished, mut ends) = split_unfinished(short, problem.noise_floor());
     for candidate in unfinished {
         match fit(&candidate, MAX_FINAL_EVALUATIONS) {
-            Ok(attempt) => ends.push(candidate.with_result(attempt)),
+            Ok(attempt) => ends.push(candidate.with_result(attempt.without_residuals())),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(_) => ends.push(candidate),
         }

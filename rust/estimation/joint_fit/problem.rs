@@ -145,6 +145,7 @@ impl Problem {
             return Ok(OptimizationResult {
                 iterate: Iterate { point: optimum.point, states: Vec::new() },
                 cost: optimum.cost,
+                residual_count: optimum.residuals.len(),
                 residuals: optimum.residuals,
                 jacobian: optimum.jacobian,
                 initial: optimum.initial,
@@ -166,6 +167,7 @@ impl Problem {
             initial_responses: Vec::new(),
             iterate: Iterate { point, states: optimum.states },
             cost: optimum.cost,
+            residual_count: optimum.residuals.len(),
             residuals: optimum.residuals,
             jacobian: optimum.jacobian,
             evaluations: optimum.evaluations,
@@ -191,9 +193,13 @@ pub struct OptimizationResult {
     pub iterate: Iterate,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// The weighted residuals, ordered by run, then by output, then by sample.
+    /// Number of residuals.
+    pub residual_count: usize,
+    /// The weighted residuals, ordered by run, then by output, then by sample. They are empty after
+    /// [`Self::without_residuals`].
     pub residuals: Vec<f64>,
-    /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested.
+    /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested, and after
+    /// [`Self::without_residuals`].
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms by run and equation. With friction or nonlinear terms, initial states by run.
     pub initial: Vec<Vec<Vec<f64>>>,
@@ -213,14 +219,21 @@ impl OptimizationResult {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
         let (residuals, jacobian) = (Vec::new(), Vec::new());
         let (initial, initial_responses) = (Vec::new(), Vec::new());
-        Self { iterate, cost, residuals, jacobian, initial, initial_responses, evaluations, status }
+        let residual_count = 0;
+        Self { iterate, cost, residual_count, residuals, jacobian, initial, initial_responses, evaluations, status }
+    }
+
+    /// Return the result without residuals and derivatives, which fill most of the memory of a long record.
+    #[must_use]
+    pub fn without_residuals(self) -> Self {
+        Self { residuals: Vec::new(), jacobian: Vec::new(), initial_responses: Vec::new(), ..self }
     }
 
     /// Mean square of the weighted residuals: about 1 if the weights match the noise and the model is complete.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn cost_per_residual(&self) -> f64 {
-        2.0 * self.cost / self.residuals.len() as f64
+        2.0 * self.cost / self.residual_count as f64
     }
 
     /// Return true if the gradient vanished, except for components that point out of an active bound.

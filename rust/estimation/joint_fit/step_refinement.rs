@@ -17,7 +17,8 @@ const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
 /// multistart are also fitted.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Minimum number of block pulses over all runs at which the step error is corrected without fits on finer pulse grids.
+/// Minimum number of block pulses over all runs at which the step error of a linear model is corrected without fits on
+/// finer pulse grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
 /// Maximum number of corrections with the same pair of finer pulse grids.
 ///
@@ -130,7 +131,9 @@ pub fn refine_step<'a>(
     Ok(Optimum { attempt: best, grid, estimate, step_converged: has_converged, covariance: spread })
 }
 
-/// Return the optimum of a long record for zero step, by deferred correction; None if this fails.
+/// Return the optimum for zero step by deferred correction; None if this fails or is not worth its overhead.
+///
+/// It serves long records, and nonlinear terms without friction, whose fits on fine pulse grids are slow.
 ///
 /// At the optimum, the residuals on two finer pulse grids are extrapolated to zero step. The difference of this limit
 /// from the residuals on `grid` hardly depends on the parameters. It is added to the samples, and the model is fitted
@@ -142,7 +145,9 @@ pub fn refine_step<'a>(
 /// shorter step. [`Error::Interrupted`] after a stop request.
 pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: Loss) -> Result<Option<Optimum<'a>>> {
     let pulses: usize = grid.experiments().iter().map(|experiment| experiment.record.m()).sum();
-    if pulses < MIN_CORRECTED_PULSES || !best.has_converged() {
+    let is_smooth = grid.problem.frictions.is_empty();
+    let is_slow = is_smooth && !grid.problem.is_linear();
+    if !(is_slow || pulses >= MIN_CORRECTED_PULSES) || !best.has_converged() {
         return Ok(None);
     }
     let time_scaling = grid.time_scaling();
@@ -163,7 +168,8 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
             if has_converged && correction == 0 {
                 // The optimum is the same as with the previous pair of coarser grids.
                 let estimate = next.values();
-                let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
+                let iterate = Iterate { point: best.iterate.point.clone(), states: next.iterate.states.clone() };
+                let attempt = OptimizationResult { iterate, ..next };
                 let grid = next_grid;
                 return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
             }

@@ -19,7 +19,7 @@ use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::fft::Bin;
 use crate::fractional::kernels::digamma;
-use crate::fractional::starred_transform::{integration, StarredTransform};
+use crate::fractional::starred_transform::{LaplacePoint, StarredTransform};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 
 /// Minimum number of pulses for exact samples. For shorter experiments, block pulses are faster.
@@ -45,11 +45,62 @@ pub(crate) struct SampledSimulation {
     pub(crate) effects: Vec<Vec<f64>>,
 }
 
+/// Difference of two integration orders from a whole number below which it counts as one.
+const WHOLE_ORDER_TOLERANCE: f64 = 1e-14;
+
+/// Distinct integration orders η. Each is the sum of a whole number and of a fraction in [0, 1).
+///
+/// The orders of an equation often differ by whole numbers. The power s^−η is then computed once for the common
+/// fraction, and multiplied by whole powers of 1/s.
+#[derive(Default)]
+struct IntegrationOrders {
+    etas: Vec<f64>,
+    /// Whole part of each order, and the index of its fraction; None if the fraction is 0.
+    parts: Vec<(u32, Option<usize>)>,
+    fractions: Vec<f64>,
+}
+
+impl IntegrationOrders {
+    /// Return the index of an order, which is added if it is new.
+    fn index(&mut self, eta: f64) -> usize {
+        if let Some(index) = self.etas.iter().position(|e| e.to_bits() == eta.to_bits()) {
+            return index;
+        }
+        let near = |a: f64, b: f64| (a - b).abs() < WHOLE_ORDER_TOLERANCE;
+        let (whole, fraction) = if near(eta, eta.round()) { (eta.round(), 0.0) } else { (eta.floor(), eta.fract()) };
+        let known = self.fractions.iter().position(|&f| near(f, fraction));
+        let place = (fraction > 0.0).then(|| {
+            known.unwrap_or_else(|| {
+                self.fractions.push(fraction);
+                self.fractions.len() - 1
+            })
+        });
+        self.etas.push(eta);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        self.parts.push((whole as u32, place));
+        self.etas.len() - 1
+    }
+
+    /// Write s^−η of each order to `powers`.
+    fn powers(&self, at: LaplacePoint, powers: &mut Vec<Bin>) {
+        powers.clear();
+        // The powers of the fractions come first and are removed at the end.
+        powers.extend(self.fractions.iter().map(|&fraction| at.integration(fraction)));
+        let reciprocal = at.s.inv();
+        for &(whole, fraction) in &self.parts {
+            let mut power = fraction.map_or(Bin::from(1.0), |place| powers[place]);
+            (0..whole).for_each(|_| power *= reciprocal);
+            powers.push(power);
+        }
+        powers.drain(..self.fractions.len());
+    }
+}
+
 /// Terms of an equation at a parameter point.
 struct Terms {
     /// Distinct integration orders η of the terms.
-    etas: Vec<f64>,
-    /// Index of the integration order of each term in `etas`.
+    orders: IntegrationOrders,
+    /// Index of the integration order of each term in `orders`.
     eta_indices: Vec<usize>,
     coefficients: Vec<f64>,
     /// Input signal of each term; None for a term of the output itself.
@@ -59,20 +110,42 @@ struct Terms {
 /// Derivatives of the coefficient and of the integration order of each term with respect to one parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// Response of an equation to one input from zero initial conditions.
-///
-/// In this response, `weights` replace the coefficients of the terms of this input.
-struct Column {
-    /// Weight of each term of the equation. Only the weights of the terms of this input are used.
-    weights: Vec<f64>,
-    input: usize,
+/// Sum Σ (w − v ln s) s^−η over integration orders η, with weights w and v.
+struct PowerSum {
+    /// Index of the integration order and w, without zeros.
+    terms: Vec<(usize, f64)>,
+    /// Index of the integration order and v, without zeros.
+    logarithmic: Vec<(usize, f64)>,
+}
+
+impl PowerSum {
+    /// Return the sum at a point. `powers` contains s^−η of each integration order.
+    fn at(&self, logarithm: Bin, powers: &[Bin]) -> Bin {
+        let sum = |terms: &[(usize, f64)]| {
+            terms.iter().fold(Bin::default(), |sum, &(index, weight)| sum + powers[index] * weight)
+        };
+        let plain = sum(&self.terms);
+        if self.logarithmic.is_empty() {
+            plain
+        } else {
+            plain - logarithm * sum(&self.logarithmic)
+        }
+    }
+
+    fn is_zero(&self) -> bool {
+        self.terms.is_empty() && self.logarithmic.is_empty()
+    }
 }
 
 impl Terms {
     fn of(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
         let structure = &model.structures(&point.orders)[i];
-        let mut terms =
-            Self { etas: Vec::new(), eta_indices: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
+        let mut terms = Self {
+            orders: IntegrationOrders::default(),
+            eta_indices: Vec::new(),
+            coefficients: Vec::new(),
+            inputs: Vec::new(),
+        };
         for (k, term) in structure.terms.iter().enumerate() {
             let eta = structure.order - term.order;
             let own = model.output_index(i, term.signal).is_some();
@@ -80,11 +153,8 @@ impl Terms {
                 // This is reported as divergence, so that the optimization shortens its step.
                 return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
             }
-            let position = terms.etas.iter().position(|e| e.to_bits() == eta.to_bits());
-            terms.eta_indices.push(position.unwrap_or(terms.etas.len()));
-            if position.is_none() {
-                terms.etas.push(eta);
-            }
+            let index = terms.orders.index(eta);
+            terms.eta_indices.push(index);
             terms.coefficients.push(model.equations[i].terms[k].2.at(&point.coefficients));
             terms.inputs.push((!own).then_some(term.signal));
         }
@@ -99,25 +169,27 @@ impl Terms {
         signal_indices
     }
 
-    /// Return Σ weight·s^−η over the terms of `input`, or over the terms of the output itself if `input` is None.
+    /// Return Σ (w − v ln s) s^−η over the terms of `input`, or of the output itself if `input` is None.
     ///
-    /// `powers` contains s^−η of each distinct integration order.
-    fn sum(&self, input: Option<usize>, powers: &[Bin], weight: impl Fn(usize) -> Bin) -> Bin {
-        let terms = (0..self.eta_indices.len()).filter(|&k| self.inputs[k] == input);
-        terms.map(|k| weight(k) * powers[self.eta_indices[k]]).sum()
+    /// `weights` returns the pair (w, v) of a term.
+    fn sum(&self, input: Option<usize>, weights: impl Fn(usize) -> (f64, f64)) -> PowerSum {
+        let own = || (0..self.eta_indices.len()).filter(|&k| self.inputs[k] == input);
+        let nonzero = |part: &dyn Fn(usize) -> f64| {
+            own().map(|k| (self.eta_indices[k], part(k))).filter(|(_, weight)| *weight != 0.0).collect()
+        };
+        PowerSum { terms: nonzero(&|k| weights(k).0), logarithmic: nonzero(&|k| weights(k).1) }
     }
 
-    /// Write s^−η of each distinct integration order η to `powers`, and return 1/D; `logarithm` is ln s.
-    fn powers(&self, logarithm: Bin, powers: &mut Vec<Bin>) -> Bin {
-        powers.clear();
-        powers.extend(self.etas.iter().map(|&eta| integration(logarithm, eta)));
-        (Bin::from(1.0) - self.sum(None, powers, |k| self.coefficients[k].into())).inv()
+    /// Return Σ c s^−η over the terms of `input`, or of the output itself if `input` is None.
+    fn sum_of_coefficients(&self, input: Option<usize>) -> PowerSum {
+        self.sum(input, |k| (self.coefficients[k], 0.0))
     }
 
     /// Return half of the jump of the step response at t = 0. `weights` returns the weight of a term of the input.
     fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
-        let at_once =
-            |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.eta_indices[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
+        let at_once = |k: &usize| {
+            self.inputs[*k] == Some(input) && self.orders.etas[self.eta_indices[*k]] < FEEDTHROUGH_ORDER_TOLERANCE
+        };
         0.5 * (0..self.eta_indices.len()).filter(at_once).map(weights).sum::<f64>()
     }
 }
@@ -134,10 +206,10 @@ impl InitialTerms {
         Self { terms: exponents.iter().zip(values).map(of).collect() }
     }
 
-    /// Write the Laplace transform of each term to `out`, and return the sum of the transforms; `logarithm` is ln s.
-    fn transforms(&self, logarithm: Bin, out: &mut Vec<Bin>) -> Bin {
+    /// Write the Laplace transform of each term to `out`, and return the sum of the transforms.
+    fn transforms(&self, at: LaplacePoint, out: &mut Vec<Bin>) -> Bin {
         out.clear();
-        out.extend(self.terms.iter().map(|&(power, weight, _)| integration(logarithm, power) * weight));
+        out.extend(self.terms.iter().map(|&(power, weight, _)| at.integration(power) * weight));
         out.iter().sum()
     }
 
@@ -361,32 +433,36 @@ impl Run {
         weight_sets: &[Vec<f64>],
         exponents: &[f64],
     ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
-        let mut functions: Vec<(usize, Column)> = Vec::new();
+        // The place of a set of weights, the input, and the weighted sum of powers for this input.
+        let mut functions: Vec<(usize, usize, PowerSum)> = Vec::new();
+        let mut starts = Vec::new();
         for (place, weights) in weight_sets.iter().enumerate() {
             for input in terms.signals() {
-                let acts = |k: usize| terms.inputs[k] == Some(input) && weights[k] != 0.0;
-                if (0..weights.len()).any(acts) {
-                    functions.push((place, Column { weights: weights.clone(), input }));
+                let sum = terms.sum(Some(input), |k| (weights[k], 0.0));
+                if !sum.is_zero() {
+                    functions.push((place, input, sum));
+                    starts.push(terms.start(input, |k| weights[k]));
                 }
             }
         }
-        let mut starts: Vec<f64> = functions.iter().map(|(_, c)| terms.start(c.input, |k| c.weights[k])).collect();
         starts.resize(functions.len() + exponents.len(), 0.0);
+        let own = terms.sum_of_coefficients(None);
         let mut powers = Vec::new();
         let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
-        let spectra = self.transform.spectra(&starts, |logarithm, values| {
-            let response = terms.powers(logarithm, &mut powers);
-            let hold_response = response * integration(logarithm, 1.0);
+        let spectra = self.transform.spectra(&starts, |at, values| {
+            terms.orders.powers(at, &mut powers);
+            let response = (Bin::from(1.0) - own.at(at.logarithm, &powers)).inv();
+            let hold_response = response / at.s;
             let (driven, free) = values.split_at_mut(functions.len());
-            for (value, (_, c)) in driven.iter_mut().zip(&functions) {
-                *value = terms.sum(Some(c.input), &powers, |k| c.weights[k].into()) * hold_response;
+            for (value, (_, _, sum)) in driven.iter_mut().zip(&functions) {
+                *value = sum.at(at.logarithm, &powers) * hold_response;
             }
             for ((value, unit), e) in free.iter_mut().zip(&units).zip(exponents) {
-                *value = response * integration(logarithm, e + 1.0) * unit;
+                *value = response * at.integration(e + 1.0) * unit;
             }
         });
         let mut spectra = spectra.into_iter();
-        let sources = functions.iter().map(|(place, c)| (*place, Some(c.input)));
+        let sources = functions.iter().map(|(place, input, _)| (*place, Some(*input)));
         let driven = self.columns(experiment, weight_sets.len(), sources.zip(spectra.by_ref()));
         let free = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
         (driven, free)
@@ -402,39 +478,58 @@ impl Run {
         initial: &InitialTerms,
         requests: &[(Slopes, Vec<f64>)],
     ) -> Vec<Vec<f64>> {
-        let mut functions: Vec<(usize, Option<usize>)> = Vec::new();
-        for (place, (slopes, initial_slopes)) in requests.iter().enumerate() {
-            let acts =
-                |input: Option<usize>| (0..slopes.len()).any(|k| terms.inputs[k] == input && slopes[k] != (0.0, 0.0));
-            let inputs = terms.signals().into_iter().map(Some);
-            functions.extend(inputs.filter(|&input| acts(None) || acts(input)).map(|input| (place, input)));
-            if !initial.terms.is_empty() && (acts(None) || initial_slopes.iter().any(|v| *v != 0.0)) {
-                functions.push((place, None));
+        let derivative = |place: usize, input: Option<usize>| {
+            let slopes: &Slopes = &requests[place].0;
+            terms.sum(input, |k| (slopes[k].0, terms.coefficients[k] * slopes[k].1))
+        };
+        let signals = terms.signals();
+        let denominators: Vec<PowerSum> = (0..requests.len()).map(|place| derivative(place, None)).collect();
+        // The place of a request, the place of an input in `signals`, and the derivative of the numerator for it.
+        let mut functions: Vec<(usize, Option<usize>, PowerSum)> = Vec::new();
+        for (place, (_, initial_slopes)) in requests.iter().enumerate() {
+            for (index, &signal) in signals.iter().enumerate() {
+                let numerator = derivative(place, Some(signal));
+                if !(denominators[place].is_zero() && numerator.is_zero()) {
+                    functions.push((place, Some(index), numerator));
+                }
+            }
+            let acts = !denominators[place].is_zero() || initial_slopes.iter().any(|v| *v != 0.0);
+            if !initial.terms.is_empty() && acts {
+                functions.push((place, None, PowerSum { terms: Vec::new(), logarithmic: Vec::new() }));
             }
         }
-        let start = |&(place, input): &(usize, Option<usize>)| {
-            input.map_or(0.0, |input| terms.start(input, |k| requests[place].0[k].0))
+        let start = |(place, index, _): &(usize, Option<usize>, PowerSum)| {
+            index.map_or(0.0, |index| terms.start(signals[index], |k| requests[*place].0[k].0))
         };
         let starts: Vec<f64> = functions.iter().map(start).collect();
+        let own = terms.sum_of_coefficients(None);
+        let numerators: Vec<PowerSum> = signals.iter().map(|&signal| terms.sum_of_coefficients(Some(signal))).collect();
         let (mut powers, mut transforms) = (Vec::new(), Vec::new());
-        let spectra = self.transform.spectra(&starts, |logarithm, values| {
-            let response = terms.powers(logarithm, &mut powers);
-            let hold_response = integration(logarithm, 1.0);
-            let undriven = initial.transforms(logarithm, &mut transforms);
-            for (value, &(place, input)) in values.iter_mut().zip(&functions) {
-                let (slopes, initial_slopes) = &requests[place];
-                let weight = |k: usize| Bin::from(slopes[k].0) - logarithm * (terms.coefficients[k] * slopes[k].1);
-                let (driven, changed) = match input {
-                    None => (undriven, initial.slope(logarithm, &transforms, initial_slopes)),
-                    Some(_) => {
-                        let sum = terms.sum(input, &powers, |k| terms.coefficients[k].into());
-                        (sum * hold_response, terms.sum(input, &powers, weight) * hold_response)
+        let (mut driven, mut changes) = (vec![Bin::default(); numerators.len()], vec![Bin::default(); requests.len()]);
+        let spectra = self.transform.spectra(&starts, |at, values| {
+            let logarithm = at.logarithm;
+            terms.orders.powers(at, &mut powers);
+            let response = (Bin::from(1.0) - own.at(logarithm, &powers)).inv();
+            let hold_response = response / at.s;
+            let undriven = initial.transforms(at, &mut transforms) * response;
+            for (value, sum) in driven.iter_mut().zip(&numerators) {
+                *value = sum.at(logarithm, &powers) * hold_response;
+            }
+            for (value, sum) in changes.iter_mut().zip(&denominators) {
+                *value = sum.at(logarithm, &powers) * response;
+            }
+            for (value, (place, index, numerator)) in values.iter_mut().zip(&functions) {
+                *value = match index {
+                    Some(index) => driven[*index] * changes[*place] + numerator.at(logarithm, &powers) * hold_response,
+                    None => {
+                        let changed = initial.slope(logarithm, &transforms, &requests[*place].1);
+                        undriven * changes[*place] + changed * response
                     }
                 };
-                *value = (driven * response * terms.sum(None, &powers, weight) + changed) * response;
             }
         });
-        self.columns(experiment, requests.len(), functions.iter().copied().zip(spectra))
+        let functions = functions.iter().map(|(place, index, _)| (*place, index.map(|index| signals[index])));
+        self.columns(experiment, requests.len(), functions.zip(spectra))
     }
 
     /// Return `count` columns of compared samples.
@@ -531,6 +626,23 @@ mod tests {
         assert_eq!(actual.len(), exact.len());
         let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
         actual.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / peak
+    }
+
+    #[test]
+    fn orders_that_differ_by_whole_numbers_share_one_power() {
+        let mut orders = IntegrationOrders::default();
+        let etas = [1.7, 0.7, 3.7, 0.3, 2.0, 0.0, 1.0 - 1e-9, 0.7];
+        let indices: Vec<usize> = etas.iter().map(|&eta| orders.index(eta)).collect();
+        assert_eq!(indices, [0, 1, 2, 3, 4, 5, 6, 1]);
+        assert_eq!(orders.fractions.len(), 3);
+        let at = LaplacePoint::new(Bin::new(0.3, 40.0));
+        let mut powers = Vec::new();
+        orders.powers(at, &mut powers);
+        assert_eq!(powers.len(), 7);
+        for (power, eta) in powers.iter().zip(etas) {
+            let direct = at.integration(eta);
+            assert!((power - direct).norm() < 1e-13 * direct.norm(), "{eta}: {power} and {direct}");
+        }
     }
 
     #[test]

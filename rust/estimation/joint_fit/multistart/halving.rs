@@ -143,7 +143,10 @@ impl Rung<'_> {
         let place = &candidate.result.iterate;
         let problem = self.free.problem_at(place, false, &[]);
         match problem.minimize(self.experiments, place, settings, self.requires_stability, self.stop) {
-            Ok(attempt) => Ok(Some(zero_vanishing_coefficients(self.free, candidate, candidate.with_result(attempt)))),
+            Ok(attempt) => {
+                let ended = candidate.with_result(attempt.without_residuals());
+                Ok(Some(zero_vanishing_coefficients(self.free, candidate, ended)))
+            }
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
         }
@@ -267,7 +270,7 @@ mod tests {
         let point = ParameterPoint { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
         let attempt = OptimizationResult::initial_result(Iterate { point, states: Vec::new() });
         Candidate {
-            result: OptimizationResult { cost: level, residuals: vec![0.0; 2], ..attempt },
+            result: OptimizationResult { cost: level, residual_count: 2, ..attempt },
             origin: String::new(),
             duplicates: Vec::new(),
             cost_before: f64::INFINITY,
