@@ -4,7 +4,7 @@
 //! I^α it becomes y = Σ_k c_k I^{α−ν_k} s_k + initial terms. All other modules use this form.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
-use crate::fractional::kernels::{block_pulse_kernel, MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
+use crate::fractional::kernels::{block_pulse_kernel, MAX_ORDER, MAX_ORDER_EXCESS, MIN_INPUT_ORDER};
 use crate::series;
 
 /// Difference below which two orders count as equal. Orders on an order grid are multiples of its increment only up to
@@ -158,9 +158,9 @@ impl Initial {
     #[must_use]
     pub fn with_states(self, states: u8) -> Self {
         match (self, states) {
-            (whole, 0) => whole,
+            (initial, 0) => initial,
             (Self::Filtered { base, .. }, _) => Self::Filtered { base, states },
-            (whole, _) => Self::Filtered { base: Box::new(whole), states },
+            (initial, _) => Self::Filtered { base: Box::new(initial), states },
         }
     }
 
@@ -250,8 +250,8 @@ impl Initial {
     /// empty without an offset.
     pub(crate) fn offset_exponents(&self, alpha: f64) -> Vec<f64> {
         match self {
-            Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
-            Self::Offset { ramp: false, .. } => vec![tidy(alpha)],
+            Self::Offset { ramp: true, .. } => vec![round_order(alpha), round_order(alpha + 1.0)],
+            Self::Offset { ramp: false, .. } => vec![round_order(alpha)],
             Self::Filtered { base, .. } => base.offset_exponents(alpha),
             _ => Vec::new(),
         }
@@ -272,9 +272,9 @@ impl Initial {
         check_finite("exponents of the initial terms", exponents)?;
         match exponents.iter().find(|&&e| e <= -1.0) {
             None => Ok(()),
-            Some(&bad) => Err(Error::OutOfRange {
+            Some(&exponent) => Err(Error::OutOfRange {
                 name: "exponent of an initial term".into(),
-                value: bad,
+                value: exponent,
                 range: "(-1, ∞)".into(),
                 remedy: "t to this power has no mean over the first pulse".into(),
             }),
@@ -292,14 +292,19 @@ impl Structure {
     /// # Errors
     /// [`Error::OutOfRange`] for an order that is out of range, [`Error::Structure`] for a signal that does not exist.
     pub fn check(&self, signals: usize, is_input: impl Fn(usize) -> bool) -> Result<()> {
-        let range = |name: String, value: f64, range: String, remedy: &str| Error::OutOfRange {
+        let out_of_range = |name: String, value: f64, range: String, remedy: &str| Error::OutOfRange {
             name,
             value,
             range,
             remedy: remedy.to_owned(),
         };
         if !alpha_fits(self.order) {
-            return Err(range("order alpha".into(), self.order, format!("(0, {MAX_ORDER}]"), "choose another order"));
+            return Err(out_of_range(
+                "order alpha".into(),
+                self.order,
+                format!("(0, {MAX_ORDER}]"),
+                "choose another order",
+            ));
         }
         if self.output >= signals {
             return Err(missing_signal_error(self.output, signals));
@@ -312,14 +317,14 @@ impl Structure {
             if term.signal == self.output {
                 if !order_fits(self.order, term.order, true, false) {
                     let allowed = format!("[0, {})", self.order);
-                    return Err(range(name, term.order, allowed, "an own-output order must stay below alpha"));
+                    return Err(out_of_range(name, term.order, allowed, "an own-output order must stay below alpha"));
                 }
             } else {
                 let lowest = if is_input(term.signal) { MIN_INPUT_ORDER } else { 0.0 };
-                let limit_order = self.order + MAX_EXCESS;
+                let limit_order = self.order + MAX_ORDER_EXCESS;
                 if !(term.order >= lowest && term.order < limit_order - ORDER_GRAIN) {
                     let allowed = format!("[{lowest}, {limit_order})");
-                    return Err(range(name, term.order, allowed, "an order must stay below alpha + 1"));
+                    return Err(out_of_range(name, term.order, allowed, "an order must stay below alpha + 1"));
                 }
             }
         }
@@ -333,7 +338,7 @@ impl Structure {
     /// If there is no term `k`.
     #[must_use]
     pub fn integration(&self, k: usize) -> f64 {
-        tidy(self.order - self.terms[k].order)
+        round_order(self.order - self.terms[k].order)
     }
 
     /// Return the distinct exponents of the initial terms, ascending.
@@ -346,11 +351,11 @@ impl Structure {
             Initial::Rest | Initial::Offset { .. } | Initial::Level { .. } | Initial::Filtered { .. } => Vec::new(),
             Initial::Powers(powers) => powers.clone(),
             Initial::Caputo => {
-                let mut all: Vec<f64> = whole_below(self.order).collect();
+                let mut powers: Vec<f64> = integers_below(self.order).collect();
                 for (k, term) in self.terms.iter().enumerate() {
-                    all.extend(whole_below(term.order).map(|i| tidy(self.integration(k) + i)));
+                    powers.extend(integers_below(term.order).map(|i| round_order(self.integration(k) + i)));
                 }
-                all
+                powers
             }
         };
         let offset = initial.offset_exponents(self.order);
@@ -373,15 +378,15 @@ pub fn alpha_fits(alpha: f64) -> bool {
 
 /// True if an order search may use a term of this order in an equation of order `alpha`.
 ///
-/// Orders must be in [0, α) for the output (`own`), in [−3, α] for an input, and in [0, α] for other signals.
+/// Orders must be in [0, α) for the output (`is_output`), in [−3, α] for an input, and in [0, α] for other signals.
 /// [`Structure::check`] also admits orders up to α + 1 for other signals. A search must not use them, because a free
 /// term of an order above α nearly reproduces the output.
 #[must_use]
-pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
-    if own {
+pub fn order_fits(alpha: f64, order: f64, is_output: bool, is_input: bool) -> bool {
+    if is_output {
         order >= 0.0 && order < alpha - ORDER_GRAIN
     } else {
-        order >= if input { MIN_INPUT_ORDER } else { 0.0 } && order <= alpha + ORDER_GRAIN
+        order >= if is_input { MIN_INPUT_ORDER } else { 0.0 } && order <= alpha + ORDER_GRAIN
     }
 }
 
@@ -394,7 +399,7 @@ pub(crate) fn missing_signal_error(signal: usize, signals: usize) -> Error {
 
 /// Iterate over the integers 0, 1, … below `order`: the exponents of the powers of t whose Caputo derivative D^order is
 /// zero.
-fn whole_below(order: f64) -> impl Iterator<Item = f64> {
+fn integers_below(order: f64) -> impl Iterator<Item = f64> {
     (0_u32..).map(f64::from).take_while(move |&i| i < order.min(MAX_ORDER) - ORDER_GRAIN)
 }
 
@@ -404,14 +409,14 @@ fn whole_below(order: f64) -> impl Iterator<Item = f64> {
 /// farther apart than 1e−9.
 ///
 /// ```
-/// assert_eq!(ftlm::equation::tidy(0.1 + 0.2), 0.3);
-/// assert_eq!(ftlm::equation::tidy(1e12), 1e12);
+/// assert_eq!(ftlm::equation::round_order(0.1 + 0.2), 0.3);
+/// assert_eq!(ftlm::equation::round_order(1e12), 1e12);
 /// ```
 #[must_use]
-pub fn tidy(order: f64) -> f64 {
-    const EXACT: f64 = 9_007_199_254_740_992.0; // 2⁵³
+pub fn round_order(order: f64) -> f64 {
+    const EXACT_INTEGER_LIMIT: f64 = 9_007_199_254_740_992.0; // 2⁵³
     let units = (order * 1e9).round();
-    if units.abs() < EXACT {
+    if units.abs() < EXACT_INTEGER_LIMIT {
         // Adding 0 turns −0 into 0, so that equal orders have equal bits.
         units / 1e9 + 0.0
     } else {
@@ -450,13 +455,13 @@ impl AffineOrder {
     pub fn check(&self, bounds: &[(f64, f64)]) -> Result<()> {
         check_length("weights of an order", bounds.len(), self.weights.len())?;
         let free = self.weights.iter().zip(bounds).map(|(w, (low, high))| w.abs() * low.abs().max(high.abs()));
-        let size = self.constant.abs() + free.sum::<f64>();
-        if size <= MAX_REACHED_ORDER {
+        let magnitude = self.constant.abs() + free.sum::<f64>();
+        if magnitude <= MAX_REACHED_ORDER {
             return Ok(());
         }
         Err(Error::OutOfRange {
             name: "size of an order within its bounds".into(),
-            value: size,
+            value: magnitude,
             range: format!("[0, {MAX_REACHED_ORDER}]"),
             remedy: format!("bound free orders by {MIN_INPUT_ORDER} and {MAX_ORDER}"),
         })
@@ -465,7 +470,7 @@ impl AffineOrder {
     /// Return the value of the law at the given free orders.
     #[must_use]
     pub fn at(&self, free: &[f64]) -> f64 {
-        tidy(self.constant + self.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>())
+        round_order(self.constant + self.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>())
     }
 }
 
@@ -506,7 +511,7 @@ impl Filter {
         }
         let highest = self.denominator.iter().map(|t| t.1).fold(0.0, f64::max);
         let mut parts = [vec![0.0; m], vec![0.0; m]];
-        for (part, terms) in parts.iter_mut().zip([&self.numerator, &self.denominator]) {
+        for (series, terms) in parts.iter_mut().zip([&self.numerator, &self.denominator]) {
             for &(coefficient, order) in terms {
                 if !(order >= 0.0 && order <= highest && highest <= MAX_ORDER) {
                     return Err(Error::OutOfRange {
@@ -516,7 +521,7 @@ impl Filter {
                         remedy: "a filter's numerator must not exceed its denominator in order".into(),
                     });
                 }
-                for (p, k) in part.iter_mut().zip(block_pulse_kernel(tidy(highest - order), m, step)) {
+                for (p, k) in series.iter_mut().zip(block_pulse_kernel(round_order(highest - order), m, step)) {
                     *p += coefficient * k;
                 }
             }

@@ -75,8 +75,8 @@ fn power(x: f64, n: f64) -> (f64, f64) {
         return (1.0, 0.0);
     }
     if n.fract() == 0.0 && n.abs() < f64::from(i16::MAX) {
-        let before = x.powi(n as i32 - 1);
-        return (if n > 0.0 { before * x } else { x.powi(n as i32) }, n * before);
+        let lower_power = x.powi(n as i32 - 1);
+        return (if n > 0.0 { lower_power * x } else { x.powi(n as i32) }, n * lower_power);
     }
     (libm::pow(x, n), if x == 0.0 && n < 1.0 { 0.0 } else { n * libm::pow(x, n - 1.0) })
 }
@@ -154,7 +154,7 @@ impl Expression {
     pub fn new(program: Vec<Instruction>, channels: usize) -> Result<Self> {
         let mut depth = 0_usize;
         for instruction in &program {
-            let needed = match instruction {
+            let argument_count = match instruction {
                 Instruction::Constant(_) | Instruction::Channel(_) => 0,
                 Instruction::Add | Instruction::Multiply => 2,
                 Instruction::Negate | Instruction::Power(_) | Instruction::Apply(_) => 1,
@@ -166,10 +166,10 @@ impl Expression {
                 Instruction::Channel(channel) if *channel >= channels => {
                     return refuse(format!("channel {channel} of {channels}"), "number them from 0");
                 }
-                _ if depth < needed => {
+                _ if depth < argument_count => {
                     return refuse(format!("{instruction:?} without a value"), "give its arguments before it")
                 }
-                _ => depth = depth + 1 - needed,
+                _ => depth = depth + 1 - argument_count,
             }
         }
         if depth != 1 {
@@ -199,8 +199,8 @@ impl Expression {
                 }
                 Instruction::Channel(channel) => {
                     values.stack.push(channels[channel]);
-                    let one = |i| if i == channel { 1.0 } else { 0.0 };
-                    values.slopes.extend((0..n).map(one));
+                    let unit = |i| if i == channel { 1.0 } else { 0.0 };
+                    values.slopes.extend((0..n).map(unit));
                 }
                 Instruction::Add => values.combine(n, |a, b| (a + b, 1.0, 1.0)),
                 Instruction::Multiply => values.combine(n, |a, b| (a * b, b, a)),
@@ -247,11 +247,11 @@ impl Values {
 
     fn combine(&mut self, n: usize, function: impl Fn(f64, f64) -> (f64, f64, f64)) {
         let (Some(b), Some(a)) = (self.stack.pop(), self.stack.last_mut()) else { return };
-        let (value, by_a, by_b) = function(*a, b);
+        let (value, slope_a, slope_b) = function(*a, b);
         *a = value;
         let split = self.slopes.len() - n;
         let (head, tail) = self.slopes.split_at_mut(split);
-        head[split - n..].iter_mut().zip(tail.iter()).for_each(|(a, b)| *a = by_a * *a + by_b * b);
+        head[split - n..].iter_mut().zip(tail.iter()).for_each(|(a, b)| *a = slope_a * *a + slope_b * b);
         self.slopes.truncate(split);
     }
 }

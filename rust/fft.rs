@@ -63,7 +63,7 @@ const RECENT_REQUEST_COUNT: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
 struct Plans {
-    uses: u64,
+    request_count: u64,
     plans: BTreeMap<usize, (Plan, u64)>,
 }
 
@@ -77,14 +77,14 @@ thread_local! {
 
 impl Plans {
     const fn new() -> Self {
-        Self { uses: 0, plans: BTreeMap::new() }
+        Self { request_count: 0, plans: BTreeMap::new() }
     }
 
     fn find(&mut self, len: usize) -> Option<Plan> {
         let (plan, last) = self.plans.get_mut(&len)?;
         if len > MAX_PERMANENT_PLAN_POINTS {
-            self.uses += 1;
-            *last = self.uses;
+            self.request_count += 1;
+            *last = self.request_count;
         }
         Some(plan.clone())
     }
@@ -99,10 +99,10 @@ impl Plans {
         }
         let mut evicted = Vec::new();
         if len > MAX_PERMANENT_PLAN_POINTS {
-            self.uses += 1;
+            self.request_count += 1;
             evicted = self.evict(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
         }
-        self.plans.insert(len, (plan.clone(), self.uses));
+        self.plans.insert(len, (plan.clone(), self.request_count));
         (plan, evicted)
     }
 
@@ -119,7 +119,7 @@ impl Plans {
         let mut stored_points: usize = long.iter().map(|&(_, len)| len).sum();
         let mut evicted = Vec::new();
         for (last, len) in long {
-            if stored_points <= points || self.uses - last <= RECENT_REQUEST_COUNT {
+            if stored_points <= points || self.request_count - last <= RECENT_REQUEST_COUNT {
                 break;
             }
             stored_points -= len;
@@ -143,7 +143,7 @@ impl Plans {
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    if let Some(plan) = THREAD_PLANS.with_borrow_mut(|own| own.find(len)) {
+    if let Some(plan) = THREAD_PLANS.with_borrow_mut(|plans| plans.find(len)) {
         return plan;
     }
     let (plan, shared) = match SHARED_PLANS.with(|plans| plans.find(len)).flatten() {
@@ -158,7 +158,7 @@ pub fn plan(len: usize) -> Plan {
         }
     };
     if len <= MAX_PERMANENT_PLAN_POINTS || !shared {
-        THREAD_PLANS.with_borrow_mut(|own| own.insert(plan.clone()));
+        THREAD_PLANS.with_borrow_mut(|plans| plans.insert(plan.clone()));
     }
     plan
 }
@@ -205,7 +205,7 @@ impl Plan {
     /// If a length differs from that of the plan, which is a programming error.
     pub fn transform(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
-        let scratch = workspace.at_least(self.forward.get_scratch_len());
+        let scratch = workspace.scratch(self.forward.get_scratch_len());
         // The transform can only fail on lengths, which were checked.
         let outcome = self.forward.process_with_scratch(time, spectrum, scratch);
         assert!(outcome.is_ok(), "the forward transform refused its own lengths");
@@ -236,7 +236,7 @@ impl Plan {
         {
             last.im = 0.0;
         }
-        let scratch = workspace.at_least(self.inverse.get_scratch_len());
+        let scratch = workspace.scratch(self.inverse.get_scratch_len());
         let outcome = self.inverse.process_with_scratch(spectrum, time, scratch);
         assert!(outcome.is_ok(), "the inverse transform refused its own lengths");
         #[allow(clippy::cast_precision_loss)]
@@ -254,7 +254,7 @@ impl Workspace {
         Self::default()
     }
 
-    fn at_least(&mut self, len: usize) -> &mut [Bin] {
+    fn scratch(&mut self, len: usize) -> &mut [Bin] {
         if self.scratch.len() < len {
             self.scratch.resize(len, Bin::new(0.0, 0.0));
         }

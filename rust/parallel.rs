@@ -102,23 +102,23 @@ impl<T> ForkSafeLock<T> {
 
     /// Apply `work`, which must be short, to the value and return its result. None if the lock cannot be taken.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> Option<R> {
-        for turn in 0..MAX_LOCK_ATTEMPTS {
+        for attempt in 0..MAX_LOCK_ATTEMPTS {
             match self.0.try_lock() {
                 Ok(mut value) => return Some(work(&mut value)),
                 // Poison means that another thread panicked, which leaves the values intact.
                 Err(TryLockError::Poisoned(value)) => return Some(work(&mut value.into_inner())),
-                Err(TryLockError::WouldBlock) if turn < SPIN_LOCK_ATTEMPTS => std::hint::spin_loop(),
+                Err(TryLockError::WouldBlock) if attempt < SPIN_LOCK_ATTEMPTS => std::hint::spin_loop(),
                 Err(TryLockError::WouldBlock) => std::thread::yield_now(),
             }
         }
         None
     }
 
-    /// Hold the lock during `meanwhile`, like a thread that does not survive a fork.
+    /// Hold the lock during `work`, like a thread that does not survive a fork.
     #[cfg(test)]
-    pub(crate) fn hold_during<R>(&self, meanwhile: impl FnOnce() -> R) -> R {
+    pub(crate) fn hold_during<R>(&self, work: impl FnOnce() -> R) -> R {
         let _value = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        meanwhile()
+        work()
     }
 }
 

@@ -7,7 +7,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use crate::equation::{grains, tidy};
+use crate::equation::{grains, round_order};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::fractional::kernels::{kernel, power_means, power_pulses};
 use crate::parallel::{self, Stop};
@@ -113,22 +113,22 @@ impl Record {
         for (signal, row) in jumps.iter().enumerate() {
             let mut last = (0, 0.0);
             for jump in row {
-                let PulseJump { pulse, share, .. } = *jump;
+                let PulseJump { pulse, fraction, .. } = *jump;
                 let invalid_jump = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
                 if pulse >= self.m() {
                     let what = format!("signal {signal} jumps in pulse {pulse} of {}", self.m());
                     return invalid_jump(what, "count pulses from 0");
                 }
-                if !(share > 0.0 && share < 1.0) {
-                    let what = format!("signal {signal} jumps after a share of {share} of pulse {pulse}");
-                    return invalid_jump(what, "give jumps within pulses, with shares between 0 and 1");
+                if !(fraction > 0.0 && fraction < 1.0) {
+                    let what = format!("signal {signal} jumps after the fraction {fraction} of pulse {pulse}");
+                    return invalid_jump(what, "give jumps within pulses, with fractions between 0 and 1");
                 }
-                if (pulse, share) <= last {
+                if (pulse, fraction) <= last {
                     let what = format!("a jump of signal {signal} in pulse {pulse} is not after the one before it");
                     return invalid_jump(what, "sort the jumps by time");
                 }
                 check_finite("values around a jump", &[jump.before, jump.after])?;
-                last = (pulse, share);
+                last = (pulse, fraction);
             }
         }
         self.jumps = jumps;
@@ -162,7 +162,7 @@ impl Record {
     #[must_use]
     pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (transients, moving, impulse_responses) =
+        let (transients, deviations, impulse_responses) =
             (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
         Self {
             step: self.step,
@@ -170,7 +170,7 @@ impl Record {
             filter: self.filter.clone(),
             clean: None,
             filter_transients: transients,
-            deviations: moving,
+            deviations,
             impulse_responses,
             jumps: self.jumps.clone(),
         }
@@ -203,12 +203,13 @@ impl Record {
     pub fn with_filter(&self, filter: &[f64]) -> Result<Self> {
         let m = self.m();
         check_length("filter", m, filter.len())?;
-        let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
-        let derivative = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
-        let mut through = Self::from_rows(self.step, self.signals.iter().map(filtered).collect(), Some(derivative))?;
-        through.filter_transients.clone_from(&self.filter_transients);
-        through.deviations = self.deviations.iter().map(|moving| moving.as_ref().map(filtered)).collect();
-        Ok(through)
+        let apply = |series: &Vec<f64>| series::multiply(filter, series, m);
+        let derivative = self.filter.as_ref().map_or_else(|| filter.to_vec(), apply);
+        let mut filtered_record =
+            Self::from_rows(self.step, self.signals.iter().map(apply).collect(), Some(derivative))?;
+        filtered_record.filter_transients.clone_from(&self.filter_transients);
+        filtered_record.deviations = self.deviations.iter().map(|deviation| deviation.as_ref().map(apply)).collect();
+        Ok(filtered_record)
     }
 
     /// Return the record with nonzero initial conditions.
@@ -242,15 +243,15 @@ impl Record {
         check_length("flags of signals with a transient of the sensor filter", self.len(), transients.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
-        for answer in &impulse_responses {
-            check_length("response of the sensor filter", self.m(), answer.len())?;
-            check_finite("response of the sensor filter", answer)?;
+        for response in &impulse_responses {
+            check_length("response of the sensor filter", self.m(), response.len())?;
+            check_finite("response of the sensor filter", response)?;
         }
         let unit = if levels.iter().any(|v| *v != 0.0) { self.initial_term(0.0) } else { Vec::new() };
-        let above = |(signal, &level): (&Vec<f64>, &f64)| {
+        let deviation = |(signal, &level): (&Vec<f64>, &f64)| {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
-        self.deviations = self.signals.iter().zip(levels).map(above).collect();
+        self.deviations = self.signals.iter().zip(levels).map(deviation).collect();
         (self.filter_transients, self.impulse_responses) = (transients, impulse_responses);
         Ok(self)
     }
@@ -388,8 +389,8 @@ impl Record {
     /// Return the pulse means of an initial term t^exponent as an input of a simulation, before the sensor filter.
     /// `None` for a record without filter, or if the filter response is known.
     pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
-        let passes = self.filter.is_some() && self.impulse_response(exponent).is_none();
-        passes.then(|| power_pulses(exponent, self.m(), self.step))
+        let is_filtered_later = self.filter.is_some() && self.impulse_response(exponent).is_none();
+        is_filtered_later.then(|| power_pulses(exponent, self.m(), self.step))
     }
 
     /// Apply the record's sensor filter to a series. Without a filter, return the series unchanged.
@@ -478,7 +479,7 @@ pub struct Bank {
     /// series in the one-step delay.
     kernels: Vec<f64>,
     /// Index of the kernel of each column, `None` if the column is not an integral of the output.
-    own: Vec<Option<usize>>,
+    kernel_indices: Vec<Option<usize>>,
 }
 
 /// Columns of all signals at one order of integration, to be computed. The kernel is included if the output is among
@@ -493,7 +494,7 @@ impl OrderColumns<'_> {
     /// Compute the columns of all signals, given by their spectra, from one kernel.
     #[allow(clippy::cast_precision_loss)]
     fn write(self, record: &Record, spectra: &BTreeMap<usize, Kernel>, buffers: &mut Buffers) {
-        let kernel = kernel(tidy(self.order as f64 / 1e9), record.m(), record.step());
+        let kernel = kernel(round_order(self.order as f64 / 1e9), record.m(), record.step());
         if self.order == 0 {
             self.columns.into_iter().for_each(|(signal, column)| column.copy_from_slice(record.signal(signal)));
         } else {
@@ -504,8 +505,8 @@ impl OrderColumns<'_> {
                 }
             }
         }
-        if let Some(own) = self.kernel {
-            own.copy_from_slice(&kernel);
+        if let Some(kernel_slot) = self.kernel {
+            kernel_slot.copy_from_slice(&kernel);
         }
     }
 }
@@ -535,7 +536,7 @@ impl Bank {
     /// ```
     pub fn new(index: &Index, record: &Record, output: usize) -> Result<Self> {
         let (m, limit) = (record.m(), u128::from(BANK_LIMIT));
-        let bytes = 8 * m as u128 * (index.keys.len() + Self::own(index, output)) as u128;
+        let bytes = 8 * m as u128 * (index.keys.len() + Self::output_integral_count(index, output)) as u128;
         if bytes > limit {
             return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit });
         }
@@ -543,7 +544,7 @@ impl Bank {
     }
 
     /// Return the number of regressors that are integrals of the signal `output`.
-    pub(crate) fn own(index: &Index, output: usize) -> usize {
+    pub(crate) fn output_integral_count(index: &Index, output: usize) -> usize {
         index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count()
     }
 
@@ -566,34 +567,38 @@ impl Bank {
             });
         }
         let mut columns = vec![0.0; m * index.keys.len()];
-        let mut kernels = vec![0.0; m * Self::own(index, output)];
-        let mut own = Vec::with_capacity(index.keys.len());
+        let mut kernels = vec![0.0; m * Self::output_integral_count(index, output)];
+        let mut kernel_indices = Vec::with_capacity(index.keys.len());
         let mut orders: BTreeMap<i64, OrderColumns<'_>> = BTreeMap::new();
         let mut initial = Vec::new();
-        let mut rest = kernels.chunks_exact_mut(m).enumerate();
+        let mut kernel_slots = kernels.chunks_exact_mut(m).enumerate();
         for (key, column) in index.keys.iter().zip(columns.chunks_exact_mut(m)) {
             let mut kernel = None;
             match *key {
                 Key::Integral { signal, order } => {
-                    let bank =
+                    let group =
                         orders.entry(order).or_insert_with(|| OrderColumns { order, columns: vec![], kernel: None });
-                    bank.columns.push((signal, column));
+                    group.columns.push((signal, column));
                     if signal == output {
-                        (kernel, bank.kernel) = rest.next().unzip();
+                        (kernel, group.kernel) = kernel_slots.next().unzip();
                     }
                 }
                 Key::Initial { exponent } => initial.push((exponent, column)),
             }
-            own.push(kernel);
+            kernel_indices.push(kernel);
         }
-        let integrated: BTreeSet<usize> =
-            orders.values().filter(|bank| bank.order != 0).flat_map(|bank| &bank.columns).map(|(s, _)| *s).collect();
+        let integrated: BTreeSet<usize> = orders
+            .values()
+            .filter(|group| group.order != 0)
+            .flat_map(|group| &group.columns)
+            .map(|(s, _)| *s)
+            .collect();
         let signals = integrated.into_iter().collect();
         let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
         let spectra: BTreeMap<usize, Kernel> = parallel::map(signals, || (), spectrum).into_iter().collect();
-        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, bank| {
+        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, group| {
             if !stop.is_set() {
-                bank.write(record, &spectra, buffers);
+                group.write(record, &spectra, buffers);
             }
         });
         stop.check()?;
@@ -604,7 +609,7 @@ impl Bank {
                 column.copy_from_slice(&record.initial_term(exponent as f64 / 1e9));
             },
         );
-        Ok(Self { m, columns, kernels, own })
+        Ok(Self { m, columns, kernels, kernel_indices })
     }
 
     /// Return the values of all columns, one column after another.
@@ -628,19 +633,19 @@ impl Bank {
     /// If the column does not exist.
     #[must_use]
     pub fn kernel(&self, position: usize) -> &[f64] {
-        self.own[position].map_or(&[], |place| &self.kernels[place * self.m..(place + 1) * self.m])
+        self.kernel_indices[position].map_or(&[], |index| &self.kernels[index * self.m..(index + 1) * self.m])
     }
 
     /// Return the number of columns.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.own.len()
+        self.kernel_indices.len()
     }
 
     /// Return true if there are no columns.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.own.is_empty()
+        self.kernel_indices.is_empty()
     }
 }
 
@@ -653,14 +658,14 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
 /// the sensors.
 #[allow(clippy::type_complexity)]
 pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
-    powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
+    powers.iter().map(|terms| terms.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
 }
 
 /// Add impulses and their derivatives, given as (exponent, coefficient) pairs by output, to the pulse means of the
 /// outputs. `step` is the pulse length \[s\].
 pub(crate) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
-    for (output, own) in outputs.iter_mut().zip(impulses) {
-        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+    for (output, terms) in outputs.iter_mut().zip(impulses) {
+        for &(exponent, value) in terms.iter().filter(|(_, value)| *value != 0.0) {
             let means = power_means(exponent, output.len(), step);
             output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
         }

@@ -62,12 +62,12 @@ impl<'a> System<'a> {
                         continue;
                     }
                 }
-                let place = kernels.iter().position(|(known, _)| known.to_bits() == eta.to_bits());
-                let place = place.unwrap_or_else(|| {
+                let index = kernels.iter().position(|(order, _)| order.to_bits() == eta.to_bits());
+                let index = index.unwrap_or_else(|| {
                     kernels.push((eta, kernel(eta, m, step)));
                     kernels.len() - 1
                 });
-                let kernel = &kernels[place].1;
+                let kernel = &kernels[index].1;
                 match unknown {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
@@ -100,9 +100,9 @@ impl<'a> System<'a> {
     /// Return the outputs, by equation, for the inputs of the record and these initial terms. `initial` lists the
     /// (exponent, coefficient) pairs of each equation, empty for zero initial conditions.
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-        let (rhs, beside) = self.forced_right_side(initial);
+        let (rhs, output_impulses) = self.forced_right_side(initial);
         let mut outputs = self.solve(&rhs)?;
-        self.add_output_impulses(&mut outputs, &beside);
+        self.add_output_impulses(&mut outputs, &output_impulses);
         Ok(outputs)
     }
 
@@ -111,65 +111,65 @@ impl<'a> System<'a> {
     /// equation.
     #[allow(clippy::type_complexity)]
     fn forced_right_side(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
-        let (beside, driving): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
-            .map(|(i, own)| own.iter().copied().partition(|&(exponent, _)| self.is_output_impulse(i, exponent)))
+        let (output_impulses, input_terms): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
+            .map(|(i, terms)| terms.iter().copied().partition(|&(exponent, _)| self.is_output_impulse(i, exponent)))
             .unzip();
         let mut rhs = self.rhs.clone();
-        for (b, terms) in rhs.iter_mut().zip(&driving) {
+        for (b, terms) in rhs.iter_mut().zip(&input_terms) {
             for &(exponent, coefficient) in terms {
                 b.iter_mut().zip(self.record.forcing_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
             }
         }
-        (rhs, beside)
+        (rhs, output_impulses)
     }
 
-    /// Return the outputs if `bounded` accepts them. Otherwise return the outputs of the first damped copy of the
-    /// system whose outputs `bounded` accepts. The flag is true for a damped copy.
+    /// Return the outputs if `is_bounded` accepts them. Otherwise return the outputs of the first damped copy of the
+    /// system whose outputs `is_bounded` accepts. The flag is true for a damped copy.
     ///
     /// The damped copies have decays of 4, 8, 16, … per record ([`crate::simulate::respond_damped`]). The last copy is
-    /// returned if `bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. If the
+    /// returned if `is_bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. If the
     /// inverse of the matrix is finite, the inverse of a copy is the same series at ρz, so that no further division is
     /// needed.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn respond_stabilized(
         &self,
         initial: &[Vec<(f64, f64)>],
-        bounded: impl Fn(&[Vec<f64>]) -> bool,
+        is_bounded: impl Fn(&[Vec<f64>]) -> bool,
     ) -> Result<(Vec<Vec<f64>>, bool)> {
-        let (rhs, beside) = self.forced_right_side(initial);
-        let finish = |mut outputs: Vec<Vec<f64>>| {
-            self.add_output_impulses(&mut outputs, &beside);
+        let (rhs, output_impulses) = self.forced_right_side(initial);
+        let add_impulses = |mut outputs: Vec<Vec<f64>>| {
+            self.add_output_impulses(&mut outputs, &output_impulses);
             outputs
         };
-        let outputs = finish(self.solve(&rhs)?);
-        if bounded(&outputs) {
+        let outputs = add_impulses(self.solve(&rhs)?);
+        if is_bounded(&outputs) {
             return Ok((outputs, false));
         }
         let m = self.record.m();
         let inverse = self.inverse()?;
-        let finite = inverse.iter().flatten().flatten().all(|v| v.is_finite());
+        let is_finite = inverse.iter().flatten().flatten().all(|v| v.is_finite());
         let spectra: Vec<Kernel> = rhs.iter().map(|b| Kernel::new(b)).collect();
         let (mut sum, mut buffers) = (SumOfProducts::new(m), Buffers::default());
         let mut gamma = 4.0;
         loop {
             let decay = gamma / m as f64;
-            let outputs = if finite {
-                let mut through = |row: &Vec<Vec<f64>>| {
-                    for (series, driver) in row.iter().zip(&spectra) {
-                        sum.add(1.0, &Kernel::new(&damp_series(decay, series)), driver);
+            let outputs = if is_finite {
+                let mut response = |row: &Vec<Vec<f64>>| {
+                    for (series, input) in row.iter().zip(&spectra) {
+                        sum.add(1.0, &Kernel::new(&damp_series(decay, series)), input);
                     }
                     let mut out = vec![0.0; m];
                     sum.take(&mut out, &mut buffers);
                     out
                 };
-                finish(inverse.iter().map(&mut through).collect())
+                add_impulses(inverse.iter().map(&mut response).collect())
             } else {
                 let matrix =
                     self.matrix.iter().map(|row| row.iter().map(|series| damp_series(decay, series)).collect());
                 let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
-                finish(series::solve(&matrix.collect::<Vec<Vec<Vec<f64>>>>(), &borrowed)?)
+                add_impulses(series::solve(&matrix.collect::<Vec<Vec<Vec<f64>>>>(), &borrowed)?)
             };
-            if bounded(&outputs) || gamma > 64.0 * m as f64 {
+            if is_bounded(&outputs) || gamma > 64.0 * m as f64 {
                 return Ok((outputs, true));
             }
             gamma *= 2.0;
@@ -184,9 +184,9 @@ impl<'a> System<'a> {
     }
 
     /// Add impulses, given as (exponent, coefficient) pairs by equation, to the outputs.
-    fn add_output_impulses(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
-        for (output, own) in outputs.iter_mut().zip(beside) {
-            for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+    fn add_output_impulses(&self, outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>]) {
+        for (output, terms) in outputs.iter_mut().zip(impulses) {
+            for &(exponent, value) in terms.iter().filter(|(_, value)| *value != 0.0) {
                 output.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(s, v)| *s += value * v);
             }
         }
@@ -202,21 +202,24 @@ impl<'a> System<'a> {
     pub(crate) fn unit_responses(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let mut solver = series::Solver::new(&self.matrix)?;
         match self.invert_for_units(&mut solver, units)? {
-            Some(mut by) => Ok(units.iter().map(|&unit| by.unit(unit)).collect()),
-            None => self.one_by_one(&mut solver, units),
+            Some(mut inverse_kernels) => Ok(units.iter().map(|&unit| inverse_kernels.unit_response(unit)).collect()),
+            None => self.solve_each(&mut solver, units),
         }
     }
 
     /// Return the outputs with zero initial conditions, and [`System::unit_responses`].
     #[allow(clippy::type_complexity)]
-    pub(crate) fn rest_and_unit_responses(
+    pub(crate) fn zero_initial_and_unit_responses(
         &self,
         units: &[(usize, f64)],
     ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
         let mut solver = series::Solver::new(&self.matrix)?;
         match self.invert_for_units(&mut solver, units)? {
-            Some(mut by) => Ok((by.rest(), units.iter().map(|&unit| by.unit(unit)).collect())),
-            None => Ok((solver.solve(&self.rhs)?, self.one_by_one(&mut solver, units)?)),
+            Some(mut inverse_kernels) => Ok((
+                inverse_kernels.zero_initial_response(),
+                units.iter().map(|&unit| inverse_kernels.unit_response(unit)).collect(),
+            )),
+            None => Ok((solver.solve(&self.rhs)?, self.solve_each(&mut solver, units)?)),
         }
     }
 
@@ -245,7 +248,7 @@ impl<'a> System<'a> {
     }
 
     /// Return the responses of all outputs to each initial term (equation, exponent) by one solution per term.
-    fn one_by_one(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+    fn solve_each(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         units
             .iter()
             .map(|&(i, exponent)| {
@@ -288,13 +291,13 @@ struct InverseKernels<'s, 'a> {
 
 impl InverseKernels<'_, '_> {
     /// Return the outputs for the inputs of the record with zero initial conditions.
-    fn rest(&mut self) -> Vec<Vec<f64>> {
+    fn zero_initial_response(&mut self) -> Vec<Vec<f64>> {
         let (rhs, m) = (&self.system.rhs, self.system.record.m());
         let mut outputs = vec![vec![0.0; m]; self.kernels.len()];
         let mut product = vec![0.0; m];
         for (output, row) in outputs.iter_mut().zip(&self.kernels) {
-            for (kernel, driver) in row.iter().zip(rhs) {
-                kernel.apply(driver, &mut product, &mut self.buffers);
+            for (kernel, input) in row.iter().zip(rhs) {
+                kernel.apply(input, &mut product, &mut self.buffers);
                 output.iter_mut().zip(&product).for_each(|(y, v)| *y += v);
             }
         }
@@ -302,26 +305,26 @@ impl InverseKernels<'_, '_> {
     }
 
     /// Return the responses of all outputs to an initial term with coefficient 1 in equation `i`.
-    fn unit(&mut self, (i, exponent): (usize, f64)) -> Vec<Vec<f64>> {
+    fn unit_response(&mut self, (i, exponent): (usize, f64)) -> Vec<Vec<f64>> {
         let (system, m) = (self.system, self.system.record.m());
         if system.is_output_impulse(i, exponent) {
             return system.initial_term_right_side(i, exponent);
         }
         let buffers = &mut self.buffers;
-        let mut through = |kernel: &Kernel, term: &[f64]| {
+        let mut response = |kernel: &Kernel, term: &[f64]| {
             let mut out = vec![0.0; m];
             kernel.apply(term, &mut out, buffers);
             out
         };
         let Some(term) = system.record.unfiltered_term(exponent) else {
             let term = system.record.forcing_term(exponent);
-            return self.kernels.iter().map(|row| through(&row[i], &term)).collect();
+            return self.kernels.iter().map(|row| response(&row[i], &term)).collect();
         };
         let inverse = &self.inverse;
         let filtered_kernels = self.filtered_kernels[i].get_or_insert_with(|| {
             inverse.iter().map(|row| Kernel::new(&system.record.apply_filter(row[i].clone()))).collect()
         });
-        filtered_kernels.iter().map(|kernel| through(kernel, &term)).collect()
+        filtered_kernels.iter().map(|kernel| response(kernel, &term)).collect()
     }
 }
 

@@ -132,7 +132,7 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # }
 /// ```
 pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-    build_system(equations, record, &as_terms(equations.len(), units)?)?.unit_responses(units)
+    build_system(equations, record, &unit_terms(equations.len(), units)?)?.unit_responses(units)
 }
 
 /// Return the response with zero initial conditions ([`respond`]) and the [`unit_responses`]. Both share their
@@ -146,13 +146,13 @@ pub fn respond_and_units(
     record: &Record,
     units: &[(usize, f64)],
 ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
-    let system = build_system(equations, record, &as_terms(equations.len(), units)?)?;
-    system.rest_and_unit_responses(units)
+    let system = build_system(equations, record, &unit_terms(equations.len(), units)?)?;
+    system.zero_initial_and_unit_responses(units)
 }
 
 /// Return the initial terms `units` with coefficient 1, by equation. Return an error for an equation index out of
 /// range.
-fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
+fn unit_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
     let mut initial = vec![Vec::new(); equations];
     for &(i, exponent) in units {
         initial
@@ -189,7 +189,7 @@ pub fn respond_with_initial(
     let exponents: Vec<Vec<f64>> = (equations.iter().enumerate())
         .map(|(i, e)| e.structure.initial_exponents(if is_filtered(i) { initial } else { initial.without_filter() }))
         .collect();
-    let through = |mut outputs: Vec<Vec<f64>>| {
+    let apply_filter = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
             for (output, _) in outputs.iter_mut().zip(filter.applies).filter(|&(_, &applies)| applies) {
                 *output = series::multiply(filter.series, output, record.m());
@@ -197,13 +197,13 @@ pub fn respond_with_initial(
         }
         outputs
     };
-    let mut outputs = through(system.solve(&system.rhs)?);
+    let mut outputs = apply_filter(system.solve(&system.rhs)?);
     let mut coefficients: Vec<Vec<f64>> = exponents.iter().map(|e| vec![0.0; e.len()]).collect();
-    let finite = |outputs: &[Vec<f64>]| outputs.iter().flatten().all(|v| v.is_finite());
-    if exponents.iter().all(Vec::is_empty) || !finite(&outputs) {
+    let is_finite = |outputs: &[Vec<f64>]| outputs.iter().flatten().all(|v| v.is_finite());
+    if exponents.iter().all(Vec::is_empty) || !is_finite(&outputs) {
         return Ok(Response { outputs, exponents, initial: coefficients });
     }
-    let weights: Vec<f64> = equations.iter().map(|e| weight(record.signal(e.structure.output))).collect();
+    let weights: Vec<f64> = equations.iter().map(|e| output_weight(record.signal(e.structure.output))).collect();
     let stack = |outputs: &[Vec<f64>]| -> Vec<f64> {
         outputs.iter().zip(&weights).flat_map(|(o, w)| o.iter().map(move |v| v * w)).collect()
     };
@@ -212,16 +212,16 @@ pub fn respond_with_initial(
         .collect();
     let terms: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
     let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.unit_responses(&terms)?))
-        .map(|(&(i, e, _), outputs)| (i, e, through(outputs)))
-        .filter(|(_, _, response)| finite(response))
+        .map(|(&(i, e, _), outputs)| (i, e, apply_filter(outputs)))
+        .filter(|(_, _, response)| is_finite(response))
         .collect();
     let columns: Vec<Vec<f64>> = responses.iter().map(|(_, _, r)| stack(r)).collect();
-    let misses: Vec<Vec<f64>> = equations
+    let residuals: Vec<Vec<f64>> = equations
         .iter()
         .zip(&outputs)
         .map(|(e, o)| record.signal(e.structure.output).iter().zip(o).map(|(y, v)| y - v).collect())
         .collect();
-    let (solution, _) = least_squares::solve(&columns, &stack(&misses), 0)?;
+    let (solution, _) = least_squares::solve(&columns, &stack(&residuals), 0)?;
     for ((i, e, response), x) in responses.iter().zip(solution) {
         coefficients[*i][*e] = x;
         for (output, r) in outputs.iter_mut().zip(response) {
@@ -232,7 +232,7 @@ pub fn respond_with_initial(
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn weight(y: &[f64]) -> f64 {
+fn output_weight(y: &[f64]) -> f64 {
     let mean = y.iter().sum::<f64>() / y.len() as f64;
     let variance = y.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / y.len() as f64;
     if variance > 0.0 {
@@ -292,19 +292,19 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
         check_finite(&format!("signal {i}"), signal)?;
         check_length(&format!("signal {i}"), signals[0].len(), signal.len())?;
     }
-    let whole = |order: f64| (order - order.round()).abs() < ORDER_GRAIN && order >= 0.0;
+    let is_integer = |order: f64| (order - order.round()).abs() < ORDER_GRAIN && order >= 0.0;
     let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
     let alpha: Vec<usize> = equations.iter().map(|e| e.structure.order.round() as usize).collect();
     for (i, equation) in equations.iter().enumerate() {
         let structure = &equation.structure;
         structure.check(signals.len(), |s| !outputs.contains(&s))?;
         equation.check(signals.len())?;
-        let fits = |term: &crate::equation::Term| match outputs.iter().position(|&o| o == term.signal) {
-            Some(j) => whole(term.order) && (term.order.round() as usize) < alpha[j],
+        let is_supported = |term: &crate::equation::Term| match outputs.iter().position(|&o| o == term.signal) {
+            Some(j) => is_integer(term.order) && (term.order.round() as usize) < alpha[j],
             None => term.order.abs() < ORDER_GRAIN,
         };
         // An order within the resolution of 0 is an integer, but has no state.
-        if !whole(structure.order) || alpha[i] == 0 || !structure.terms.iter().all(fits) {
+        if !is_integer(structure.order) || alpha[i] == 0 || !structure.terms.iter().all(is_supported) {
             return Err(Error::Structure {
                 what: format!("equation {i} has orders that explicit Euler cannot step"),
                 remedy: "use integer orders below that of each output, and order 0 for inputs, or use the simulation by series"
@@ -316,7 +316,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
     // states[i][ν] is D^ν of output i.
     let mut states: Vec<Vec<f64>> = alpha.iter().map(|&a| vec![0.0; a]).collect();
     let mut out = vec![Vec::with_capacity(rows); equations.len()];
-    let read = |signal: usize, row: usize| signals[signal][row];
+    let sample = |signal: usize, row: usize| signals[signal][row];
     for row in 0..rows {
         let highest: Vec<f64> = equations
             .iter()
@@ -326,7 +326,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
                     .map(|(term, c)| {
                         c * match outputs.iter().position(|&o| o == term.signal) {
                             Some(j) => states[j][term.order.round() as usize],
-                            None => read(term.signal, row),
+                            None => sample(term.signal, row),
                         }
                     })
                     .sum()
@@ -371,11 +371,11 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
             let mut divisor = vec![0.0; m];
             divisor[0] = 1.0;
             let mut numerator = vec![0.0; m];
-            for ((own, part), c) in parts.iter().zip(row) {
-                if *own {
-                    divisor.iter_mut().zip(part).for_each(|(d, v)| *d -= c * v);
+            for ((is_output_term, series), c) in parts.iter().zip(row) {
+                if *is_output_term {
+                    divisor.iter_mut().zip(series).for_each(|(d, v)| *d -= c * v);
                 } else {
-                    numerator.iter_mut().zip(part).for_each(|(n, v)| *n += c * v);
+                    numerator.iter_mut().zip(series).for_each(|(n, v)| *n += c * v);
                 }
             }
             let response = series::divide(&numerator, &divisor)?;
@@ -417,16 +417,16 @@ fn alternating_sum(eta: f64) -> f64 {
 
 /// Riemann zeta function ζ(x) for x > 1, by Euler–Maclaurin summation with 16 terms.
 fn zeta(x: f64) -> f64 {
-    const TERMS: f64 = 16.0;
+    const TERM_COUNT: f64 = 16.0;
     let mut sum = 0.0;
     let mut n = 1.0;
-    while n < TERMS {
+    while n < TERM_COUNT {
         sum += libm::pow(n, -x);
         n += 1.0;
     }
-    let last = libm::pow(TERMS, -x);
-    let slope = x * last / TERMS;
-    let third = slope * (x + 1.0) * (x + 2.0) / (TERMS * TERMS);
-    let fifth = third * (x + 3.0) * (x + 4.0) / (TERMS * TERMS);
-    sum + last * TERMS / (x - 1.0) + 0.5 * last + slope / 12.0 - third / 720.0 + fifth / 30240.0
+    let last = libm::pow(TERM_COUNT, -x);
+    let slope = x * last / TERM_COUNT;
+    let third = slope * (x + 1.0) * (x + 2.0) / (TERM_COUNT * TERM_COUNT);
+    let fifth = third * (x + 3.0) * (x + 4.0) / (TERM_COUNT * TERM_COUNT);
+    sum + last * TERM_COUNT / (x - 1.0) + 0.5 * last + slope / 12.0 - third / 720.0 + fifth / 30240.0
 }

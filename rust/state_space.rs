@@ -102,7 +102,7 @@ pub fn respond(
     }
     let Some(model) = Realization::new(equations, inputs, initial, step)? else { return Ok(None) };
     let Some(recursion) = model.discretize(inputs)? else { return Ok(None) };
-    recursion.run(model.start, rows, stop).map(Some)
+    recursion.run(model.initial_state, rows, stop).map(Some)
 }
 
 /// Convert an order or exponent to an integer. Values above [`MAX_STATES`] become [`MAX_STATES`] + 1. Return an error
@@ -128,8 +128,8 @@ struct Realization {
     /// Gains (h B, D) of each input on the states and on the outputs.
     input_vectors: Vec<(Vec<f64>, Vec<f64>)>,
     /// Output matrix C, one row per output.
-    read: Vec<f64>,
-    start: Vec<f64>,
+    output_matrix: Vec<f64>,
+    initial_state: Vec<f64>,
 }
 
 impl Realization {
@@ -148,10 +148,12 @@ impl Realization {
         let mut terms = Vec::new();
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
-                let of_input = || inputs.iter().position(|u| u.signal == term.signal).map(|q| count + q);
+                let input_index = || inputs.iter().position(|u| u.signal == term.signal).map(|q| count + q);
                 let eta = integer(structure.integration(k))?;
                 // A signal that is neither output nor input is zero.
-                let Some(source) = outputs.iter().position(|&o| o == term.signal).or_else(of_input) else { continue };
+                let Some(source) = outputs.iter().position(|&o| o == term.signal).or_else(input_index) else {
+                    continue;
+                };
                 if c != 0.0 {
                     terms.push((i, eta, source, c));
                     lengths[i] = eta.max(lengths[i]);
@@ -177,39 +179,39 @@ impl Realization {
             }
         }
         let norm = |m: &[f64]| m.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        let Ok(through) = small::inverse(&feedthrough, count) else { return Ok(None) };
-        let condition = norm(&feedthrough) * norm(&through);
+        let Ok(feedthrough_inverse) = small::inverse(&feedthrough, count) else { return Ok(None) };
+        let condition = norm(&feedthrough) * norm(&feedthrough_inverse);
         if condition.is_nan() || condition > MAX_CONDITION {
             return Ok(None);
         }
-        let mut read = vec![0.0; count * n];
+        let mut output_matrix = vec![0.0; count * n];
         for (i, row) in (0..count).flat_map(|i| (0..count).map(move |row| (i, row))).filter(|&(i, _)| lengths[i] > 0) {
-            read[row * n + first[i]] = through[row * count + i];
+            output_matrix[row * n + first[i]] = feedthrough_inverse[row * count + i];
         }
         let mut input_vectors: Vec<(Vec<f64>, Vec<f64>)> =
-            direct.iter().map(|f| (vec![0.0; n], dense::multiply(&through, f, count, count, 1))).collect();
+            direct.iter().map(|f| (vec![0.0; n], dense::multiply(&feedthrough_inverse, f, count, count, 1))).collect();
         let mut system = vec![0.0; n * n];
-        let mut start = vec![0.0; n];
+        let mut initial_state = vec![0.0; n];
         for i in 0..count {
             (first[i]..(first[i] + lengths[i]).saturating_sub(1)).for_each(|row| system[row * n + row + 1] = step);
             for &(exponent, value) in initial.get(i).into_iter().flatten() {
                 let power = integer(exponent)?;
                 #[allow(clippy::cast_precision_loss)]
                 let factorial: f64 = (1..=power).map(|k| k as f64).product();
-                start[first[i] + power] += value * factorial;
+                initial_state[first[i] + power] += value * factorial;
             }
         }
         for &(i, eta, source, c) in terms.iter().filter(|t| t.1 > 0) {
             let (row, gain) = (first[i] + eta - 1, step * c);
             match source.checked_sub(count) {
                 None => {
-                    (0..n).for_each(|j| system[row * n + j] += gain * read[source * n + j]);
+                    (0..n).for_each(|j| system[row * n + j] += gain * output_matrix[source * n + j]);
                     input_vectors.iter_mut().for_each(|(b, d)| b[row] += gain * d[source]);
                 }
                 Some(q) => input_vectors[q].0[row] += gain,
             }
         }
-        let mut model = Self { states: n, outputs: count, system, input_vectors, read, start };
+        let mut model = Self { states: n, outputs: count, system, input_vectors, output_matrix, initial_state };
         model.balance();
         Ok(Some(model))
     }
@@ -225,8 +227,8 @@ impl Realization {
                 break;
             }
             for i in 0..n {
-                let sum = |of: &dyn Fn(usize) -> usize| {
-                    (0..n).filter(|&j| j != i).map(|j| self.system[of(j)].abs()).sum::<f64>()
+                let sum = |index: &dyn Fn(usize) -> usize| {
+                    (0..n).filter(|&j| j != i).map(|j| self.system[index(j)].abs()).sum::<f64>()
                 };
                 let (column, row) = (sum(&|j| j * n + i), sum(&|j| i * n + j));
                 let ratio = (row / column).log2() * 0.5;
@@ -238,9 +240,9 @@ impl Realization {
                     self.system[j * n + i] *= factor;
                     self.system[i * n + j] /= factor;
                 });
-                self.read.iter_mut().skip(i).step_by(n).for_each(|v| *v *= factor);
+                self.output_matrix.iter_mut().skip(i).step_by(n).for_each(|v| *v *= factor);
                 self.input_vectors.iter_mut().for_each(|(b, _)| b[i] /= factor);
-                self.start[i] /= factor;
+                self.initial_state[i] /= factor;
                 has_changed = true;
             }
         }
@@ -253,11 +255,11 @@ impl Realization {
         let mut channels = Vec::with_capacity(inputs.len());
         for (input, (input_vector, direct)) in inputs.iter().zip(&self.input_vectors) {
             let nearest = input.delay.round();
-            let is_whole = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.abs().max(1.0);
-            let delay = if is_whole { nearest } else { input.delay };
+            let is_integer = (input.delay - nearest).abs() <= DELAY_TOLERANCE * nearest.abs().max(1.0);
+            let delay = if is_integer { nearest } else { input.delay };
             let fraction = delay - delay.floor();
             #[allow(clippy::cast_possible_truncation)]
-            let whole = delay.floor().clamp(-1e18, 1e18) as isize;
+            let integer_delay = delay.floor().clamp(-1e18, 1e18) as isize;
             let Some(InputGains { now, later }) =
                 InputGains::new(&interval, &self.system, input_vector, input.between, fraction)
             else {
@@ -269,14 +271,14 @@ impl Realization {
                 }
                 Intersample::Linear => (Cow::Borrowed(input.samples.as_slice()), 0),
                 Intersample::Hold => {
-                    (Cow::Borrowed(input.samples.as_slice()), whole.saturating_add(isize::from(fraction > 0.0)))
+                    (Cow::Borrowed(input.samples.as_slice()), integer_delay.saturating_add(isize::from(fraction > 0.0)))
                 }
             };
             let channel = Channel { samples, lag, before: input.before, now, later, direct: direct.clone() };
             channels.push(channel);
         }
-        let finite = channels.iter().flat_map(|c| c.now.iter().chain(&c.later).chain(&c.direct));
-        if !finite.chain(&self.start).chain(&self.read).all(|v| v.is_finite()) {
+        let gains = channels.iter().flat_map(|c| c.now.iter().chain(&c.later).chain(&c.direct));
+        if !gains.chain(&self.initial_state).chain(&self.output_matrix).all(|v| v.is_finite()) {
             return Ok(None);
         }
         // Columns are contiguous, so that the states of a step are independent sums.
@@ -285,7 +287,7 @@ impl Realization {
             states: n,
             outputs: self.outputs,
             transition_increment,
-            read: self.read.clone(),
+            output_matrix: self.output_matrix.clone(),
             channels,
         }))
     }
@@ -300,15 +302,15 @@ pub(crate) struct Transition {
 }
 
 impl Transition {
-    /// Compute the functions of M = `share` × `matrix` by scaling and squaring; None if they overflow.
+    /// Compute the functions of M = `scale` × `matrix` by scaling and squaring; None if they overflow.
     #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn new(matrix: &[f64], n: usize, share: f64) -> Option<Self> {
-        let norm = (0..n).map(|i| (0..n).map(|j| matrix[i * n + j].abs()).sum::<f64>()).fold(0.0_f64, f64::max) * share;
+    pub(crate) fn new(matrix: &[f64], n: usize, scale: f64) -> Option<Self> {
+        let norm = (0..n).map(|i| (0..n).map(|j| matrix[i * n + j].abs()).sum::<f64>()).fold(0.0_f64, f64::max) * scale;
         if !norm.is_finite() {
             return None;
         }
         let halvings = if norm > 0.5 { norm.log2().ceil() as i32 + 1 } else { 0 };
-        let scaled: Vec<f64> = matrix.iter().map(|v| v * share * 0.5_f64.powi(halvings)).collect();
+        let scaled: Vec<f64> = matrix.iter().map(|v| v * scale * 0.5_f64.powi(halvings)).collect();
         let with_diagonal = |mut matrix: Vec<f64>, value: f64| {
             (0..n).for_each(|i| matrix[i * n + i] += value);
             matrix
@@ -331,8 +333,8 @@ impl Transition {
             let squared = product(&transition_increment, &transition_increment);
             transition_increment.iter_mut().zip(&squared).for_each(|(v, s)| *v = 2.0 * *v + s);
         }
-        let finite = transition_increment.iter().chain(&first).chain(&second).all(|v| v.is_finite());
-        finite.then_some(Self { transition_increment, first, second })
+        let is_finite = transition_increment.iter().chain(&first).chain(&second).all(|v| v.is_finite());
+        is_finite.then_some(Self { transition_increment, first, second })
     }
 }
 
@@ -363,18 +365,21 @@ impl InputGains {
         fraction: f64,
     ) -> Option<Self> {
         let n = input_vector.len();
-        let all = dense::multiply(&interval.first, input_vector, n, n, 1);
+        let total = dense::multiply(&interval.first, input_vector, n, n, 1);
         let later: Vec<f64> = match between {
             Intersample::Linear => dense::multiply(&interval.second, input_vector, n, n, 1),
-            Intersample::Hold if fraction == 0.0 => return Some(Self { now: all, later: vec![0.0; n] }),
+            Intersample::Hold if fraction == 0.0 => return Some(Self { now: total, later: vec![0.0; n] }),
             Intersample::Hold => {
                 // The next value takes effect within the interval and acts over the rest of it.
-                let rest = 1.0 - fraction;
-                let part = Transition::new(system, n, rest)?;
-                dense::multiply(&part.first, input_vector, n, n, 1).into_iter().map(|v| v * rest).collect()
+                let remaining_fraction = 1.0 - fraction;
+                let remaining_interval = Transition::new(system, n, remaining_fraction)?;
+                dense::multiply(&remaining_interval.first, input_vector, n, n, 1)
+                    .into_iter()
+                    .map(|v| v * remaining_fraction)
+                    .collect()
             }
         };
-        let now = all.iter().zip(&later).map(|(a, b)| a - b).collect();
+        let now = total.iter().zip(&later).map(|(a, b)| a - b).collect();
         Some(Self { now, later })
     }
 }
@@ -399,7 +404,7 @@ struct Recursion<'a> {
     outputs: usize,
     /// Transition matrix e^{hA} minus I, column-major.
     transition_increment: Vec<f64>,
-    read: Vec<f64>,
+    output_matrix: Vec<f64>,
     channels: Vec<Channel<'a>>,
 }
 
@@ -421,25 +426,25 @@ impl Recursion<'_> {
         let mut out = vec![0.0; self.outputs * rows];
         let mut history = vec![0.0; BLOCK_ROWS * n];
         let mut values = vec![0.0; BLOCK_ROWS + 1];
-        for begin in (0..rows).step_by(BLOCK_ROWS) {
+        for first_row in (0..rows).step_by(BLOCK_ROWS) {
             stop.check()?;
-            let count = BLOCK_ROWS.min(rows - begin);
+            let count = BLOCK_ROWS.min(rows - first_row);
             history.fill(0.0);
             for channel in &self.channels {
-                channel.read(begin, &mut values);
+                channel.write_values(first_row, &mut values);
                 for (gains, shift) in [(&channel.now, 0), (&channel.later, 1)] {
                     if gains.iter().any(|&gain| gain != 0.0) {
                         add_forcing(n, gains, &values[shift..], &mut history);
                     }
                 }
                 for (samples, &gain) in out.chunks_exact_mut(rows).zip(&channel.direct).filter(|&(_, &g)| g != 0.0) {
-                    let samples = &mut samples[begin..begin + count];
+                    let samples = &mut samples[first_row..first_row + count];
                     samples.iter_mut().zip(&values).for_each(|(y, value)| *y += gain * value);
                 }
             }
             advance(n, &self.transition_increment, &mut state, &mut history);
-            for (samples, gains) in out.chunks_exact_mut(rows).zip(self.read.chunks_exact(n.max(1))) {
-                add_outputs(n, gains, &history, &mut samples[begin..begin + count]);
+            for (samples, gains) in out.chunks_exact_mut(rows).zip(self.output_matrix.chunks_exact(n.max(1))) {
+                add_outputs(n, gains, &history, &mut samples[first_row..first_row + count]);
             }
             state.iter_mut().filter(|x| x.abs() < MIN_STATE).for_each(|x| *x = 0.0);
         }
@@ -448,18 +453,19 @@ impl Recursion<'_> {
 }
 
 impl Channel<'_> {
-    /// Write the values of the input in the rows from `begin` on to `values`. The last sample is held beyond the
+    /// Write the values of the input in the rows from `first_row` on to `values`. The last sample is held beyond the
     /// record.
-    fn read(&self, begin: usize, values: &mut [f64]) {
+    fn write_values(&self, first_row: usize, values: &mut [f64]) {
         let last_value = self.samples.last().copied().unwrap_or(0.0);
-        let early = (0..values.len()).take_while(|row| delayed_row(begin + row, self.lag).is_none()).count();
-        let (early, rest) = values.split_at_mut(early);
-        early.fill(self.before);
-        let first = delayed_row(begin + early.len(), self.lag).unwrap_or(usize::MAX);
+        let before_record =
+            (0..values.len()).take_while(|row| delayed_row(first_row + row, self.lag).is_none()).count();
+        let (before_record, in_record) = values.split_at_mut(before_record);
+        before_record.fill(self.before);
+        let first = delayed_row(first_row + before_record.len(), self.lag).unwrap_or(usize::MAX);
         let samples = self.samples.get(first..).unwrap_or_default();
-        let (own, rest_of_block) = rest.split_at_mut(samples.len().min(rest.len()));
-        own.copy_from_slice(&samples[..own.len()]);
-        rest_of_block.fill(last_value);
+        let (sampled, after_record) = in_record.split_at_mut(samples.len().min(in_record.len()));
+        sampled.copy_from_slice(&samples[..sampled.len()]);
+        after_record.fill(last_value);
     }
 }
 
@@ -490,9 +496,9 @@ fn advance(n: usize, transition_increment: &[f64], state: &mut [f64], history: &
     let (transition_increment, state) = (&transition_increment[..n * n], &mut state[..n]);
     for row in history.chunks_exact_mut(n.max(1)) {
         for i in 0..n {
-            let past = state[i];
+            let current = state[i];
             state[i] += row[i];
-            row[i] = past;
+            row[i] = current;
         }
         for j in 0..n {
             for i in 0..n {

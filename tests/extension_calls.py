@@ -398,14 +398,14 @@ class Sound:
 
     def joint_fit(self):
         problem, runs, values = self.sampled()
-        near, start = self.one((values, [1.0], 1), None), self.one(values, None)
+        warm_start, initial_guess = self.one((values, [1.0], 1), None), self.one(values, None)
         raced = self.one(None, _core.joint_multistart(problem, runs, (1, 1 << 30)))
         return (
             problem,
             runs,
             self.one([], [values]),
-            start,
-            near,
+            initial_guess,
+            warm_start,
             raced,
             self.one(True, False),
             self.one(True, False),
@@ -417,9 +417,17 @@ class Sound:
     def state_of_fit(self):
         """Problem, runs and the state of a fit."""
         problem, runs, values = self.sampled()
-        shares = ("weights", [1.0]), ("shares", None), ("every", self.one(1, 2)), ("settled", self.one(True, False))
         numbers = np.array(values)
-        return problem, runs, {"estimate": numbers, "on_grid": numbers, **dict(shares), "steady": self.one(True, False)}
+        state = {
+            "estimate": numbers,
+            "on_grid": numbers,
+            "weights": [1.0],
+            "robust_weights": None,
+            "pulses_per_sample": self.one(1, 2),
+            "step_converged": self.one(True, False),
+            "requires_stability": self.one(True, False),
+        }
+        return problem, runs, state
 
     def profile_intervals(self):
         options = {"threads": self.one(1, 2), "evaluations": self.one(1, 20), "budget": self.one(None, (40, 1))}

@@ -95,10 +95,10 @@ _Floats: TypeAlias = NDArray[np.float64]
 
 #: Initial state of a record: (flags of signals with a sensor-filter transient, initial levels of the signals, responses
 #: of the filter to an impulse and its derivatives as rows, or None).
-_Begun: TypeAlias = tuple[Sequence[bool], Sequence[float], _Floats | None]
+_InitialState: TypeAlias = tuple[Sequence[bool], Sequence[float], _Floats | None]
 #: (step [s], signals as rows, series of the sensor filter or None), followed by the initial state of a run with nonzero
 #: initial conditions.
-_Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Floats, _Floats | None, _Begun]
+_Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Floats, _Floats | None, _InitialState]
 #: (output, alpha, [(signal, order) of each term]). Signals are row indices of the record.
 _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]
 #: (structure, coefficient of each term)
@@ -128,14 +128,14 @@ class _Options(TypedDict):
 
 #: Order grid: (output, values of alpha, [(signal, values of the order, whether the terms of the signal are
 #: interchangeable) of each term]).
-_Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
+_OrderGrid: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
 #: Affine function of the free orders: (constant, weight of each free order).
 _Affine: TypeAlias = tuple[float, Sequence[float]]
 #: (output, alpha, [(signal, order) of each term]) with orders that follow from the order law.
 _LawEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine]]]
 #: Nonuniform samples: (sample times in pulses, (times in pulses, sizes) of the jumps of each signal with zero-order
 #: hold, or None for other signals).
-_OwnTimes: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
+_NonuniformSamples: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
 
 class _Experiment(TypedDict):
     record: _Record
@@ -150,7 +150,7 @@ class _Experiment(TypedDict):
     signals: Sequence[tuple[_Floats | None, bool]]
     #: Robust weights of the samples, one row per output; None without a robust loss.
     robust_weights: _Floats | None
-    sample_times: _OwnTimes | None
+    sample_times: _NonuniformSamples | None
 
 class _Channel(TypedDict):
     name: str
@@ -193,7 +193,7 @@ class Recording:
         self, /, m: int, filtered: bool
     ) -> tuple[float, _Matrix, _Vector | None, tuple[list[bool], list[float], _Matrix | None]]: ...
     def experiment(
-        self, /, every: int, decimation: int, weights: Sequence[float], shares: _Floats | None = None
+        self, /, pulses_per_sample: int, decimation: int, weights: Sequence[float], robust_weights: _Floats | None = None
     ) -> Experiment: ...
     def jumps(self, /, signal: int) -> tuple[_Vector, _Vector] | None: ...
     def values_at(self, /, signal: int, times: _Floats) -> _Vector | None: ...
@@ -251,7 +251,7 @@ class _InstrumentalFit(TypedDict):
     damped: bool
 
 class _Certified(TypedDict):
-    at_least: float
+    lower_bound: float
     best: float
     alpha: float
     orders: list[float]
@@ -298,8 +298,8 @@ def filter_series(
 
 # -------------------------------------------------------------------------------- tall matrices, their columns as rows
 
-def triangular_factor(given: _Floats) -> _Matrix: ...
-def singular_values(given: _Floats) -> tuple[_Matrix, _Vector, _Matrix]: ...
+def triangular_factor(transpose: _Floats) -> _Matrix: ...
+def singular_values(transpose: _Floats) -> tuple[_Matrix, _Vector, _Matrix]: ...
 
 # ---------------------------------------------------------------------------------------------------------- estimators
 
@@ -326,7 +326,7 @@ def projected_errors(
     inputs: Sequence[bool],
     fixed: Sequence[float | None],
     terms: _Initial,
-    own: Sequence[float],
+    autoregressive_orders: Sequence[float],
     points: Sequence[Sequence[float]],
 ) -> list[tuple[float, list[float]] | None]: ...
 def multi_innovation(
@@ -398,14 +398,14 @@ class _Profile(TypedDict):
     evaluations: int
 
 class _JointFit(TypedDict):
-    shares: list[_Matrix] | None
-    every: int
+    robust_weights: list[_Matrix] | None
+    pulses_per_sample: int
     estimate: list[float]
-    settled: bool
+    step_converged: bool
     covariance: _Matrix
     noise: list[float]
     #: Residuals of each run divided by the noise standard deviation, one row per output; NaN for a missing sample.
-    left: list[_Matrix]
+    residuals: list[_Matrix]
     #: (number of down-weighted residuals, number of outliers, number of residuals); None without a robust loss.
     robust: tuple[int, int, int] | None
     #: Fraction of the information on a parameter that its prior contributes, one per prior, in the order of parameters.
@@ -423,7 +423,7 @@ class _JointFit(TypedDict):
     #: Choice between an unstable and a stable optimum: (whether the unstable one is kept, relative excess of the
     #: residuals of the stable one, whether the stable one is at the stability limit); None if there was no such
     #: choice.
-    growth: tuple[bool, float, bool] | None
+    unstable_optimum: tuple[bool, float, bool] | None
 
 @final
 class JointProblem:
@@ -456,20 +456,20 @@ class JointMultistart: ...
 def joint_multistart(
     problem: JointProblem,
     runs: Sequence[Recording],
-    means: tuple[int, int],
+    resources: tuple[int, int],
     progress: Callable[[int, int], object] | None = None,
     stop: Stop | None = None,
 ) -> JointMultistart: ...
 def joint_fit(
     problem: JointProblem,
     runs: Sequence[Recording],
-    known: Sequence[Sequence[float]],
-    start: Sequence[float] | None,
-    near: tuple[Sequence[float], Sequence[float], int] | None,
+    guesses: Sequence[Sequence[float]],
+    initial_guess: Sequence[float] | None,
+    warm_start: tuple[Sequence[float], Sequence[float], int] | None,
     candidates: JointMultistart | None,
     huber: bool,
     refine: bool,
-    means: tuple[int, int],
+    resources: tuple[int, int],
     progress: Callable[[int, int], object] | None = None,
     stop: Stop | None = None,
 ) -> _JointFit | None: ...
@@ -491,7 +491,7 @@ def cost_surface(
     runs: Sequence[Recording],
     fit: Mapping[str, Any],
     pair: tuple[int, int],
-    halves: tuple[float, float],
+    half_widths: tuple[float, float],
     points: int,
     *,
     refit: bool = True,
@@ -552,7 +552,7 @@ def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], tra
 def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
 def correlation(x: Sequence[_Floats], y: Sequence[_Floats], lags: int) -> tuple[_Vector, float, int]: ...
 def richardson_limit(
-    grids: Sequence[tuple[_Floats, Sequence[float]]], owners: Sequence[int]
+    grids: Sequence[tuple[_Floats, Sequence[float]]], outputs: Sequence[int]
 ) -> tuple[_Matrix, _Vector, list[float]]: ...
 
 #: Initial terms: (whether their coefficients are fitted, [(exponent, coefficient) of each term] of each equation,
@@ -571,7 +571,7 @@ class OutputSimulation:
         derived: Sequence[_Derived] = ...,
     ) -> OutputSimulation: ...
     def samples(
-        self, /, every: int, terms: _Terms, stop: Stop | None = None
+        self, /, pulses_per_sample: int, terms: _Terms, stop: Stop | None = None
     ) -> tuple[_Matrix, list[list[tuple[float, float]]]]: ...
     def exact_samples(
         self, /, terms: _Terms, stop: Stop | None = None
@@ -599,11 +599,11 @@ class OutputSimulation:
         stop: Stop | None = None,
     ) -> list[list[tuple[float, float]]] | None: ...
     def fit_initial_states(
-        self, /, start: _Initial, every: int, stop: Stop | None = None
+        self, /, initial_terms: _Initial, pulses_per_sample: int, stop: Stop | None = None
     ) -> list[list[tuple[float, float]]]: ...
 
-def interpolate_samples(means: _Floats, places: _Floats) -> _Matrix: ...
-def kink_correction(m: int, places: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
+def interpolate_samples(means: _Floats, positions: _Floats) -> _Matrix: ...
+def kink_correction(m: int, positions: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
 def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float, float]: ...
 
 # ------------------------------------------------------------------------------------------------------------ searches
@@ -622,10 +622,10 @@ def certify(
     memory: int,
     progress: _Progress | None,
 ) -> _Certified: ...
-def order_grid_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...
+def order_grid_size(orders: _OrderGrid, inputs: Sequence[bool]) -> int: ...
 def search(
     runs: Sequence[_Record],
-    orders: _Lattice,
+    orders: _OrderGrid,
     inputs: Sequence[bool],
     fixed: Sequence[float | None],
     terms: _Initial,
@@ -635,10 +635,10 @@ def search(
 def panic_on_purpose(place: str) -> None: ...
 def force_portable(on: bool) -> None: ...
 def search_plan(
-    orders: _Lattice, inputs: Sequence[bool], terms: _Initial, settings: _Options
+    orders: _OrderGrid, inputs: Sequence[bool], terms: _Initial, settings: _Options
 ) -> tuple[int, list[int]]: ...
 def search_join(
-    orders: _Lattice,
+    orders: _OrderGrid,
     inputs: Sequence[bool],
     terms: _Initial,
     settings: _Options,
@@ -651,7 +651,7 @@ class OrderSearch:
     def __new__(
         cls,
         runs: Sequence[_Record],
-        orders: _Lattice,
+        orders: _OrderGrid,
         inputs: Sequence[bool],
         fixed: Sequence[float | None],
         terms: _Initial,

@@ -22,11 +22,12 @@ const RANK_TOLERANCE: f64 = 1e-10;
 
 /// Return twice the log-likelihood ratio of two nested regressions under autoregressive noise, at least 0.
 ///
-/// `residuals` (N samples) are regressed on the columns `few` and on the columns `many`. Each set of columns is
-/// orthonormal. `outputs` contains, for each output, the index range of each run in `residuals`. Each output has its
-/// own autoregressive noise of at most `most` lags. The noise order is first selected for each set of columns
-/// separately, because an autoregression of high order can imitate a missing column. The larger of the two orders then
-/// limits both final fits, so that they predict the same samples. The cost is O(k² N) for k columns or lags.
+/// `residuals` (N samples) are regressed on the columns `nested_columns` and on the columns `full_columns`. Each set of
+/// columns is orthonormal. `outputs` contains, for each output, the index range of each run in `residuals`. Each output
+/// has its own autoregressive noise of at most `max_lag` lags. The noise order is first selected for each set of
+/// columns separately, because an autoregression of high order can imitate a missing column. The larger of the two
+/// orders then limits both final fits, so that they predict the same samples. The cost is O(k² N) for k columns or
+/// lags.
 ///
 /// # Errors
 /// [`Error::Length`] if a column has another length than `residuals`, or if a range ends beyond the residuals.
@@ -53,25 +54,25 @@ const RANK_TOLERANCE: f64 = 1e-10;
 /// # }
 /// ```
 pub fn prediction_ratio(
-    few: &[Vec<f64>],
-    many: &[Vec<f64>],
+    nested_columns: &[Vec<f64>],
+    full_columns: &[Vec<f64>],
     residuals: &[f64],
     outputs: &[Vec<Range<usize>>],
-    most: usize,
+    max_lag: usize,
     stop: &Stop,
 ) -> Result<f64> {
-    for column in few.iter().chain(many) {
+    for column in nested_columns.iter().chain(full_columns) {
         check_length("column", residuals.len(), column.len())?;
     }
-    if let Some(end) = outputs.iter().flatten().map(|place| place.end).find(|end| *end > residuals.len()) {
+    if let Some(end) = outputs.iter().flatten().map(|range| range.end).find(|end| *end > residuals.len()) {
         check_length("residuals", end, residuals.len())?;
     }
-    let shortest = |places: &Vec<Range<usize>>| places.iter().map(Range::len).min().unwrap_or(0);
-    let limits: Vec<usize> = outputs.iter().map(|places| most.min(shortest(places) / SAMPLES_PER_LAG)).collect();
+    let shortest = |ranges: &Vec<Range<usize>>| ranges.iter().map(Range::len).min().unwrap_or(0);
+    let limits: Vec<usize> = outputs.iter().map(|ranges| max_lag.min(shortest(ranges) / SAMPLES_PER_LAG)).collect();
     let fit = |columns, limits: &[usize]| noise_criterion(columns, residuals, outputs, limits, stop);
-    let (orders, other_orders) = (fit(few, &limits)?.1, fit(many, &limits)?.1);
-    let common: Vec<usize> = orders.into_iter().zip(other_orders).map(|(a, b)| a.max(b)).collect();
-    Ok((fit(few, &common)?.0 - fit(many, &common)?.0).max(0.0))
+    let (orders, other_orders) = (fit(nested_columns, &limits)?.1, fit(full_columns, &limits)?.1);
+    let max_orders: Vec<usize> = orders.into_iter().zip(other_orders).map(|(a, b)| a.max(b)).collect();
+    Ok((fit(nested_columns, &max_orders)?.0 - fit(full_columns, &max_orders)?.0).max(0.0))
 }
 
 /// Return the noise criterion after regression on `columns`, summed over outputs, and the noise order of each output.
@@ -86,15 +87,15 @@ fn noise_criterion(
     limits: &[usize],
     stop: &Stop,
 ) -> Result<(f64, Vec<usize>)> {
-    let mut amounts: Vec<f64> = columns.iter().map(|column| inner(column, residuals)).collect();
+    let mut coefficients: Vec<f64> = columns.iter().map(|column| inner(column, residuals)).collect();
     let (mut best, mut orders) = (f64::INFINITY, limits.to_vec());
     for _ in 0..MAX_ALTERNATIONS {
         stop.check()?;
         let mut noise = residuals.to_vec();
-        columns.iter().zip(&amounts).for_each(|(column, x)| add_multiple(&mut noise, -x, column));
-        let fit = |(places, &most): (&Vec<Range<usize>>, &usize)| {
-            let series: Vec<&[f64]> = places.iter().map(|place| &noise[place.clone()]).collect();
-            Autoregression::fit(&series, most)
+        columns.iter().zip(&coefficients).for_each(|(column, x)| add_multiple(&mut noise, -x, column));
+        let fit = |(ranges, &max_lag): (&Vec<Range<usize>>, &usize)| {
+            let series: Vec<&[f64]> = ranges.iter().map(|range| &noise[range.clone()]).collect();
+            Autoregression::fit(&series, max_lag)
         };
         let fits: Vec<Autoregression> = outputs.iter().zip(limits).map(fit).collect();
         let criterion: f64 = fits.iter().map(|fit| fit.criterion).sum();
@@ -104,15 +105,16 @@ fn noise_criterion(
         best = criterion;
         orders = fits.iter().map(Autoregression::order).collect();
         let whiten = |column: &[f64]| -> Vec<f64> {
-            let of = fits.iter().zip(outputs).zip(limits);
-            of.flat_map(|((fit, places), &first)| {
-                places.iter().flat_map(move |place| fit.whiten(&column[place.clone()], first))
-            })
-            .collect()
+            let models = fits.iter().zip(outputs).zip(limits);
+            models
+                .flat_map(|((fit, ranges), &first)| {
+                    ranges.iter().flat_map(move |range| fit.whiten(&column[range.clone()], first))
+                })
+                .collect()
         };
         let whitened: Vec<Vec<f64>> = columns.iter().map(|column| whiten(column)).collect();
         let error = || Error::Internal { what: "singular values of whitened columns that do not converge".into() };
-        amounts = minimum_norm_solution(&whitened, &whiten(residuals), RANK_TOLERANCE).ok_or_else(error)?;
+        coefficients = minimum_norm_solution(&whitened, &whiten(residuals), RANK_TOLERANCE).ok_or_else(error)?;
     }
     Ok((best, orders))
 }
@@ -135,39 +137,39 @@ impl Autoregression {
     /// Fit an autoregression to the series and one to their increments, and return the one with the lower criterion.
     ///
     /// The model of the increments has a root fixed at 1 (a random walk). Both models are fitted by least squares and
-    /// predict the samples of each series from index `most` on. The order minimizes Akaike's criterion, because white
-    /// noise on a random walk needs many lags. The model of the series itself is penalized by the logarithm of the
-    /// number of samples. Without this penalty, a random walk would pass for stationary noise about a mean, because an
-    /// estimated root near 1 is biased downward. The series are not centered, because their mean is the quantity under
-    /// test.
+    /// predict the samples of each series from index `max_lag` on. The order minimizes Akaike's criterion, because
+    /// white noise on a random walk needs many lags. The model of the series itself is penalized by the logarithm of
+    /// the number of samples. Without this penalty, a random walk would pass for stationary noise about a mean, because
+    /// an estimated root near 1 is biased downward. The series are not centered, because their mean is the quantity
+    /// under test.
     #[allow(clippy::cast_precision_loss)]
-    fn fit(series: &[&[f64]], most: usize) -> Self {
-        let size = most + 1;
+    fn fit(series: &[&[f64]], max_lag: usize) -> Self {
+        let size = max_lag + 1;
         let mut factor = vec![0.0; size * size];
         for values in series {
-            for start in (most..values.len()).step_by(BLOCK_ROWS) {
+            for start in (max_lag..values.len()).step_by(BLOCK_ROWS) {
                 let end = (start + BLOCK_ROWS).min(values.len());
                 // The columns are the lags and then the predicted sample, so that one triangular factor contains the
                 // fit of every order.
                 let column = |j: usize| {
-                    let lag = if j < most { j + 1 } else { 0 };
-                    let above = (0..size).map(|i| factor[i * size + j]);
-                    above.chain(values[start - lag..end - lag].iter().copied()).collect()
+                    let lag = if j < max_lag { j + 1 } else { 0 };
+                    let processed = (0..size).map(|i| factor[i * size + j]);
+                    processed.chain(values[start - lag..end - lag].iter().copied()).collect()
                 };
                 factor = triangular_factor(&(0..size).map(column).collect::<Vec<_>>());
             }
         }
-        let count: usize = series.iter().map(|values| values.len().saturating_sub(most)).sum();
+        let count: usize = series.iter().map(|values| values.len().saturating_sub(max_lag)).sum();
         let direct = Self::of_best_order(&factor, size, count, &[1.0], libm::log(count.max(1) as f64));
-        if most == 0 {
+        if max_lag == 0 {
             return direct;
         }
         let column = |j: usize| -> Vec<f64> {
-            let (one, other) = if j + 1 < most { (j, j + 1) } else { (most, 0) };
-            (0..size).map(|i| factor[i * size + one] - factor[i * size + other]).collect()
+            let (first, second) = if j + 1 < max_lag { (j, j + 1) } else { (max_lag, 0) };
+            (0..size).map(|i| factor[i * size + first] - factor[i * size + second]).collect()
         };
-        let increments = triangular_factor(&(0..most).map(column).collect::<Vec<_>>());
-        let random_walk = Self::of_best_order(&increments, most, count, &[1.0, -1.0], 0.0);
+        let increments = triangular_factor(&(0..max_lag).map(column).collect::<Vec<_>>());
+        let random_walk = Self::of_best_order(&increments, max_lag, count, &[1.0, -1.0], 0.0);
         if random_walk.criterion < direct.criterion {
             random_walk
         } else {
@@ -189,11 +191,15 @@ impl Autoregression {
         let criterion = |order: usize| count as f64 * libm::log(variance(order)) + 2.0 * order as f64 + penalty;
         let order = (1..size).fold(0, |best, order| if criterion(order) < criterion(best) { order } else { best });
         let lags: Vec<Vec<f64>> = (0..order).map(|j| (0..order).map(|i| factor[i * size + j]).collect()).collect();
-        let share = f64::EPSILON * order as f64;
-        let coefficients = minimum_norm_solution(&lags, &last[..order], share).unwrap_or_else(|| vec![0.0; order]);
-        let own: Vec<f64> = std::iter::once(1.0).chain(coefficients.iter().map(|c| -c)).collect();
-        let mut filter = vec![0.0; own.len() + difference.len() - 1];
-        difference.iter().enumerate().for_each(|(k, d)| add_multiple(&mut filter[k..k + own.len()], *d, &own));
+        let relative_tolerance = f64::EPSILON * order as f64;
+        let coefficients =
+            minimum_norm_solution(&lags, &last[..order], relative_tolerance).unwrap_or_else(|| vec![0.0; order]);
+        let estimated_filter: Vec<f64> = std::iter::once(1.0).chain(coefficients.iter().map(|c| -c)).collect();
+        let mut filter = vec![0.0; estimated_filter.len() + difference.len() - 1];
+        difference
+            .iter()
+            .enumerate()
+            .for_each(|(k, d)| add_multiple(&mut filter[k..k + estimated_filter.len()], *d, &estimated_filter));
         Self { filter, deviation: variance(order).sqrt(), criterion: criterion(order) }
     }
 

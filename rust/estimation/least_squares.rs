@@ -21,7 +21,7 @@ pub struct Estimate {
     /// Exponents of the initial terms (powers of time).
     pub exponents: Vec<f64>,
     /// Initial terms excluded as linearly dependent, as pairs of record index and exponent index.
-    pub dropped: Vec<(usize, usize)>,
+    pub excluded_terms: Vec<(usize, usize)>,
 }
 
 /// Regression of an equation over several records, which are stacked in columns and target.
@@ -94,26 +94,28 @@ impl Regression {
 
     /// Convert a solution (free coefficients, then coefficients of the initial terms by record) to an [`Estimate`].
     ///
-    /// `dropped` contains the indices of excluded columns.
+    /// `excluded_columns` contains the indices of excluded columns.
     ///
     /// # Errors
     /// [`Error::Length`] for a solution of another length. [`Error::Structure`] if an excluded column is not an initial
     /// term.
-    pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Result<Estimate> {
+    pub fn estimate(&self, solution: &[f64], excluded_columns: &[usize]) -> Result<Estimate> {
         let first = self.free_count();
         let count = first + (self.starts.len() - 1) * self.exponents.len();
         check_length("solution", count, solution.len())?;
-        if let Some(index) = dropped.iter().find(|index| !(first..count).contains(index)) {
+        if let Some(index) = excluded_columns.iter().find(|index| !(first..count).contains(index)) {
             let what = format!("column {index} is not an initial term; these are columns {first} to {count}");
             return Err(Error::Structure { what, remedy: "omit initial terms only".into() });
         }
         let mut free = solution.iter();
         let coefficients = self.fixed.iter().map(|f| f.or_else(|| free.next().copied()).unwrap_or(0.0)).collect();
         let width = self.exponents.len();
-        let rest: Vec<f64> = free.copied().collect();
-        let initial = (0..self.starts.len() - 1).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
-        let dropped = dropped.iter().map(|&index| ((index - first) / width, (index - first) % width)).collect();
-        Ok(Estimate { coefficients, initial, exponents: self.exponents.clone(), dropped })
+        let initial_coefficients: Vec<f64> = free.copied().collect();
+        let initial =
+            (0..self.starts.len() - 1).map(|r| initial_coefficients[r * width..(r + 1) * width].to_vec()).collect();
+        let excluded_terms =
+            excluded_columns.iter().map(|&index| ((index - first) / width, (index - first) % width)).collect();
+        Ok(Estimate { coefficients, initial, exponents: self.exponents.clone(), excluded_terms })
     }
 }
 
@@ -146,19 +148,19 @@ impl Regression {
 /// ```
 pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
     let regression = Regression::new(records, structure, fixed, initial)?;
-    let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free_count())?;
-    regression.estimate(&solution, &dropped)
+    let (solution, excluded_columns) = solve(&regression.columns, &regression.target, regression.free_count())?;
+    regression.estimate(&solution, &excluded_columns)
 }
 
 /// Minimize ‖target − Σ x_k column_k‖ over the coefficients x_k by QR factorization.
 ///
-/// The first `needed` columns must be linearly independent. Later dependent columns are excluded, with coefficient 0.
+/// The first `required` columns must be linearly independent. Later dependent columns are excluded, with coefficient 0.
 /// Return the coefficients and the indices of the excluded columns.
 ///
 /// # Errors
 /// [`Error::Singular`] with the index of the first dependent column among the needed ones. [`Error::Length`] if a
 /// column has another length than the target.
-pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec<f64>, Vec<usize>)> {
+pub fn solve(columns: &[Vec<f64>], target: &[f64], required: usize) -> Result<(Vec<f64>, Vec<usize>)> {
     let k = columns.len();
     columns.iter().try_for_each(|column| check_length("column", target.len(), column.len()))?;
     if k == 0 {
@@ -166,8 +168,8 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
     }
     let scales: Vec<f64> = columns.iter().map(|c| norm(c)).collect();
     let mut independent: Vec<usize> = (0..k).collect();
-    if let Some(&zero) = independent.iter().find(|&&i| i < needed && !(scales[i] > 0.0 && scales[i].is_finite())) {
-        return Err(Error::Singular { index: zero, count: k });
+    if let Some(&index) = independent.iter().find(|&&i| i < required && !(scales[i] > 0.0 && scales[i].is_finite())) {
+        return Err(Error::Singular { index, count: k });
     }
     independent.retain(|&i| scales[i] > 0.0 && scales[i].is_finite());
     let target_scale = norm(target).max(f64::MIN_POSITIVE);
@@ -179,7 +181,7 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
         let stride = scaled.len();
         let dependent = (0..independent.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
         if let Some(position) = dependent {
-            if independent[position] < needed {
+            if independent[position] < required {
                 return Err(Error::Singular { index: independent[position], count: k });
             }
             independent.remove(position);
@@ -191,8 +193,8 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
         for (&i, value) in independent.iter().zip(solution) {
             x[i] = value * target_scale / scales[i];
         }
-        let dropped = (0..k).filter(|i| !independent.contains(i)).collect();
-        return Ok((x, dropped));
+        let excluded_columns = (0..k).filter(|i| !independent.contains(i)).collect();
+        return Ok((x, excluded_columns));
     }
 }
 

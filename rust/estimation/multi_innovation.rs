@@ -138,27 +138,27 @@ pub fn closed_form(
     let regression = regression_in_basis(records, structure, fixed, initial, innovation)?;
     let Regression { columns, target, starts, .. } = &regression;
     let prior = innovation.prior.precisions(columns);
-    let (solution, dropped) =
+    let (solution, excluded_columns) =
         weighted_solution((columns, target, starts), innovation.length, &prior, regression.free_count())?;
-    regression.estimate(&solution, &dropped)
+    regression.estimate(&solution, &excluded_columns)
 }
 
 /// Return the least-squares solution of the weighted rows and the prior rows, and the linearly dependent columns.
 ///
-/// `prior` contains the inverse prior covariances. The first `needed` columns must be independent.
+/// `prior` contains the inverse prior covariances. The first `required` columns must be independent.
 fn weighted_solution(
     (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
     prior: &[f64],
-    needed: usize,
+    required: usize,
 ) -> Result<(Vec<f64>, Vec<usize>)> {
     let columns = columns.iter().map(|column| column.as_ref().to_vec()).collect();
     let (columns, target) = weighted_rows(columns, target.to_vec(), starts, length, prior);
     // With a prior, only a zero column under a relative prior is linearly dependent in exact arithmetic.
-    let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
-    match dropped.iter().find(|&&column| column < needed) {
+    let (solution, excluded_columns) = least_squares::solve(&columns, &target, 0)?;
+    match excluded_columns.iter().find(|&&column| column < required) {
         Some(&index) => Err(Error::Singular { index, count: columns.len() }),
-        None => Ok((solution, dropped)),
+        None => Ok((solution, excluded_columns)),
     }
 }
 
@@ -252,13 +252,13 @@ fn run_recursion(
     let mut trace = Vec::with_capacity(target.len() * columns.len());
     for pair in starts.windows(2) {
         window.clear();
-        for (newest, &measured) in target.iter().enumerate().take(pair[1]).skip(pair[0]) {
+        for (row_index, &measured) in target.iter().enumerate().take(pair[1]).skip(pair[0]) {
             stop.check()?;
-            row.iter_mut().zip(columns).for_each(|(value, column)| *value = column.as_ref()[newest]);
+            row.iter_mut().zip(columns).for_each(|(value, column)| *value = column.as_ref()[row_index]);
             window.push(&row, measured)?;
             state
                 .step(&window)
-                .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: newest })?;
+                .map_err(|_| Error::Diverged { what: "covariance of the recursion".into(), index: row_index })?;
             trace.extend_from_slice(state.coefficients());
         }
     }

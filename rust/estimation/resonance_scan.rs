@@ -30,15 +30,15 @@ struct RecordSpectra {
     terms: Vec<Kernel>,
     initial: Vec<Kernel>,
     /// Kernels of the autoregressive terms.
-    own: Vec<Vec<f64>>,
+    autoregressive_kernels: Vec<Vec<f64>>,
 }
 
 /// Fit an equation by output error for several sets of fixed autoregressive coefficients.
 ///
-/// `structure` contains the terms in signals other than the output. `own` contains the integration orders of the
-/// autoregressive terms, and each point contains their coefficients. The coefficients of the other terms and of the
-/// initial terms follow by linear least squares. There is one result per point. It is None if the response overflows or
-/// a free term is linearly dependent.
+/// `structure` contains the terms in signals other than the output. `autoregressive_orders` contains the integration
+/// orders of the autoregressive terms, and each point contains their coefficients. The coefficients of the other terms
+/// and of the initial terms follow by linear least squares. There is one result per point. It is None if the response
+/// overflows or a free term is linearly dependent.
 ///
 /// Integrals of signals, powers of time and kernels are computed once. The cost is O(points · columns · m log m) for
 /// records of m pulses.
@@ -62,10 +62,10 @@ struct RecordSpectra {
 /// let rest = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; 300], input.clone()]), None)?;
 /// let y = ftlm::simulate::respond(&[plant], &rest, &[])?.remove(0);
 /// let run = Record::new(0.02, PulseMeans::from_signals(vec![y, input]), None)?;
-/// let driven = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// let points = [vec![-4.0], vec![-9.0]];
-/// let found = resonance_scan::fit_with_fixed_poles(&[run], &driven, &[None], &Initial::Rest, &[2.0], &points)?;
-/// let errors: Vec<f64> = found.iter().flatten().map(|one| one.error).collect();
+/// let estimates = resonance_scan::fit_with_fixed_poles(&[run], &structure, &[None], &Initial::Rest, &[2.0], &points)?;
+/// let errors: Vec<f64> = estimates.iter().flatten().map(|estimate| estimate.error).collect();
 /// assert!(errors.len() == 2 && errors[0] > 0.1 && errors[1] < 1e-9);
 /// # Ok(())
 /// # }
@@ -75,45 +75,52 @@ pub fn fit_with_fixed_poles(
     structure: &Structure,
     fixed: &[Option<f64>],
     initial: &Initial,
-    own: &[f64],
+    autoregressive_orders: &[f64],
     points: &[Vec<f64>],
 ) -> Result<Vec<Option<FixedPoleEstimate>>> {
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_finite("fixed coefficients", &fixed.iter().flatten().copied().collect::<Vec<_>>())?;
-    own.iter().try_for_each(|&eta| check_order("integration of an own term", eta))?;
-    points.iter().try_for_each(|point| check_length("coefficients of a point", own.len(), point.len()))?;
+    autoregressive_orders.iter().try_for_each(|&eta| check_order("integration of an autoregressive term", eta))?;
+    points
+        .iter()
+        .try_for_each(|point| check_length("coefficients of a point", autoregressive_orders.len(), point.len()))?;
     let regression = Regression::new(records, structure, &vec![None; fixed.len()], initial)?;
     // Linearly dependent inputs have linearly dependent responses up to rounding.
     if solve(&regression.columns[..regression.free_count()], &regression.target, regression.free_count()).is_err() {
         return Ok(vec![None; points.len()]);
     }
-    let parts: Vec<RecordSpectra> =
-        (records.iter().enumerate()).map(|(r, record)| record_spectra(&regression, own, r, record)).collect();
-    let size = norm(&regression.target).max(1e-300);
-    points.iter().map(|point| fit_point(&parts, fixed, point, size)).collect()
+    let parts: Vec<RecordSpectra> = (records.iter().enumerate())
+        .map(|(r, record)| record_spectra(&regression, autoregressive_orders, r, record))
+        .collect();
+    let output_norm = norm(&regression.target).max(1e-300);
+    points.iter().map(|point| fit_point(&parts, fixed, point, output_norm)).collect()
 }
 
-fn record_spectra(regression: &Regression, own: &[f64], r: usize, record: &Record) -> RecordSpectra {
+fn record_spectra(regression: &Regression, autoregressive_orders: &[f64], r: usize, record: &Record) -> RecordSpectra {
     let rows = regression.starts[r]..regression.starts[r + 1];
-    let of = |column: &Vec<f64>| Kernel::new(&column[rows.clone()]);
+    let kernel_of = |column: &Vec<f64>| Kernel::new(&column[rows.clone()]);
     let (terms, initial) = regression.columns.split_at(regression.free_count());
-    let each = initial.len() / (regression.starts.len() - 1);
+    let term_count = initial.len() / (regression.starts.len() - 1);
     RecordSpectra {
         target: regression.target[rows.clone()].to_vec(),
-        terms: terms.iter().map(of).collect(),
-        initial: initial[r * each..(r + 1) * each].iter().map(of).collect(),
-        own: own.iter().map(|&eta| block_pulse_kernel(eta, record.m(), record.step())).collect(),
+        terms: terms.iter().map(kernel_of).collect(),
+        initial: initial[r * term_count..(r + 1) * term_count].iter().map(kernel_of).collect(),
+        autoregressive_kernels: autoregressive_orders
+            .iter()
+            .map(|&eta| block_pulse_kernel(eta, record.m(), record.step()))
+            .collect(),
     }
 }
 
 /// Fit at one point: compute the responses of each record, then eliminate the initial terms.
 ///
-/// `size` is the norm of the measured output. Return None if a response overflows or a free term is linearly dependent.
+/// `output_norm` is the norm of the measured output. Return None if a response overflows or a free term is linearly
+/// dependent.
 fn fit_point(
     parts: &[RecordSpectra],
     fixed: &[Option<f64>],
     point: &[f64],
-    size: f64,
+    output_norm: f64,
 ) -> Result<Option<FixedPoleEstimate>> {
     let mut buffers = Buffers::default();
     let mut target: Vec<f64> = Vec::new();
@@ -123,7 +130,7 @@ fn fit_point(
         let m = part.target.len();
         let mut divisor = vec![0.0; m];
         divisor[0] = 1.0;
-        for (c, kernel) in point.iter().zip(&part.own) {
+        for (c, kernel) in point.iter().zip(&part.autoregressive_kernels) {
             divisor.iter_mut().zip(kernel).for_each(|(d, v)| *d -= c * v);
         }
         let response = reciprocal(&divisor);
@@ -131,7 +138,7 @@ fn fit_point(
             return Ok(None);
         }
         let response = Kernel::new(&response);
-        let mut through = |series: &Kernel| {
+        let mut respond = |series: &Kernel| {
             let mut out = vec![0.0; m];
             response.times(series, &mut out, &mut buffers);
             out
@@ -139,24 +146,28 @@ fn fit_point(
         let mut residual = part.target.clone();
         let mut free = columns.iter_mut();
         for (series, coefficient) in part.terms.iter().zip(fixed) {
-            let answer = through(series);
+            let output = respond(series);
             match coefficient {
-                Some(c) => residual.iter_mut().zip(&answer).for_each(|(t, v)| *t -= c * v),
-                None => free.next().into_iter().for_each(|column| column.extend(&answer)),
+                Some(c) => residual.iter_mut().zip(&output).for_each(|(t, v)| *t -= c * v),
+                None => free.next().into_iter().for_each(|column| column.extend(&output)),
             }
         }
         target.extend(residual);
-        initial_responses.push(part.initial.iter().map(&mut through).collect::<Vec<_>>());
+        initial_responses.push(part.initial.iter().map(&mut respond).collect::<Vec<_>>());
     }
-    let finite = |v: &[f64]| v.iter().all(|x| x.is_finite());
-    if !finite(&target) || !columns.iter().all(|c| finite(c)) || !initial_responses.iter().flatten().all(|c| finite(c))
+    let is_finite = |v: &[f64]| v.iter().all(|x| x.is_finite());
+    if !is_finite(&target)
+        || !columns.iter().all(|c| is_finite(c))
+        || !initial_responses.iter().flatten().all(|c| is_finite(c))
     {
         return Ok(None);
     }
-    let Some((values, missed)) = solve_with_initial_terms(columns, target, initial_responses) else { return Ok(None) };
+    let Some((values, residual_norm)) = solve_with_initial_terms(columns, target, initial_responses) else {
+        return Ok(None);
+    };
     let mut values = values.into_iter();
     let coefficients = fixed.iter().map(|f| f.or_else(|| values.next()).unwrap_or(f64::NAN)).collect();
-    Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
+    Ok(Some(FixedPoleEstimate { error: residual_norm / output_norm, coefficients }))
 }
 
 /// Fit the coefficients of the columns together with the initial terms of each record.
@@ -167,33 +178,35 @@ fn solve_with_initial_terms(
     target: Vec<f64>,
     initial_responses: Vec<Vec<Vec<f64>>>,
 ) -> Option<(Vec<f64>, f64)> {
-    let lengths: Vec<usize> = initial_responses.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
+    let lengths: Vec<usize> = initial_responses.iter().map(|responses| responses.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
-    let (mut less, mut residual) = (columns.clone(), target.clone());
+    let (mut projected, mut residual) = (columns.clone(), target.clone());
     let mut from = 0;
-    for (own, &m) in initial_responses.iter().zip(&lengths) {
+    for (responses, &m) in initial_responses.iter().zip(&lengths) {
         let mut basis = Vec::new();
-        own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
-        for series in less.iter_mut().chain(std::iter::once(&mut residual)) {
+        responses.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
+        for series in projected.iter_mut().chain(std::iter::once(&mut residual)) {
             let rows = &mut series[from..from + m];
             project_out(&basis, rows);
             project_out(&basis, rows);
         }
         from += m;
     }
-    let is_determined =
-        less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
+    let is_determined = projected
+        .iter()
+        .zip(&columns)
+        .all(|(projected, original)| norm(projected) > MIN_REMAINING_NORM_RATIO * norm(original));
     let (columns, target) = if is_determined {
-        (less, residual)
+        (projected, residual)
     } else {
         (append_initial_terms(columns, &initial_responses, &lengths), target)
     };
     let (x, _) = solve(&columns, &target, free).ok()?;
-    let mut missed = target;
+    let mut remaining = target;
     for (column, c) in columns.iter().zip(&x) {
-        missed.iter_mut().zip(column).for_each(|(e, v)| *e -= c * v);
+        remaining.iter_mut().zip(column).for_each(|(e, v)| *e -= c * v);
     }
-    Some((x, norm(&missed)))
+    Some((x, norm(&remaining)))
 }
 
 /// Append the columns of the initial terms. Each of them is zero outside its record.
@@ -204,8 +217,8 @@ fn append_initial_terms(
 ) -> Vec<Vec<f64>> {
     let rows = lengths.iter().sum();
     let mut from = 0;
-    for (own, &m) in initial_responses.iter().zip(lengths) {
-        for series in own {
+    for (responses, &m) in initial_responses.iter().zip(lengths) {
+        for series in responses {
             let mut column = vec![0.0; rows];
             column[from..from + m].copy_from_slice(series);
             columns.push(column);

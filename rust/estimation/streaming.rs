@@ -38,8 +38,10 @@ struct PulseWeights {
 
 impl PulseWeights {
     #[inline(always)]
-    fn apply(&self, newest: f64, past: &SignalHistory) -> f64 {
-        self.recent[0] * newest + self.recent[1] * past.last + dot(&self.history, &past.states[..self.history.len()])
+    fn apply(&self, newest: f64, history: &SignalHistory) -> f64 {
+        self.recent[0] * newest
+            + self.recent[1] * history.last
+            + dot(&self.history, &history.states[..self.history.len()])
     }
 }
 
@@ -91,13 +93,13 @@ impl RunningIntegral {
 
     /// Advance by one pulse and return the mean of the integral over the newest pulse.
     #[inline(always)]
-    fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
-        let local = self.local.apply(newest, past);
+    fn next(&mut self, newest: f64, history: &SignalHistory) -> f64 {
+        let local = self.local.apply(newest, history);
         match &mut self.inner {
             None => local,
             Some((inner, sum)) => {
                 let value = *sum + local;
-                *sum += self.step * inner.apply(newest, past);
+                *sum += self.step * inner.apply(newest, history);
                 value
             }
         }
@@ -222,7 +224,7 @@ impl Streaming {
             check_finite("fixed coefficients", &fixed_values)?;
             // A stream integrates only. The whole equation is integrated by the excess order of an improper term.
             let orders: Vec<f64> = (0..structure.terms.len()).map(|k| structure.integration(k)).collect();
-            let excess = orders.iter().fold(0.0, |most: f64, order| most.max(-order));
+            let excess = orders.iter().fold(0.0, |largest: f64, order| largest.max(-order));
             let integrals = structure
                 .terms
                 .iter()
@@ -361,11 +363,11 @@ impl simd::SimdKernel for Integration<'_> {
                 *value = integral.next(means[integral.signal], &histories[integral.signal]);
             }
         }
-        for (past, mean) in histories.iter_mut().zip(means) {
-            for ((z, decay_factor), pulse_weight) in past.states.iter_mut().zip(decay_factors).zip(pulse_weights) {
-                *z = *z * decay_factor + pulse_weight * past.last;
+        for (history, mean) in histories.iter_mut().zip(means) {
+            for ((z, decay_factor), pulse_weight) in history.states.iter_mut().zip(decay_factors).zip(pulse_weights) {
+                *z = *z * decay_factor + pulse_weight * history.last;
             }
-            past.last = *mean;
+            history.last = *mean;
         }
     }
 }

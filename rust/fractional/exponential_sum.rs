@@ -34,29 +34,29 @@ impl Rates {
     /// # Errors
     /// [`Error::OutOfRange`] if the lags do not increase or the tolerance is outside (1e−15, 0.1).
     pub fn new(shortest: f64, longest: f64, tolerance: f64) -> Result<Self> {
-        let bad = |name: &str, value: f64, range: &str| Error::OutOfRange {
+        let out_of_range = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
             value,
             range: range.into(),
             remedy: "give lags in seconds and a relative accuracy".into(),
         };
         if !(shortest > 0.0 && shortest.is_finite()) {
-            return Err(bad("shortest lag", shortest, "(0, ∞)"));
+            return Err(out_of_range("shortest lag", shortest, "(0, ∞)"));
         }
         if !(longest > shortest && longest.is_finite()) {
-            return Err(bad("longest lag", longest, "(shortest lag, ∞)"));
+            return Err(out_of_range("longest lag", longest, "(shortest lag, ∞)"));
         }
         if !(tolerance > 1e-15 && tolerance < 0.1) {
-            return Err(bad("tolerance", tolerance, "(1e-15, 0.1)"));
+            return Err(out_of_range("tolerance", tolerance, "(1e-15, 0.1)"));
         }
-        let digits = -libm::log(tolerance);
+        let log_accuracy = -libm::log(tolerance);
         // The growth of Γ off the real axis costs slightly more than e^{−π²/Δx}.
-        let spacing = std::f64::consts::PI * std::f64::consts::PI / (digits + 4.0);
+        let spacing = std::f64::consts::PI * std::f64::consts::PI / (log_accuracy + 4.0);
         let lowest = LOWEST_RATE_TIMES_LAG / longest;
         // Above this rate the remainder at lag `shortest` is below the tolerance, even relative to t^{q−1} at q near 1.
-        let highest = (digits + 8.0) / shortest;
+        let highest = (log_accuracy + 8.0) / shortest;
         if !(highest / lowest).is_finite() {
-            return Err(bad("longest lag", longest, "a range that floating point holds"));
+            return Err(out_of_range("longest lag", longest, "a range that floating point holds"));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let count = (libm::log(highest / lowest) / spacing).ceil() as usize + 1;
@@ -86,11 +86,11 @@ impl Rates {
             *w = scale * libm::pow(*rate, 1.0 - q);
         }
         // Moments Σ_{j≥0} w_j (rate_j/lowest)^k of the nodes of the rule at and below the lowest rate.
-        let at = scale * libm::pow(self.lowest, 1.0 - q);
+        let lowest_weight = scale * libm::pow(self.lowest, 1.0 - q);
         let mut moments = [0.0; 4];
         let mut power = 1.0 - q;
         for moment in &mut moments {
-            *moment = -at / libm::expm1(-power * self.spacing);
+            *moment = -lowest_weight / libm::expm1(-power * self.spacing);
             power += 1.0;
         }
         for (i, weight) in weights.iter_mut().take(TAIL_RATE_RATIOS.len()).enumerate() {
@@ -165,16 +165,16 @@ pub fn integral_by_memory(x: &[f64], order: f64, step: f64, tolerance: f64) -> R
     let weights = rates.weights(order);
     let scale = libm::pow(step, order) / libm::tgamma(order + 2.0);
     let decays: Vec<_> = rates.rates().iter().map(|s| decay(s * step)).collect();
-    let mut past = vec![0.0; weights.len()];
+    let mut history = vec![0.0; weights.len()];
     let mut out = vec![0.0; x.len()];
     for n in 1..x.len() {
         let mut value = scale * (x[n] + order * x[n - 1]);
-        for ((z, w), (keep, first, last)) in past.iter_mut().zip(&weights).zip(&decays) {
-            value += w * keep * *z;
-            *z = *z * keep + step * (first * x[n - 1] + last * x[n]);
+        for ((z, w), (factor, first, last)) in history.iter_mut().zip(&weights).zip(&decays) {
+            value += w * factor * *z;
+            *z = *z * factor + step * (first * x[n - 1] + last * x[n]);
         }
         out[n] = value;
     }
     check_overflow(&out, step)?;
-    Ok((out, past.len()))
+    Ok((out, history.len()))
 }

@@ -8,7 +8,7 @@ use crate::parallel::ForkSafeLock;
 
 /// Return `n^exponent` for n = 0 … m−1, with 0 for n = 0. Only primes require the power function. Every other integer
 /// requires one product. The relative error grows by ε/2 per prime factor. Integers below 2^20 have at most 19 factors.
-pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
+pub(crate) fn integer_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(m), powers_of_primes(exponent, m));
     let mut powers = vec![0.0; m];
     for n in 1..m {
@@ -24,7 +24,7 @@ pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     powers
 }
 
-/// Return `(2k+1)^exponent` for k = 0 … m−1, computed as in [`whole_powers`].
+/// Return `(2k+1)^exponent` for k = 0 … m−1, computed as in [`integer_powers`].
 pub(crate) fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(2 * m), powers_of_primes(exponent, 2 * m));
     let mut powers = vec![1.0; m];
@@ -50,9 +50,9 @@ fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
         None => libm::pow(prime as f64, exponent),
         Some(logarithms) => {
             let (high, low) = logarithms[prime];
-            let (product, left) = exact_product(high, exponent);
+            let (product, rounding_error) = exact_product(high, exponent);
             let value = libm::exp(product);
-            value + value * (left + low * exponent)
+            value + value * (rounding_error + low * exponent)
         }
     }
 }
@@ -60,13 +60,13 @@ fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
 /// Return the rounded product a·b and its rounding error (Dekker, doi:10.1007/BF01397083). There must be no overflow or
 /// underflow.
 fn exact_product(a: f64, b: f64) -> (f64, f64) {
-    const HALVES: f64 = 134_217_729.0;
-    let halves = |x: f64| {
-        let high = HALVES * x - (HALVES * x - x);
+    const SPLITTING_FACTOR: f64 = 134_217_729.0;
+    let split = |x: f64| {
+        let high = SPLITTING_FACTOR * x - (SPLITTING_FACTOR * x - x);
         (high, x - high)
     };
     let product = a * b;
-    let ((a, c), (b, d)) = (halves(a), halves(b));
+    let ((a, c), (b, d)) = (split(a), split(b));
     (product, ((a * b - product) + a * d + c * b) + c * d)
 }
 
@@ -92,9 +92,9 @@ type Values<T> = Option<Arc<Vec<T>>>;
 impl<T> Table<T> {
     /// Return a table with at least m values.
     fn of(&self, m: usize) -> Arc<Vec<T>> {
-        let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
-        let thread_values = || self.thread_values.with_borrow(enough);
-        if let Some(values) = thread_values().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
+        let long_enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
+        let thread_values = || self.thread_values.with_borrow(long_enough);
+        if let Some(values) = thread_values().or_else(|| self.shared.with(|values| long_enough(values)).flatten()) {
             return values;
         }
         let table = Arc::new((self.make)(m.next_power_of_two()));
@@ -113,8 +113,8 @@ impl<T> Table<T> {
 /// Return the least prime divisor of each n < m. The table may be longer.
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
-    static SHARED: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
-    thread_local!(static OWN: RefCell<Values<u32>> = const { RefCell::new(None) });
+    static SHARED_TABLE: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
+    thread_local!(static THREAD_TABLE: RefCell<Values<u32>> = const { RefCell::new(None) });
     let make = |len| {
         let mut divisors: Vec<u32> = (0..len as u32).collect();
         let mut prime = 2;
@@ -130,7 +130,7 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
         }
         divisors
     };
-    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
+    Table { shared: &SHARED_TABLE, thread_values: &THREAD_TABLE, make }.of(m)
 }
 
 /// Return the logarithms ln n in double-double precision for n < m, with 0 for n = 0. The table may be longer.
@@ -139,13 +139,13 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
 /// factors.
 #[allow(clippy::cast_precision_loss)]
 fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
-    static SHARED: ForkSafeLock<Values<Logarithm>> = ForkSafeLock::new(None);
-    thread_local!(static OWN: RefCell<Values<Logarithm>> = const { RefCell::new(None) });
+    static SHARED_TABLE: ForkSafeLock<Values<Logarithm>> = ForkSafeLock::new(None);
+    thread_local!(static THREAD_TABLE: RefCell<Values<Logarithm>> = const { RefCell::new(None) });
     let make = |len| {
         let divisors = least_divisors(len);
-        let added = |(high, low): Logarithm, (other, less): Logarithm| {
-            let (sum, left) = exact_sum(high, other);
-            exact_sum(sum, left + (low + less))
+        let add = |(high, low): Logarithm, (other, other_low): Logarithm| {
+            let (sum, rounding_error) = exact_sum(high, other);
+            exact_sum(sum, rounding_error + (low + other_low))
         };
         let mut logarithms = vec![(0.0, 0.0); len];
         for n in 2..len {
@@ -155,28 +155,28 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
             } else if divisor == n {
                 let odd = (2 * n - 1) as f64;
                 let first = 1.0 / odd;
-                let (product, left) = exact_product(first, odd);
+                let (product, rounding_error) = exact_product(first, odd);
                 let square = first * first;
                 // The truncated part of the series is below 1e−19.
-                let rest = (1..13).rev().fold(0.0, |sum, k| (sum + 1.0 / f64::from(2 * k + 1)) * square);
-                let low = ((1.0 - product) - left) / odd + first * rest;
-                added(logarithms[n - 1], exact_sum(2.0 * first, 2.0 * low))
+                let series_tail = (1..13).rev().fold(0.0, |sum, k| (sum + 1.0 / f64::from(2 * k + 1)) * square);
+                let low = ((1.0 - product) - rounding_error) / odd + first * series_tail;
+                add(logarithms[n - 1], exact_sum(2.0 * first, 2.0 * low))
             } else {
-                added(logarithms[divisor], logarithms[n / divisor])
+                add(logarithms[divisor], logarithms[n / divisor])
             };
         }
         logarithms
     };
-    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
+    Table { shared: &SHARED_TABLE, thread_values: &THREAD_TABLE, make }.of(m)
 }
 
 /// Return the logarithms ln n for n < m, with 0 for n = 0. The table may be longer.
 #[allow(clippy::cast_precision_loss)]
-pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
-    static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);
-    thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
+pub(crate) fn integer_logarithms(m: usize) -> Arc<Vec<f64>> {
+    static SHARED_TABLE: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);
+    thread_local!(static THREAD_TABLE: RefCell<Values<f64>> = const { RefCell::new(None) });
     let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
-    Table { shared: &SHARED, thread_values: &OWN, make }.of(m)
+    Table { shared: &SHARED_TABLE, thread_values: &THREAD_TABLE, make }.of(m)
 }
 
 #[cfg(test)]
@@ -185,10 +185,10 @@ mod tests {
 
     #[test]
     fn a_lock_that_is_never_given_back_stops_no_table() {
-        static SHARED: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
-        thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
-        let table = Table { shared: &SHARED, thread_values: &OWN, make: |len| (0..len).collect() };
-        let (first, second) = SHARED.hold_during(|| (table.of(5), table.of(8)));
+        static SHARED_TABLE: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
+        thread_local!(static THREAD_TABLE: RefCell<Values<usize>> = const { RefCell::new(None) });
+        let table = Table { shared: &SHARED_TABLE, thread_values: &THREAD_TABLE, make: |len| (0..len).collect() };
+        let (first, second) = SHARED_TABLE.hold_during(|| (table.of(5), table.of(8)));
         assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
         assert!(Arc::ptr_eq(&first, &second), "made once");
         let longer = table.of(9);

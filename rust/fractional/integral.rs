@@ -18,7 +18,7 @@ pub enum IntegralRule {
 
 /// Maximum order of a derivative of samples. Each integer order multiplies the noise of the samples by 1/h, where h is
 /// the sampling interval.
-pub const MAX_DERIVATIVE: f64 = 3.0;
+pub const MAX_DERIVATIVE_ORDER: f64 = 3.0;
 
 /// Definition of a fractional derivative of order α, and its discretization with the sampling interval h.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -147,11 +147,11 @@ pub fn fractional_derivative(
     initial: &[f64],
 ) -> Result<Vec<f64>> {
     check_step(step)?;
-    if !(0.0..=MAX_DERIVATIVE).contains(&alpha) {
+    if !(0.0..=MAX_DERIVATIVE_ORDER).contains(&alpha) {
         return Err(Error::OutOfRange {
             name: "order".into(),
             value: alpha,
-            range: format!("[0, {MAX_DERIVATIVE}]"),
+            range: format!("[0, {MAX_DERIVATIVE_ORDER}]"),
             remedy: "reduce the order of the derivative, or move the derivative to an equation".into(),
         });
     }
@@ -169,31 +169,31 @@ pub fn fractional_derivative(
         return Ok(out);
     }
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let whole = alpha.ceil() as usize;
-    if m < whole + 2 {
-        return Err(Error::Length { name: "x".into(), expected: whole + 2, found: m });
+    let integer_order = alpha.ceil() as usize;
+    if m < integer_order + 2 {
+        return Err(Error::Length { name: "x".into(), expected: integer_order + 2, found: m });
     }
     // Initial values, and the highest integer derivative, to which the L1 formula is applied.
     let mut x = x.to_vec();
     x[0] = initial.first().copied().unwrap_or(x[0]);
-    let mut starts = Vec::with_capacity(whole);
+    let mut initial_values = Vec::with_capacity(integer_order);
     let mut highest = Vec::new();
-    for k in 0..whole {
+    for k in 0..integer_order {
         highest = difference(&x, k, step);
-        starts.push(initial.get(k).copied().unwrap_or(highest[0]));
-        highest[0] = starts[k];
+        initial_values.push(initial.get(k).copied().unwrap_or(highest[0]));
+        highest[0] = initial_values[k];
     }
     #[allow(clippy::cast_precision_loss)]
-    let fraction = alpha - (whole - 1) as f64;
-    let mut out = if fraction == 1.0 { difference(&x, whole, step) } else { l1(&highest, fraction, step) };
+    let fraction = alpha - (integer_order - 1) as f64;
+    let mut out = if fraction == 1.0 { difference(&x, integer_order, step) } else { l1(&highest, fraction, step) };
     if definition == Derivative::RiemannLiouville && fraction < 1.0 {
         #[allow(clippy::cast_precision_loss)]
-        for (k, &start) in starts.iter().enumerate() {
-            if start == 0.0 {
+        for (k, &initial_value) in initial_values.iter().enumerate() {
+            if initial_value == 0.0 {
                 continue;
             }
             let power = k as f64 - alpha;
-            let scale = start / libm::tgamma(power + 1.0);
+            let scale = initial_value / libm::tgamma(power + 1.0);
             for (n, value) in out.iter_mut().enumerate() {
                 *value += scale * libm::pow(n as f64 * step, power);
             }
@@ -214,12 +214,12 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
             scale * if k == 0.0 { 1.0 } else { libm::pow(k, a) * libm::expm1(a * libm::log1p(1.0 / k)) }
         })
         .collect();
-    let mut rises = vec![0.0; m];
+    let mut differences = vec![0.0; m];
     for n in 1..m {
-        rises[n] = x[n] - x[n - 1];
+        differences[n] = x[n] - x[n - 1];
     }
     // rises[0] = 0, so the product at n is Σ_{k<n} w_k·(x_{n−k} − x_{n−k−1}).
-    series::multiply(&weights, &rises, m)
+    series::multiply(&weights, &differences, m)
 }
 
 /// Return the derivative of integer order k ≤ 3 by central differences, which are one-sided at the ends. The error is
@@ -230,22 +230,22 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
 fn difference(x: &[f64], k: usize, step: f64) -> Vec<f64> {
     // Weights for the first samples, and central weights for every interior sample.
-    let (ends, centre): (&[&[f64]], &[f64]) = match k {
+    let (end_weights, central_weights): (&[&[f64]], &[f64]) = match k {
         0 => return x.to_vec(),
         1 => (&[&[-1.5, 2.0, -0.5]], &[-0.5, 0.0, 0.5]),
         2 => (&[&[2.0, -5.0, 4.0, -1.0]], &[1.0, -2.0, 1.0]),
         _ => (&[&[-2.5, 9.0, -12.0, 7.0, -1.5], &[-1.5, 5.0, -6.0, 3.0, -0.5]], &[-0.5, 1.0, 0.0, -1.0, 0.5]),
     };
-    let (m, reach) = (x.len(), ends.len());
+    let (m, end_count) = (x.len(), end_weights.len());
     let scale = step.powi(-(k as i32));
     // In reversed time, a derivative of odd order changes its sign.
-    let mirrored = if k % 2 == 1 { -scale } else { scale };
+    let end_scale = if k % 2 == 1 { -scale } else { scale };
     let mut out: Vec<f64> = Vec::with_capacity(m);
-    let weighted = |weights: &[f64], values: &mut dyn Iterator<Item = &f64>| -> f64 {
+    let weighted_sum = |weights: &[f64], values: &mut dyn Iterator<Item = &f64>| -> f64 {
         weights.iter().zip(values).map(|(w, v)| w * v).sum()
     };
-    out.extend(ends.iter().map(|weights| scale * weighted(weights, &mut x.iter())));
-    out.extend(x.windows(2 * reach + 1).map(|window| scale * weighted(centre, &mut window.iter())));
-    out.extend(ends.iter().rev().map(|weights| mirrored * weighted(weights, &mut x.iter().rev())));
+    out.extend(end_weights.iter().map(|weights| scale * weighted_sum(weights, &mut x.iter())));
+    out.extend(x.windows(2 * end_count + 1).map(|window| scale * weighted_sum(central_weights, &mut window.iter())));
+    out.extend(end_weights.iter().rev().map(|weights| end_scale * weighted_sum(weights, &mut x.iter().rev())));
     out
 }

@@ -7,7 +7,7 @@
 //! error of second order in the step. D^q I^q is the identity up to rounding.
 
 use crate::error::{Error, Result};
-use crate::fractional::integer_powers::{odd_powers, whole_logarithms, whole_powers};
+use crate::fractional::integer_powers::{integer_logarithms, integer_powers, odd_powers};
 use crate::series::{multiply, reciprocal};
 
 /// Maximum order of an integral and of an equation. It suffices for five oscillatory modes.
@@ -19,14 +19,15 @@ pub const MAX_ORDER: f64 = 10.0;
 /// Minimum order of an input in an equation. A negative order −3 is a threefold integration.
 pub const MIN_INPUT_ORDER: f64 = -3.0;
 
-/// Distance \[pulses\] below which the even binomial sum of the kernel converges slowly and needs [`TERMS_NEAR`] terms.
+/// Distance \[pulses\] below which the even binomial sum of the kernel converges slowly and needs [`NEAR_SUM_TERMS`]
+/// terms.
 const FAR_DISTANCE_PULSES: usize = 8;
 /// Number of terms of the binomial sum of the kernel for distances of 2 to 7 pulses. At distance 2, the omitted terms,
 /// 4^−25, are below the rounding error.
-const TERMS_NEAR: usize = 25;
+const NEAR_SUM_TERMS: usize = 25;
 /// Number of terms of the binomial sum of the kernel from a distance of 8 pulses on. The omitted terms, 64^−8, are
 /// below the rounding error.
-const TERMS_FAR: usize = 8;
+const FAR_SUM_TERMS: usize = 8;
 
 /// Return the block-pulse kernel of I^η, which is the first row of the matrix F^η: `h^η/Γ(η+2)·v_n`, n = 1 … m, eq.
 /// (32) of the paper. `step` is the pulse length h \[s\].
@@ -48,7 +49,7 @@ pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     if m < MIN_SIEVE_TERMS {
         return (1..=m).map(|n| scale * differences.value(n)).collect();
     }
-    let powers = whole_powers(eta + 1.0, m);
+    let powers = integer_powers(eta + 1.0, m);
     let head = (1..=LONG_SUM_TERMS).map(|n| differences.near_value(n, powers[n - 1]));
     let tail = powers.iter().enumerate().skip(LONG_SUM_TERMS).map(|(c, &power)| differences.far_value(c, power));
     head.chain(tail).map(|v| scale * v).collect()
@@ -70,8 +71,8 @@ pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f
     let slope = libm::log(step) - digamma(eta + 2.0);
     let differences = SecondDifferences::new(eta);
     if m >= MIN_SIEVE_TERMS {
-        let powers = whole_powers(eta + 1.0, m);
-        let logarithms = whole_logarithms(m);
+        let powers = integer_powers(eta + 1.0, m);
+        let logarithms = integer_logarithms(m);
         let (mut kernel, mut slopes) = (Vec::with_capacity(m), Vec::with_capacity(m));
         for (c, (&power, &logarithm)) in powers.iter().zip(logarithms.iter()).enumerate() {
             let (v, dv) = if c < LONG_SUM_TERMS {
@@ -104,16 +105,16 @@ pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
 pub(crate) struct SecondDifferences {
     eta: f64,
     /// Binomial coefficients C(η+1, 2k), k = 1 … K, for the order of integration η.
-    coefficients: [f64; TERMS_NEAR],
+    coefficients: [f64; NEAR_SUM_TERMS],
     /// Derivatives of the binomial coefficients with respect to the order of integration.
-    slopes: [f64; TERMS_NEAR],
+    slopes: [f64; NEAR_SUM_TERMS],
 }
 
 impl SecondDifferences {
     /// Compute the coefficients for the order of integration `eta`.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn new(eta: f64) -> Self {
-        let (mut coefficients, mut slopes) = ([0.0; TERMS_NEAR], [0.0; TERMS_NEAR]);
+        let (mut coefficients, mut slopes) = ([0.0; NEAR_SUM_TERMS], [0.0; NEAR_SUM_TERMS]);
         let (mut c, mut dc) = (1.0, 0.0);
         for (k, (coefficient, slope)) in coefficients.iter_mut().zip(&mut slopes).enumerate() {
             for j in [2 * k, 2 * k + 1] {
@@ -129,11 +130,11 @@ impl SecondDifferences {
         Self { eta, coefficients, slopes }
     }
 
-    /// Return the sum Σ_k a_k x^k, k ≥ 1, with a = `coefficients` and x = `shrink` = centre^{−2}. Only terms above the
-    /// rounding error are added, the smallest first.
-    fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
-        let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
-        coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
+    /// Return the sum Σ_k a_k x^k, k ≥ 1, with a = `coefficients` and x = `inverse_square` = center^{−2}. Only terms
+    /// above the rounding error are added, the smallest first.
+    fn sum(coefficients: &[f64; NEAR_SUM_TERMS], center: usize, inverse_square: f64) -> f64 {
+        let terms = if center < FAR_DISTANCE_PULSES { NEAR_SUM_TERMS } else { FAR_SUM_TERMS };
+        coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * inverse_square)
     }
 
     /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]).
@@ -145,9 +146,9 @@ impl SecondDifferences {
     /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) and its derivative with respect to η.
     #[allow(clippy::cast_precision_loss)]
     fn value_and_slope(&self, n: usize) -> (f64, f64) {
-        let centre = n.saturating_sub(1) as f64;
+        let center = n.saturating_sub(1) as f64;
         let (power, logarithm) =
-            if n > 2 { (libm::pow(centre, self.eta + 1.0), libm::log(centre)) } else { (1.0, 0.0) };
+            if n > 2 { (libm::pow(center, self.eta + 1.0), libm::log(center)) } else { (1.0, 0.0) };
         self.near_value_and_slope(n, power, logarithm)
     }
 
@@ -159,8 +160,8 @@ impl SecondDifferences {
             1 => 1.0,
             2 => 2.0 * libm::expm1(self.eta * std::f64::consts::LN_2),
             _ => {
-                let centre = (n - 1) as f64;
-                2.0 * power * Self::sum(&self.coefficients, n - 1, 1.0 / (centre * centre))
+                let center = (n - 1) as f64;
+                2.0 * power * Self::sum(&self.coefficients, n - 1, 1.0 / (center * center))
             }
         }
     }
@@ -174,8 +175,8 @@ impl SecondDifferences {
             0 | 1 => (value, 0.0),
             2 => (value, 2.0 * libm::exp2(self.eta) * std::f64::consts::LN_2),
             _ => {
-                let centre = (n - 1) as f64;
-                let slope = Self::sum(&self.slopes, n - 1, 1.0 / (centre * centre));
+                let center = (n - 1) as f64;
+                let slope = Self::sum(&self.slopes, n - 1, 1.0 / (center * center));
                 (value, value * logarithm + 2.0 * power * slope)
             }
         }
@@ -188,10 +189,10 @@ const MIN_SIEVE_TERMS: usize = 256;
 /// at most five terms.
 const LONG_SUM_TERMS: usize = 64;
 
-/// Return the number K of terms of the even binomial sum that exceed the rounding error for c = `centre` ≥
+/// Return the number K of terms of the even binomial sum that exceed the rounding error for c = `center` ≥
 /// [`LONG_SUM_TERMS`]. The omitted terms are below c^{−2K}.
-const fn terms_at(centre: usize) -> usize {
-    match centre {
+const fn terms_at(center: usize) -> usize {
+    match center {
         0..1024 => 5,
         1024..32768 => 3,
         _ => 2,
@@ -199,25 +200,25 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) for n = `centre` + 1 > [`LONG_SUM_TERMS`].
-    /// `power` is centre^{η+1}.
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) for n = `center` + 1 > [`LONG_SUM_TERMS`].
+    /// `power` is center^{η+1}.
     #[allow(clippy::cast_precision_loss)]
-    fn far_value(&self, centre: usize, power: f64) -> f64 {
-        let shrink = 1.0 / (centre as f64 * centre as f64);
-        let sum = self.coefficients[..terms_at(centre)].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink);
+    fn far_value(&self, center: usize, power: f64) -> f64 {
+        let inverse_square = 1.0 / (center as f64 * center as f64);
+        let sum = self.coefficients[..terms_at(center)].iter().rev().fold(0.0, |sum, &c| (sum + c) * inverse_square);
         2.0 * power * sum
     }
 
     /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) and its derivative with respect to η, for
-    /// n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power` is centre^{η+1}, and `logarithm` is ln centre.
+    /// n = `center` + 1 > [`LONG_SUM_TERMS`]. `power` is center^{η+1}, and `logarithm` is ln center.
     #[allow(clippy::cast_precision_loss)]
-    fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
-        let shrink = 1.0 / (centre as f64 * centre as f64);
-        let terms = terms_at(centre);
+    fn far_value_and_slope(&self, center: usize, power: f64, logarithm: f64) -> (f64, f64) {
+        let inverse_square = 1.0 / (center as f64 * center as f64);
+        let terms = terms_at(center);
         let (mut sum, mut slope) = (0.0, 0.0);
         for (&c, &dc) in self.coefficients[..terms].iter().zip(&self.slopes[..terms]).rev() {
-            sum = (sum + c) * shrink;
-            slope = (slope + dc) * shrink;
+            sum = (sum + c) * inverse_square;
+            slope = (slope + dc) * inverse_square;
         }
         let value = 2.0 * power * sum;
         (value, value * logarithm + 2.0 * power * slope)
@@ -229,7 +230,7 @@ impl SecondDifferences {
 #[must_use]
 pub fn digamma(x: f64) -> f64 {
     // B_{2k}/(2k) for k = 1 … 7 with Bernoulli numbers B. The eighth term is below 1e−17 at x = 10.
-    const SERIES: [f64; 7] =
+    const BERNOULLI_SERIES: [f64; 7] =
         [1.0 / 12.0, -1.0 / 120.0, 1.0 / 252.0, -1.0 / 240.0, 1.0 / 132.0, -691.0 / 32760.0, 1.0 / 12.0];
     if x.is_nan() || x <= 0.0 {
         return f64::NAN;
@@ -240,7 +241,7 @@ pub fn digamma(x: f64) -> f64 {
         x += 1.0;
     }
     let square = 1.0 / (x * x);
-    let tail = SERIES.iter().rev().fold(0.0, |sum, &b| (sum + b) * square);
+    let tail = BERNOULLI_SERIES.iter().rev().fold(0.0, |sum, &b| (sum + b) * square);
     libm::log(x) - 0.5 / x - tail - shift
 }
 
@@ -306,7 +307,7 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let means = PowerMeans::new(exponent, step);
     let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_slope(k as f64)).collect();
     if out.len() < m {
-        let (odd, logarithms) = (odd_powers(exponent, m), whole_logarithms(2 * m));
+        let (odd, logarithms) = (odd_powers(exponent, m), integer_logarithms(2 * m));
         let far = odd.iter().enumerate().skip(ENDPOINT_PULSES);
         out.extend(far.map(|(k, &power)| means.midpoint_slope(k, power, logarithms[2 * k + 1])));
     }
@@ -387,9 +388,9 @@ impl PowerMeans {
     #[allow(clippy::cast_precision_loss)]
     fn sum(sums: &[f64; MIDPOINT_SERIES_TERMS], k: usize) -> f64 {
         let d = (2 * k + 1) as f64;
-        let shrink = 1.0 / (d * d);
+        let inverse_square = 1.0 / (d * d);
         let terms = if k < LONG_SUM_TERMS { MIDPOINT_SERIES_TERMS } else { terms_at(2 * k) };
-        sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
+        sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * inverse_square + c)
     }
 
     /// Return the mean of t^e over pulse k + 1, which is (h d/2)^e·Σ_j C(a, 2j+1)/a·d^{−2j}. Here h is the pulse
@@ -451,18 +452,18 @@ fn shift(pulses: &mut [f64], value: f64) {
 /// < e < 0.
 fn moment(exponent: f64) -> f64 {
     // Euler–Maclaurin summation from n = 10 on.
-    const FROM: f64 = 10.0;
-    const BERNOULLI: [f64; 4] = [1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1_209_600.0];
+    const SUMMATION_START: f64 = 10.0;
+    const BERNOULLI_FACTORS: [f64; 4] = [1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1_209_600.0];
     let a = exponent + 1.0;
     let first: f64 = (1..10).map(|n| libm::pow(f64::from(n), a)).sum();
-    let power = libm::pow(FROM, a);
-    let mut zeta = first - power * FROM / (a + 1.0) + 0.5 * power;
+    let power = libm::pow(SUMMATION_START, a);
+    let mut zeta = first - power * SUMMATION_START / (a + 1.0) + 0.5 * power;
     // Terms s (s+1) (s+2) … N^{−s−2j+1} for s = −a and N = 10.
-    let mut term = -a * power / FROM;
-    for (j, b) in (1..).zip(BERNOULLI) {
+    let mut term = -a * power / SUMMATION_START;
+    for (j, b) in (1..).zip(BERNOULLI_FACTORS) {
         zeta += b * term;
         let next = f64::from(2 * j - 1) - a;
-        term *= next * (next + 1.0) / (FROM * FROM);
+        term *= next * (next + 1.0) / (SUMMATION_START * SUMMATION_START);
     }
     zeta / a
 }
@@ -486,10 +487,10 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
 
 /// The difference between the order of a term and the order α of its equation must be below this value. At difference 1
 /// the reciprocal kernel is that of Tustin's rule for a derivative, which oscillates from pulse to pulse without decay.
-pub const MAX_EXCESS: f64 = 1.0;
+pub const MAX_ORDER_EXCESS: f64 = 1.0;
 
-/// Return the kernel of I^η in pulse means for η > −[`MAX_EXCESS`], m values for the pulse length `step` \[s\]. For η <
-/// 0 it is the reciprocal of [`block_pulse_kernel`] at −η.
+/// Return the kernel of I^η in pulse means for η > −[`MAX_ORDER_EXCESS`], m values for the pulse length `step` \[s\].
+/// For η < 0 it is the reciprocal of [`block_pulse_kernel`] at −η.
 ///
 /// ```
 /// use ftlm::fractional::kernels::kernel;
@@ -521,8 +522,8 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
 /// Return the first value of [`kernel`], which gives the contribution of a pulse to the integral over the same pulse.
 #[must_use]
 pub fn first_coefficient(eta: f64, step: f64) -> f64 {
-    let size = eta.abs();
-    let value = libm::pow(step, size) / libm::tgamma(size + 2.0);
+    let modulus = eta.abs();
+    let value = libm::pow(step, modulus) / libm::tgamma(modulus + 2.0);
     if eta >= 0.0 {
         value
     } else {

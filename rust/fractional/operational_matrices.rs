@@ -96,13 +96,13 @@ impl Wavelet {
     fn respond(&self, sums: &[Vec<f64>], out: &mut [f64]) {
         let half = self.width / 2;
         if self.constant {
-            let all = &sums[sums.len() - 1];
-            out.iter_mut().zip(all).for_each(|(o, v)| *o = v * self.scale);
+            let total_sums = &sums[sums.len() - 1];
+            out.iter_mut().zip(total_sums).for_each(|(o, v)| *o = v * self.scale);
             return;
         }
-        let part = &sums[half.trailing_zeros() as usize];
+        let half_sums = &sums[half.trailing_zeros() as usize];
         for (n, o) in out.iter_mut().enumerate() {
-            *o = (part[n] - if n < half { 0.0 } else { part[n - half] }) * self.scale;
+            *o = (half_sums[n] - if n < half { 0.0 } else { half_sums[n - half] }) * self.scale;
         }
     }
 }
@@ -187,11 +187,11 @@ pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64
 /// Transpose a row-major m × m matrix in place, in tiles that fit the first-level cache.
 #[cfg(feature = "oracles")]
 fn transpose(a: &mut [f64], m: usize) {
-    const TILE: usize = 32;
-    for i0 in (0..m).step_by(TILE) {
-        for j0 in (i0..m).step_by(TILE) {
-            for i in i0..(i0 + TILE).min(m) {
-                for j in j0.max(i + 1)..(j0 + TILE).min(m) {
+    const TILE_SIZE: usize = 32;
+    for i0 in (0..m).step_by(TILE_SIZE) {
+        for j0 in (i0..m).step_by(TILE_SIZE) {
+            for i in i0..(i0 + TILE_SIZE).min(m) {
+                for j in j0.max(i + 1)..(j0 + TILE_SIZE).min(m) {
                     a.swap(i * m + j, j * m + i);
                 }
             }

@@ -68,9 +68,9 @@ impl LaplacePoint {
 
     /// Return the Laplace transform s^−η of η-fold integration.
     pub(crate) fn integration(self, eta: f64) -> Bin {
-        let size = libm::exp(-eta * self.logarithm.re);
+        let modulus = libm::exp(-eta * self.logarithm.re);
         let (sine, cosine) = libm::sincos(-eta * self.logarithm.im);
-        Bin::new(size * cosine, size * sine)
+        Bin::new(modulus * cosine, modulus * sine)
     }
 }
 
@@ -98,8 +98,9 @@ impl StarredTransform {
         weights[DIRECT_ALIAS_COUNT + 1] -= THIRD_DIFFERENCE;
         weights[DIRECT_ALIAS_COUNT - 2] += THIRD_DIFFERENCE;
         let edge = (DIRECT_ALIAS_COUNT as f64 - 0.5) * period;
-        let node = |place: usize| {
-            let omega = width * (0.5 + (place / PANEL_NODES) as f64 + 0.5 * chebyshev_node(place % PANEL_NODES));
+        let node = |node_index: usize| {
+            let omega =
+                width * (0.5 + (node_index / PANEL_NODES) as f64 + 0.5 * chebyshev_node(node_index % PANEL_NODES));
             let direct = weights
                 .iter()
                 .enumerate()
@@ -149,10 +150,10 @@ impl StarredTransform {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];
         let mut sums = vec![[Bin::default(); BAND_PANEL_COUNT * PANEL_NODES]; count];
-        for (place, aliases) in self.aliases.iter().enumerate() {
+        for (node_index, aliases) in self.aliases.iter().enumerate() {
             for &(weight, point) in aliases {
                 functions(point, &mut values);
-                sums.iter_mut().zip(&values).for_each(|(sum, value)| sum[place] += value * weight);
+                sums.iter_mut().zip(&values).for_each(|(sum, value)| sum[node_index] += value * weight);
             }
         }
         let mut spectra = vec![Vec::with_capacity(self.logarithms.len()); count];
@@ -163,9 +164,9 @@ impl StarredTransform {
         }
         for ((spectrum, sums), start) in spectra.iter_mut().zip(&sums).zip(starts) {
             self.add_aliases(spectrum, sums);
-            let (bins, inner) =
+            let (bins, inner_sum) =
                 (spectrum.len(), spectrum[1..spectrum.len() - 1].iter().map(|v| 2.0 * v.re).sum::<f64>());
-            let mean = (spectrum[0].re + inner + spectrum[bins - 1].re) / self.plan.len() as f64;
+            let mean = (spectrum[0].re + inner_sum + spectrum[bins - 1].re) / self.plan.len() as f64;
             let scale = 1.0 / self.step;
             spectrum.iter_mut().for_each(|v| *v = (*v - mean) * scale + start);
         }
@@ -175,7 +176,7 @@ impl StarredTransform {
     /// Add the alias terms n ≠ 0, interpolated from their `sums` at the nodes, to the term n = 0 of a function.
     #[allow(clippy::cast_precision_loss)]
     fn add_aliases(&self, spectrum: &mut [Bin], sums: &[Bin]) {
-        let share = 2.0 * BAND_PANEL_COUNT as f64 / (self.plan.len() / 2) as f64;
+        let node_spacing = 2.0 * BAND_PANEL_COUNT as f64 / (self.plan.len() / 2) as f64;
         for (p, nodes) in sums.chunks_exact(PANEL_NODES).enumerate() {
             // Chebyshev coefficients.
             let mut c = [Bin::default(); PANEL_NODES];
@@ -187,12 +188,12 @@ impl StarredTransform {
             }
             let first = self.panels[p];
             for (j, value) in (first..).zip(&mut spectrum[first..self.panels[p + 1]]) {
-                let x = j as f64 * share - (2 * p + 1) as f64;
-                let (mut above, mut current) = (Bin::default(), Bin::default());
+                let x = j as f64 * node_spacing - (2 * p + 1) as f64;
+                let (mut previous, mut current) = (Bin::default(), Bin::default());
                 for c in c[1..].iter().rev() {
-                    (above, current) = (current, current * (2.0 * x) - above + c);
+                    (previous, current) = (current, current * (2.0 * x) - previous + c);
                 }
-                *value += current * x - above + c[0];
+                *value += current * x - previous + c[0];
             }
         }
     }

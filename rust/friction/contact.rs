@@ -72,7 +72,7 @@ impl FrictionProblem {
 
     /// Return the gain G_aa, where a is `body`.
     #[must_use]
-    pub fn own(&self, body: usize) -> f64 {
+    pub fn own_gain(&self, body: usize) -> f64 {
         self.gain(body, body)
     }
 
@@ -92,60 +92,64 @@ impl FrictionProblem {
     ///
     /// `length` is the length of the interval as a fraction of the pulse; the gains are proportional to it. A body
     /// stays at rest if the external force exceeds its friction by at most `rounding`, expressed as a velocity change.
-    /// The iteration starts at the friction forces `near`. `at` receives, for each body, the end velocity without its
-    /// own friction, and the solved pulse. Without convergence, the end velocities in the pulses are NaN, except with
-    /// Stribeck friction.
+    /// The iteration starts at the friction forces `initial_forces`. `pulses` receives, for each body, the end velocity
+    /// without its own friction, and the solved pulse. Without convergence, the end velocities in the pulses are NaN,
+    /// except with Stribeck friction.
     pub fn solve(
         &self,
         length: f64,
         (v, p): (&[f64], &[f64]),
         rounding: &[f64],
-        near: &[f64],
-        at: &mut Vec<(f64, Pulse)>,
+        initial_forces: &[f64],
+        pulses: &mut Vec<(f64, Pulse)>,
     ) {
         let n = self.count();
-        let own = |a: usize| length * self.own(a);
-        let of = |a: usize, forces: &[f64]| {
+        let own_gain = |a: usize| length * self.own_gain(a);
+        let body_pulse = |a: usize, forces: &[f64]| {
             let free = p[a] - length * self.coupling_velocity(a, |b| forces[b]);
-            (free, self.laws[a].pulse(v[a], free, own(a), rounding[a]))
+            (free, self.laws[a].pulse(v[a], free, own_gain(a), rounding[a]))
         };
-        at.clear();
-        at.extend((0..n).map(|a| of(a, near)));
+        pulses.clear();
+        pulses.extend((0..n).map(|a| body_pulse(a, initial_forces)));
         if n == 1 {
             return;
         }
-        let mut forces = near.to_vec();
-        let wrong = |at: &[(f64, Pulse)], forces: &[f64]| {
-            at.iter().zip(forces).enumerate().fold(0.0_f64, |w, (a, (x, f))| w.max((x.1.force - f).abs() * own(a)))
+        let mut forces = initial_forces.to_vec();
+        let max_error = |pulses: &[(f64, Pulse)], forces: &[f64]| {
+            pulses
+                .iter()
+                .zip(forces)
+                .enumerate()
+                .fold(0.0_f64, |w, (a, (x, f))| w.max((x.1.force - f).abs() * own_gain(a)))
         };
-        let mut miss = wrong(at, &forces);
-        let size = (0..n).map(|a| v[a].abs() + p[a].abs() + own(a) * self.breakaway(a)).fold(0.0, f64::max);
+        let mut error = max_error(pulses, &forces);
+        let size = (0..n).map(|a| v[a].abs() + p[a].abs() + own_gain(a) * self.breakaway(a)).fold(0.0, f64::max);
         for _ in 0..MAX_CONTACT_ITERATIONS {
-            if miss <= 4.0 * f64::EPSILON * size {
+            if error <= 4.0 * f64::EPSILON * size {
                 break;
             }
-            let misses: Vec<f64> = at.iter().zip(&forces).map(|(x, f)| x.1.force - f).collect();
-            let slopes: Vec<f64> = (0..n).map(|a| self.force_slope(a, length, v[a], &at[a])).collect();
-            let newton = self.solve_coupled(length, &slopes, &misses);
-            let ahead: Vec<f64> = forces.iter().zip(&newton).map(|(f, s)| f + s).collect();
-            let there: Vec<(f64, Pulse)> = (0..n).map(|a| of(a, &ahead)).collect();
-            let left = wrong(&there, &ahead);
-            if left < 0.5 * miss {
-                (forces, *at, miss) = (ahead, there, left);
+            let errors: Vec<f64> = pulses.iter().zip(&forces).map(|(x, f)| x.1.force - f).collect();
+            let slopes: Vec<f64> = (0..n).map(|a| self.force_slope(a, length, v[a], &pulses[a])).collect();
+            let newton_step = self.solve_coupled(length, &slopes, &errors);
+            let newton_forces: Vec<f64> = forces.iter().zip(&newton_step).map(|(f, s)| f + s).collect();
+            let newton_pulses: Vec<(f64, Pulse)> = (0..n).map(|a| body_pulse(a, &newton_forces)).collect();
+            let newton_error = max_error(&newton_pulses, &newton_forces);
+            if newton_error < 0.5 * error {
+                (forces, *pulses, error) = (newton_forces, newton_pulses, newton_error);
                 continue;
             }
             // Gauss–Seidel sweep over the bodies. It converges if each body affects itself more than it affects the
             // others.
             for a in 0..n {
-                forces[a] = of(a, &forces).1.force;
+                forces[a] = body_pulse(a, &forces).1.force;
             }
-            *at = (0..n).map(|a| of(a, &forces)).collect();
-            miss = wrong(at, &forces);
+            *pulses = (0..n).map(|a| body_pulse(a, &forces)).collect();
+            error = max_error(pulses, &forces);
         }
         let has_stribeck = self.laws.iter().any(|law| law.stribeck > 0.0);
-        if !has_stribeck && miss > MAX_FRICTION_ERROR_RATIO * size {
+        if !has_stribeck && error > MAX_FRICTION_ERROR_RATIO * size {
             // NaN counts as overflow, which is better than a wrong solution.
-            at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
+            pulses.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
     }
 
@@ -155,7 +159,7 @@ impl FrictionProblem {
     #[must_use]
     pub fn force_slope(&self, body: usize, length: f64, velocity: f64, at: &(f64, Pulse)) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, gain: 0.0, law: [0.0; 3] };
-        self.laws[body].slope(velocity, at.0, length * self.own(body), &at.1, &unit).0
+        self.laws[body].slope(velocity, at.0, length * self.own_gain(body), &at.1, &unit).0
     }
 
     /// Return the solution x of (1 + `length` diag(slopes) (G − diag G)) x = `vector`. x holds the changes of the

@@ -62,9 +62,9 @@ pub struct PulseDerivatives {
 struct Mean {
     value: f64,
     /// Derivative of the mean with respect to the first speed.
-    from: f64,
+    slope_from: f64,
     /// Derivative of the mean with respect to the second speed.
-    to: f64,
+    slope_to: f64,
     /// Derivatives of the mean with respect to Coulomb friction, Stribeck friction and Stribeck velocity.
     law: [f64; 3],
 }
@@ -97,15 +97,15 @@ pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
         }
         return (p.signum(), p - b * p.signum(), Phase::Slip);
     }
-    let side = v.signum();
-    let end = p - b * side;
-    if end * side >= 0.0 {
-        return (side, end, Phase::Slip);
+    let direction = v.signum();
+    let end = p - b * direction;
+    if end * direction >= 0.0 {
+        return (direction, end, Phase::Slip);
     }
     if (p - v).abs() <= b + rounding {
         return (if b > 0.0 { p / b } else { 0.0 }, 0.0, Phase::Stick);
     }
-    let sign = side * (2.0 * v / (v - end) - 1.0);
+    let sign = direction * (2.0 * v / (v - end) - 1.0);
     (sign, p - b * sign, Phase::Turn)
 }
 
@@ -140,22 +140,22 @@ impl FrictionLaw {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         let mean_stribeck_factor = self.mean_stribeck_factor(from, to);
         let gauss = |z: f64| libm::exp(-z * z);
-        let (by_from, by_to) = if d.abs() < QUADRATURE_SPEED_RATIO {
-            let sloped = |weight: fn(f64) -> f64| -> f64 {
+        let (slope_from, slope_to) = if d.abs() < QUADRATURE_SPEED_RATIO {
+            let quadrature = |weight: fn(f64) -> f64| -> f64 {
                 GAUSS_LEGENDRE_NODES.iter().map(|(u, w)| -2.0 * w * weight(*u) * (x + u * d) * gauss(x + u * d)).sum()
             };
-            (sloped(|u| 1.0 - u), sloped(|u| u))
+            (quadrature(|u| 1.0 - u), quadrature(|u| u))
         } else {
             ((mean_stribeck_factor - gauss(x)) / d, (gauss(x + d) - mean_stribeck_factor) / d)
         };
         // The mean depends on vs only by x and x + d.
-        let by_speed = -(x * by_from + (x + d) * by_to) / self.speed;
+        let slope_speed = -(x * slope_from + (x + d) * slope_to) / self.speed;
         let s = self.stribeck;
         Mean {
             value: self.coulomb + s * mean_stribeck_factor,
-            from: s * by_from / self.speed,
-            to: s * by_to / self.speed,
-            law: [1.0, mean_stribeck_factor, s * by_speed],
+            slope_from: s * slope_from / self.speed,
+            slope_to: s * slope_to / self.speed,
+            law: [1.0, mean_stribeck_factor, s * slope_speed],
         }
     }
 
@@ -197,23 +197,23 @@ impl FrictionLaw {
         if v == 0.0 && p.abs() <= max_stick_change {
             return at_rest;
         }
-        let side = if v == 0.0 { p.signum() } else { v.signum() };
-        if let Some(end) = self.slide(side * v, side * p, g) {
-            let force = side * self.mean(side * v, end);
+        let direction = if v == 0.0 { p.signum() } else { v.signum() };
+        if let Some(end) = self.slide(direction * v, direction * p, g) {
+            let force = direction * self.mean(direction * v, end);
             return Pulse { force, end: p - g * force, phase: Phase::Slip };
         }
         if (p - v).abs() <= max_stick_change {
             return at_rest;
         }
-        let (speed, push) = (side * v, side * (v - p));
-        let before = self.mean(0.0, speed);
-        let until = speed / (g * before + push);
-        let left = 1.0 - until;
+        let (speed, velocity_loss) = (direction * v, direction * (v - p));
+        let first_mean = self.mean(0.0, speed);
+        let reversal_fraction = speed / (g * first_mean + velocity_loss);
+        let remaining_fraction = 1.0 - reversal_fraction;
         // After the reversal, the body starts from rest under the remaining force, against the friction of the
         // remaining time.
-        let back = self.slide(0.0, left * push, left * g).unwrap_or(0.0);
-        let force = side * (until * before - left * self.mean(0.0, back));
-        Pulse { force, end: -side * back, phase: Phase::Turn }
+        let reverse_speed = self.slide(0.0, remaining_fraction * velocity_loss, remaining_fraction * g).unwrap_or(0.0);
+        let force = direction * (reversal_fraction * first_mean - remaining_fraction * self.mean(0.0, reverse_speed));
+        Pulse { force, end: -direction * reverse_speed, phase: Phase::Turn }
     }
 
     /// Return the derivatives of the friction force in a pulse and of the velocity at its end with respect to a
@@ -221,40 +221,43 @@ impl FrictionLaw {
     /// holds the derivatives of these arguments and of the law with respect to the parameter.
     #[must_use]
     pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
-        let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();
+        let law_derivative = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();
         match at.phase {
             Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => {
                 ((derivatives.free - at.force * derivatives.gain) / g, 0.0)
             }
             Phase::Stick => (0.0, 0.0),
             Phase::Slip => {
-                let side = if v == 0.0 { at.end.signum() } else { v.signum() };
-                let mean = self.mean_with_slopes(side * v, (side * at.end).max(0.0));
-                let by_law = of(&mean) + mean.from * side * derivatives.start;
-                let end = (side * (derivatives.free - at.force * derivatives.gain) - g * by_law) / (1.0 + g * mean.to);
-                (side * (by_law + mean.to * end), side * end)
+                let direction = if v == 0.0 { at.end.signum() } else { v.signum() };
+                let mean = self.mean_with_slopes(direction * v, (direction * at.end).max(0.0));
+                let mean_derivative = law_derivative(&mean) + mean.slope_from * direction * derivatives.start;
+                let end = (direction * (derivatives.free - at.force * derivatives.gain) - g * mean_derivative)
+                    / (1.0 + g * mean.slope_to);
+                (direction * (mean_derivative + mean.slope_to * end), direction * end)
             }
             Phase::Turn => {
-                let side = v.signum();
-                let (speed, push) = (side * v, side * (v - p));
-                let (speed_derivative, push_derivative) =
-                    (side * derivatives.start, side * (derivatives.start - derivatives.free));
-                let before = self.mean_with_slopes(0.0, speed);
-                let before_derivative = of(&before) + before.to * speed_derivative;
-                let whole = g * before.value + push;
-                let until = speed / whole;
-                let whole_derivative = derivatives.gain * before.value + g * before_derivative + push_derivative;
-                let until_derivative = (speed_derivative - until * whole_derivative) / whole;
-                let left = 1.0 - until;
-                let after = self.mean_with_slopes(0.0, at.end.abs());
-                let by_law = of(&after);
-                let back = (left * (push_derivative - derivatives.gain * after.value - g * by_law)
-                    - until_derivative * (push - g * after.value))
-                    / (1.0 + left * g * after.to);
-                let after_derivative = by_law + after.to * back;
-                let force = until_derivative * (before.value + after.value) + until * before_derivative
-                    - left * after_derivative;
-                (side * force, -side * back)
+                let direction = v.signum();
+                let (speed, velocity_loss) = (direction * v, direction * (v - p));
+                let (speed_derivative, loss_derivative) =
+                    (direction * derivatives.start, direction * (derivatives.start - derivatives.free));
+                let first_mean = self.mean_with_slopes(0.0, speed);
+                let first_derivative = law_derivative(&first_mean) + first_mean.slope_to * speed_derivative;
+                let total_loss = g * first_mean.value + velocity_loss;
+                let reversal_fraction = speed / total_loss;
+                let total_derivative = derivatives.gain * first_mean.value + g * first_derivative + loss_derivative;
+                let fraction_derivative = (speed_derivative - reversal_fraction * total_derivative) / total_loss;
+                let remaining_fraction = 1.0 - reversal_fraction;
+                let second_mean = self.mean_with_slopes(0.0, at.end.abs());
+                let second_derivative = law_derivative(&second_mean);
+                let reverse_speed = (remaining_fraction
+                    * (loss_derivative - derivatives.gain * second_mean.value - g * second_derivative)
+                    - fraction_derivative * (velocity_loss - g * second_mean.value))
+                    / (1.0 + remaining_fraction * g * second_mean.slope_to);
+                let second_derivative_total = second_derivative + second_mean.slope_to * reverse_speed;
+                let force = fraction_derivative * (first_mean.value + second_mean.value)
+                    + reversal_fraction * first_derivative
+                    - remaining_fraction * second_derivative_total;
+                (direction * force, -direction * reverse_speed)
             }
         }
     }

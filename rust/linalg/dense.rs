@@ -8,13 +8,13 @@ use crate::parallel::{self, Stop};
 
 /// Minimum number of rows in one block of a product of long columns. The blocks do not depend on the number of threads,
 /// so neither do the rounding errors of the sums.
-const MIN_PART_ROWS: usize = 1 << 14;
+const MIN_BLOCK_ROWS: usize = 1 << 14;
 /// Maximum number of row blocks of a product of long columns.
-const MAX_ROW_PARTS: usize = 16;
+const MAX_ROW_BLOCKS: usize = 16;
 /// Number of columns that are multiplied at a time in a Gram matrix product.
 const GRAM_TILE_COLUMNS: usize = 64;
 /// Number of rows of separately stored columns that are copied for one product. They fit in the cache.
-const COPIED_ROWS: usize = 1 << 10;
+const COPIED_BLOCK_ROWS: usize = 1 << 10;
 
 /// Return the row-major product of an a×b and a b×c matrix, computed on one thread. O(abc).
 #[must_use]
@@ -52,7 +52,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     tiles.push((k, y));
     let rows = row_blocks(m);
     let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
-    let tasks: Vec<_> = pairs.flat_map(|pair| rows.iter().map(move |&piece| (pair, piece))).collect();
+    let tasks: Vec<_> = pairs.flat_map(|pair| rows.iter().map(move |&block| (pair, block))).collect();
     let tiles_of_products = parallel::map(
         tasks,
         || (),
@@ -83,7 +83,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
 
 /// Return (first row, number of rows) of each row block of a product of columns with `m` rows.
 fn row_blocks(m: usize) -> Vec<(usize, usize)> {
-    let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
+    let len = m.div_ceil(MAX_ROW_BLOCKS).max(MIN_BLOCK_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
 
@@ -139,13 +139,13 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     let m = columns.first().map_or(0, Vec::len);
     let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
     let decomposition = x.thin_svd().ok()?;
-    let vectors = |of: MatRef<'_, f64>| of.col_iter().map(|column| column.iter().copied().collect()).collect();
-    let sizes = decomposition.S().column_vector().iter().copied().collect();
-    Some(SingularValues { left: vectors(decomposition.U()), values: sizes, right: vectors(decomposition.V()) })
+    let vectors = |matrix: MatRef<'_, f64>| matrix.col_iter().map(|column| column.iter().copied().collect()).collect();
+    let values = decomposition.S().column_vector().iter().copied().collect();
+    Some(SingularValues { left: vectors(decomposition.U()), values, right: vectors(decomposition.V()) })
 }
 
-/// Return the least-squares solution of smallest norm for k columns with m rows. Singular values of at most `share`
-/// times the largest count as 0. O(k²m).
+/// Return the least-squares solution of smallest norm for k columns with m rows. Singular values of at most
+/// `relative_tolerance` times the largest count as 0. O(k²m).
 ///
 /// `None` if the singular values cannot be computed, which does not occur for finite values.
 ///
@@ -155,7 +155,7 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
 /// assert!(found.is_some_and(|x| x.iter().all(|v| (v - 1.0).abs() < 1e-12)));
 /// ```
 #[must_use]
-pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -> Option<Vec<f64>> {
+pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], relative_tolerance: f64) -> Option<Vec<f64>> {
     let k = columns.len();
     let mut solution = vec![0.0; k];
     if k == 0 {
@@ -165,11 +165,12 @@ pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -
     let factor = triangular_factor(&augmented);
     let column = |j: usize| -> Vec<f64> { (0..=k).map(|i| factor[i * (k + 1) + j]).collect() };
     let factors = singular_values(&(0..k).map(column).collect::<Vec<_>>())?;
-    let (rest, least) = (column(k), share * factors.values.first().copied().unwrap_or(0.0));
+    let (transformed_target, threshold) =
+        (column(k), relative_tolerance * factors.values.first().copied().unwrap_or(0.0));
     for ((left, value), right) in factors.left.iter().zip(&factors.values).zip(&factors.right) {
-        if *value > least {
-            let amount = left.iter().zip(&rest).map(|(u, v)| u * v).sum::<f64>() / value;
-            solution.iter_mut().zip(right).for_each(|(x, v)| *x += amount * v);
+        if *value > threshold {
+            let component = left.iter().zip(&transformed_target).map(|(u, v)| u * v).sum::<f64>() / value;
+            solution.iter_mut().zip(right).for_each(|(x, v)| *x += component * v);
         }
     }
     Some(solution)
@@ -187,8 +188,8 @@ pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64
         || (),
         |(), (from, len)| {
             let mut product = Mat::<f64>::zeros(right.len(), left.len());
-            for first in (from..from + len).step_by(COPIED_ROWS).take_while(|_| !stop.is_set()) {
-                let rows = COPIED_ROWS.min(from + len - first);
+            for first in (from..from + len).step_by(COPIED_BLOCK_ROWS).take_while(|_| !stop.is_set()) {
+                let rows = COPIED_BLOCK_ROWS.min(from + len - first);
                 let x = Mat::from_fn(rows, left.len(), |i, j| left[j][first + i]);
                 let y = Mat::from_fn(rows, right.len(), |i, j| right[j][first + i]);
                 matmul(product.as_mut(), Accum::Add, y.transpose(), x.as_ref(), 1.0, Par::Seq);

@@ -43,9 +43,9 @@ impl SimdKernel for Reflections<'_> {
             let factor = 1.0 / (diagonal * (diagonal - first));
             for column in later {
                 let below = &mut column[j..];
-                let along = factor * dot(reflected, below);
+                let component = factor * dot(reflected, below);
                 for (v, w) in below.iter_mut().zip(reflected.iter()) {
-                    *v -= along * w;
+                    *v -= component * w;
                 }
             }
             reflected[0] = diagonal;
@@ -100,9 +100,9 @@ impl SimdKernel for Projection<'_> {
     fn run(self) {
         for _ in 0..self.times {
             for direction in self.basis {
-                let along = dot(direction, self.column);
+                let component = dot(direction, self.column);
                 for (v, q) in self.column.iter_mut().zip(direction) {
-                    *v -= along * q;
+                    *v -= component * q;
                 }
             }
         }
@@ -138,31 +138,32 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, relat
 /// # Errors
 /// [`crate::error::Error::Interrupted`] after a stop request.
 pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, relative_tolerance: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
-    let whole = |(): &mut (), mut column: Vec<f64>| {
+    let normalize = |(): &mut (), mut column: Vec<f64>| {
         let size = if stop.is_set() { 0.0 } else { norm(&column) };
-        let sound = size > 0.0 && size.is_finite();
+        let is_usable = size > 0.0 && size.is_finite();
         column.iter_mut().for_each(|v| *v /= size);
-        sound.then_some((1.0, column))
+        is_usable.then_some((1.0, column))
     };
-    let mut waiting: Vec<(f64, Vec<f64>)> = parallel::map(columns, || (), whole).into_iter().flatten().collect();
-    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(waiting.len());
+    let mut candidates: Vec<(f64, Vec<f64>)> = parallel::map(columns, || (), normalize).into_iter().flatten().collect();
+    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(candidates.len());
     loop {
         stop.check()?;
-        let farther = |a: &usize, b: &usize| waiting[*a].0.total_cmp(&waiting[*b].0).then(b.cmp(a));
-        let Some(next) = (0..waiting.len()).max_by(farther).filter(|&next| waiting[next].0 > relative_tolerance) else {
+        let farther = |a: &usize, b: &usize| candidates[*a].0.total_cmp(&candidates[*b].0).then(b.cmp(a));
+        let Some(next) = (0..candidates.len()).max_by(farther).filter(|&next| candidates[next].0 > relative_tolerance)
+        else {
             return Ok(basis);
         };
-        let (_, mut direction) = waiting.remove(next);
+        let (_, mut direction) = candidates.remove(next);
         // Two passes are enough (Kahan, Parlett).
-        for before in basis.chunks(VECTORS_PER_STOP_CHECK) {
+        for block in basis.chunks(VECTORS_PER_STOP_CHECK) {
             stop.check()?;
-            project_out(before, &mut direction);
+            project_out(block, &mut direction);
         }
         let remainder = norm(&direction);
         direction.iter_mut().for_each(|v| *v /= remainder);
         basis.push(direction);
         let last = &basis[basis.len() - 1..];
-        let without = |(): &mut (), (remainder, mut column): (f64, Vec<f64>)| {
+        let remove_last = |(): &mut (), (remainder, mut column): (f64, Vec<f64>)| {
             // After a stop request, columns are left unprocessed, and the result is discarded.
             if stop.is_set() {
                 return (remainder, column);
@@ -170,7 +171,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, relative_tolerance: f64,
             project_out(last, &mut column);
             (norm(&column), column)
         };
-        waiting = parallel::map(waiting, || (), without);
+        candidates = parallel::map(candidates, || (), remove_last);
     }
 }
 

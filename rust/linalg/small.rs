@@ -93,8 +93,8 @@ pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
-    let (leading, others) = coefficients.split_last()?;
-    let ratios: Vec<f64> = others.iter().rev().map(|c| -c / leading).collect();
+    let (leading, lower) = coefficients.split_last()?;
+    let ratios: Vec<f64> = lower.iter().rev().map(|c| -c / leading).collect();
     if ratios.iter().any(|v| !v.is_finite()) {
         return None;
     }
@@ -103,10 +103,10 @@ pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
     if unit == 0.0 {
         return Some(vec![(0.0, 0.0); ratios.len()]);
     }
-    let scaled = |(k, v): (usize, &f64)| (0..=k).fold(*v, |v, _| v / unit);
-    let top: Vec<f64> = ratios.iter().enumerate().map(scaled).collect();
-    let n = top.len();
-    let companion = DMatrix::from_fn(n, n, |i, j| if i == 0 { top[j] } else { f64::from(u8::from(i == j + 1)) });
+    let rescale = |(k, v): (usize, &f64)| (0..=k).fold(*v, |v, _| v / unit);
+    let first_row: Vec<f64> = ratios.iter().enumerate().map(rescale).collect();
+    let n = first_row.len();
+    let companion = DMatrix::from_fn(n, n, |i, j| if i == 0 { first_row[j] } else { f64::from(u8::from(i == j + 1)) });
     let eigenvalues = Schur::try_new(companion, f64::EPSILON, MAX_EIGENVALUE_STEPS)?.complex_eigenvalues();
     Some(eigenvalues.iter().map(|z| (unit * z.re, unit * z.im)).collect())
 }
@@ -148,13 +148,13 @@ impl EquilibratedLu {
             a.column_mut(j).unscale_mut(*scale);
         }
         let singular = |index| Error::Singular { index, count: k };
-        if let Some(bad) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
-            return Err(singular(bad % k.max(1)));
+        if let Some(index) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
+            return Err(singular(index % k.max(1)));
         }
         let factor = (k > 0).then(|| a.full_piv_lu());
         let pivots = factor.iter().flat_map(|f| f.u().diagonal().iter().copied().collect::<Vec<f64>>());
-        if let Some(bad) = pivots.into_iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
-            return Err(singular(bad));
+        if let Some(index) = pivots.into_iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
+            return Err(singular(index));
         }
         Ok(Self { rows, columns, factor })
     }
@@ -209,25 +209,25 @@ pub const fn packed_index(i: usize, j: usize) -> usize {
 /// O(k³).
 ///
 /// `gram` contains the lower triangles ([`packed_index`]) of correlation matrices. Their diagonal elements are 1, or 0
-/// for a zero column. `rhs` is overwritten with the solutions. The first `needed` unknowns must be linearly
+/// for a zero column. `rhs` is overwritten with the solutions. The first `required` unknowns must be linearly
 /// independent. The returned flag of a lane is true if these unknowns are linearly dependent. Dependent unknowns after
 /// them are set to 0. The operations of a lane depend neither on other lanes nor on L.
 #[inline(always)]
-pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], required: usize) -> [bool; L] {
     // For frequent numbers of unknowns, the compiler generates loops of constant length.
     match rhs.len() {
-        1 => solve_sized(1, gram, rhs, needed),
-        2 => solve_sized(2, gram, rhs, needed),
-        3 => solve_sized(3, gram, rhs, needed),
-        4 => solve_sized(4, gram, rhs, needed),
-        5 => solve_sized(5, gram, rhs, needed),
-        k => solve_sized(k, gram, rhs, needed),
+        1 => solve_sized(1, gram, rhs, required),
+        2 => solve_sized(2, gram, rhs, required),
+        3 => solve_sized(3, gram, rhs, required),
+        4 => solve_sized(4, gram, rhs, required),
+        5 => solve_sized(5, gram, rhs, required),
+        k => solve_sized(k, gram, rhs, required),
     }
 }
 
 /// Do the work of [`solve_lanes`] for k unknowns.
 #[inline(always)]
-fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], required: usize) -> [bool; L] {
     let (gram, rhs) = (&mut gram[..packed_index(k, 0)], &mut rhs[..k]);
     let mut singular = [false; L];
     for i in 0..k {
@@ -252,12 +252,12 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
             }
         }
         let mut inverse = [0.0; L];
-        let mut all = true;
+        let mut all_independent = true;
         for n in 0..L {
-            let fits = pivot[n] > PIVOT_FLOOR;
-            inverse[n] = if fits { 1.0 / pivot[n] } else { 0.0 };
-            all &= fits;
-            singular[n] |= !fits && i < needed;
+            let is_independent = pivot[n] > PIVOT_FLOOR;
+            inverse[n] = if is_independent { 1.0 / pivot[n] } else { 0.0 };
+            all_independent &= is_independent;
+            singular[n] |= !is_independent && i < required;
         }
         gram[packed_index(i, i)] = inverse;
         let mut value = rhs[i];
@@ -268,7 +268,7 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
             }
         }
         rhs[i] = value;
-        if !all {
+        if !all_independent {
             for n in (0..L).filter(|&n| inverse[n] == 0.0) {
                 (0..i).for_each(|j| gram[packed_index(i, j)][n] = 0.0);
                 rhs[i][n] = 0.0;
@@ -296,8 +296,8 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
 #[must_use]
 pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();
-    let solved = DMatrix::from_row_slice(k, k, matrix).cholesky()?.solve(&DVector::from_column_slice(rhs));
-    Some(solved.iter().copied().collect())
+    let solution = DMatrix::from_row_slice(k, k, matrix).cholesky()?.solve(&DVector::from_column_slice(rhs));
+    Some(solution.iter().copied().collect())
 }
 
 /// Return the x ≥ 0 that minimizes ‖Σ x_j column_j − target‖, by the active-set method.
@@ -318,15 +318,22 @@ pub fn nonnegative_solution(columns: &[Vec<f64>], target: &[f64]) -> Vec<f64> {
     for _ in 0..3 * n {
         let gradient = matrix.tr_mul(&(&target - &matrix * &x));
         let rounding = |j: usize| 10.0 * f64::EPSILON * matrix.column(j).norm() * target.norm();
-        let rises = (0..n).filter(|j| !positive.contains(j) && gradient[*j] > rounding(*j));
-        let Some(next) = rises.max_by(|&i, &j| gradient[i].total_cmp(&gradient[j])) else { break };
+        let ascending = (0..n).filter(|j| !positive.contains(j) && gradient[*j] > rounding(*j));
+        let Some(next) = ascending.max_by(|&i, &j| gradient[i].total_cmp(&gradient[j])) else { break };
         positive.push(next);
         while let Ok(solved) = matrix.select_columns(&positive).svd(true, true).solve(&target, PIVOT_FLOOR) {
             // Largest fraction of the step at which no value becomes negative.
-            let ends = positive.iter().zip(&solved).filter(|(_, to)| **to <= 0.0).map(|(&j, to)| x[j] / (x[j] - to));
-            let share = ends.fold(1.0, f64::min);
-            positive.iter().zip(&solved).for_each(|(&j, to)| x[j] += share * (to - x[j]));
-            if share == 1.0 {
+            let zero_crossings = positive
+                .iter()
+                .zip(&solved)
+                .filter(|(_, solution_value)| **solution_value <= 0.0)
+                .map(|(&j, solution_value)| x[j] / (x[j] - solution_value));
+            let step_fraction = zero_crossings.fold(1.0, f64::min);
+            positive
+                .iter()
+                .zip(&solved)
+                .for_each(|(&j, solution_value)| x[j] += step_fraction * (solution_value - x[j]));
+            if step_fraction == 1.0 {
                 break;
             }
             positive.retain(|&j| x[j] > f64::EPSILON * x.amax());
@@ -418,10 +425,10 @@ impl SlidingGram {
     /// [`Error::Length`] for a row of wrong length.
     pub fn push(&mut self, row: &[f64], output: f64) -> Result<()> {
         check_length("row", self.width, row.len())?;
-        let all = self.prefix.len();
-        if self.block.len() == self.length.saturating_mul(all) {
-            for at in (0..self.block.len() - all).rev() {
-                self.block[at] += self.block[at + all];
+        let size = self.prefix.len();
+        if self.block.len() == self.length.saturating_mul(size) {
+            for index in (0..self.block.len() - size).rev() {
+                self.block[index] += self.block[index + size];
             }
             std::mem::swap(&mut self.block, &mut self.suffixes);
             self.block.clear();
@@ -433,18 +440,18 @@ impl SlidingGram {
         }
         self.block.extend(row.iter().map(|q| q * output));
         self.prefix.iter_mut().zip(&self.block[start..]).for_each(|(sum, product)| *sum += product);
-        let after = self.block.len();
-        match self.suffixes.get(after..after + all) {
+        let end = self.block.len();
+        match self.suffixes.get(end..end + size) {
             Some(suffix) => self.suffix.copy_from_slice(suffix),
             None => self.suffix.fill(0.0),
         }
         Ok(())
     }
 
-    /// Return element `at` of the sums over the window: packed lower triangle of Σ q qᵀ, then Σ q m.
+    /// Return element `index` of the sums over the window: packed lower triangle of Σ q qᵀ, then Σ q m.
     #[inline]
-    fn sum(&self, at: usize) -> f64 {
-        self.suffix[at] + self.prefix[at]
+    fn sum(&self, index: usize) -> f64 {
+        self.suffix[index] + self.prefix[index]
     }
 }
 
@@ -488,9 +495,9 @@ impl Recursion {
 
     /// Add an inverse prior covariance for each coefficient, with prior mean 0. The next step uses them.
     pub fn add_prior(&mut self, precision: impl Iterator<Item = f64>) {
-        for (j, more) in precision.take(self.coefficients.len()).enumerate() {
-            self.information[packed_index(j, j)] += more;
-            self.gain[j] -= more * self.coefficients[j];
+        for (j, increment) in precision.take(self.coefficients.len()).enumerate() {
+            self.information[packed_index(j, j)] += increment;
+            self.gain[j] -= increment * self.coefficients[j];
         }
     }
 
@@ -504,21 +511,21 @@ impl Recursion {
     pub fn step(&mut self, window: &SlidingGram) -> Result<()> {
         let k = self.coefficients.len();
         check_length("row", k, window.width)?;
-        let mut at = 0;
+        let mut row_start = 0;
         for i in 0..k {
             for j in 0..i {
-                let sum = window.sum(at + j);
-                self.information[at + j] += sum;
+                let sum = window.sum(row_start + j);
+                self.information[row_start + j] += sum;
                 self.gain[i] -= sum * self.coefficients[j];
                 self.gain[j] -= sum * self.coefficients[i];
             }
-            let sum = window.sum(at + i);
-            self.information[at + i] += sum;
+            let sum = window.sum(row_start + i);
+            self.information[row_start + i] += sum;
             self.gain[i] -= sum * self.coefficients[i];
-            at += i + 1;
+            row_start += i + 1;
         }
         for (i, gain) in self.gain.iter_mut().enumerate() {
-            *gain += window.sum(at + i);
+            *gain += window.sum(row_start + i);
         }
         self.factor.copy_from_slice(&self.information);
         cholesky(&mut self.factor, k)

@@ -91,7 +91,7 @@ pub(super) struct ForcingTerms {
     /// Forcing of each state channel, one value per pulse; empty if zero.
     pub(super) channels: Vec<Vec<f64>>,
     /// Initial output and velocity of each body with friction; empty if zero.
-    pub(super) starts: Vec<(f64, f64)>,
+    pub(super) initial_motion: Vec<(f64, f64)>,
 }
 
 /// Derivatives of a system with respect to one parameter.

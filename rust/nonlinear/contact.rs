@@ -81,31 +81,31 @@ pub(super) struct BodyState {
 pub(super) struct ContactStates {
     states: Vec<BodyState>,
     /// Index in `states` of the first state of each pulse. The last entry is the number of states.
-    starts: Vec<usize>,
+    first_indices: Vec<usize>,
 }
 
 impl ContactStates {
     /// States of a run before its first pulse: an empty list.
     pub(super) fn empty() -> Self {
-        Self { states: Vec::new(), starts: vec![0] }
+        Self { states: Vec::new(), first_indices: vec![0] }
     }
 
     /// Append the states of one pulse.
     pub(super) fn push(&mut self, states: &[BodyState]) {
         self.states.extend_from_slice(states);
-        self.starts.push(self.states.len());
+        self.first_indices.push(self.states.len());
     }
 
     /// Return the states of one pulse: those of all bodies in its first interval, then in its second, and so on.
-    fn of_pulse(&self, pulse: usize) -> &[BodyState] {
-        &self.states[self.starts[pulse]..self.starts[pulse + 1]]
+    fn pulse_states(&self, pulse: usize) -> &[BodyState] {
+        &self.states[self.first_indices[pulse]..self.first_indices[pulse + 1]]
     }
 }
 
 /// Derivatives of the initial states, gains and friction laws of the bodies with respect to one parameter.
 pub(super) struct BodyDerivatives {
     /// Derivatives of the initial output and velocity of each body.
-    pub(super) starts: Vec<(f64, f64)>,
+    pub(super) initial_motion: Vec<(f64, f64)>,
     /// Derivatives of the gains G_ab, row-major. G_ab is the decrease of the velocity of body a at the end of a pulse
     /// per unit of friction force on body b.
     gains: Vec<f64>,
@@ -117,9 +117,9 @@ pub(super) struct BodyDerivatives {
 /// friction forces of a pulse.
 struct PulseInputDerivatives<'a> {
     /// Derivatives of the velocities of the bodies at the start of the pulse.
-    starts: &'a [f64],
+    start_velocities: &'a [f64],
     /// Derivatives of the velocities of the bodies at the end of the pulse without friction.
-    ends: &'a [f64],
+    end_velocities: &'a [f64],
     /// Derivatives of the gains G_ab, as in [`BodyDerivatives`].
     gains: &'a [f64],
     /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity of each body.
@@ -136,7 +136,7 @@ struct DerivativeWorkspace {
     means: Vec<f64>,
     slopes: Vec<f64>,
     forces: Vec<f64>,
-    ends: Vec<f64>,
+    end_velocities: Vec<f64>,
 }
 
 /// Derivatives of the outputs and velocities of the bodies with respect to one parameter. They advance from pulse to
@@ -145,15 +145,15 @@ pub(super) struct MotionDerivatives {
     outputs: Vec<f64>,
     velocities: Vec<f64>,
     /// Derivatives of the velocities at the end of the current pulse without friction.
-    ends: Vec<f64>,
+    end_velocities: Vec<f64>,
     work: DerivativeWorkspace,
 }
 
 impl MotionDerivatives {
     /// Derivatives of outputs and velocities at the start of a run.
     pub(super) fn start(derivatives: &BodyDerivatives) -> Self {
-        let (outputs, velocities): (Vec<f64>, Vec<f64>) = derivatives.starts.iter().copied().unzip();
-        Self { ends: vec![0.0; outputs.len()], outputs, velocities, work: DerivativeWorkspace::default() }
+        let (outputs, velocities): (Vec<f64>, Vec<f64>) = derivatives.initial_motion.iter().copied().unzip();
+        Self { end_velocities: vec![0.0; outputs.len()], outputs, velocities, work: DerivativeWorkspace::default() }
     }
 }
 
@@ -193,7 +193,7 @@ struct IntervalWorkspace {
     forces: Vec<f64>,
     frictionless: Vec<f64>,
     frictionless_changes: Vec<f64>,
-    at: Vec<(f64, FrictionPulse)>,
+    solutions: Vec<(f64, FrictionPulse)>,
 }
 
 impl ContactOperators {
@@ -222,7 +222,7 @@ impl ContactOperators {
         let response = |a: usize, b: usize| -> f64 {
             (0..states).map(|s| -inverse[velocities[a] * states + s] * gains[s * count + count - n + b]).sum()
         };
-        let problem = FrictionProblem::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
+        let problem = FrictionProblem::new(laws, (0..n * n).map(|index| response(index / n, index % n)).collect())?;
         Ok(Self { problem, outputs, velocities, states, inverse })
     }
 
@@ -238,10 +238,10 @@ impl ContactOperators {
 
     /// Return the motion of each body. `forcing` holds the initial velocities, and `contacts` the states of all pulses.
     pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &ContactStates) -> Vec<BodyMotion> {
-        let of = |(body, start): (usize, &(f64, f64))| {
+        let motion_of_body = |(body, start): (usize, &(f64, f64))| {
             let mut motion = BodyMotion { force: Vec::new(), velocity: vec![start.1], phases: Vec::new() };
-            for pulse in 0..contacts.starts.len() - 1 {
-                let states = || contacts.of_pulse(pulse).iter().skip(body).step_by(self.count());
+            for pulse in 0..contacts.first_indices.len() - 1 {
+                let states = || contacts.pulse_states(pulse).iter().skip(body).step_by(self.count());
                 motion.force.push(states().map(|state| state.length * state.pulse.force).sum());
                 if let Some(last) = states().next_back() {
                     motion.velocity.push(last.pulse.end);
@@ -250,17 +250,17 @@ impl ContactOperators {
             }
             motion
         };
-        forcing.starts.iter().enumerate().map(of).collect()
+        forcing.initial_motion.iter().enumerate().map(motion_of_body).collect()
     }
 
     /// Return the solver at the start of a run, with the initial outputs and velocities of `forcing`.
     pub(super) fn start(&self, forcing: &ForcingTerms) -> ContactSolver<'_> {
-        let initial_velocities: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
-        let last_outputs = forcing.starts.iter().map(|start| (start.0, true)).collect();
-        let largest = |(body, start): (&usize, &f64)| {
-            VELOCITY_ROUNDING_RATIO * forcing.channels[*body].iter().fold(start.abs(), |most, v| most.max(v.abs()))
+        let initial_velocities: Vec<f64> = forcing.initial_motion.iter().map(|start| start.1).collect();
+        let last_outputs = forcing.initial_motion.iter().map(|start| (start.0, true)).collect();
+        let rounding_error = |(body, start): (&usize, &f64)| {
+            VELOCITY_ROUNDING_RATIO * forcing.channels[*body].iter().fold(start.abs(), |peak, v| peak.max(v.abs()))
         };
-        let rounding = self.velocities.iter().zip(&initial_velocities).map(largest).collect();
+        let rounding = self.velocities.iter().zip(&initial_velocities).map(rounding_error).collect();
         let (velocities, forces) = (initial_velocities.clone(), vec![0.0; self.count()]);
         let is_resting = vec![false; self.count()];
         ContactSolver {
@@ -287,66 +287,70 @@ impl ContactOperators {
     ) -> Result<BodyDerivatives> {
         let (states, n) = (self.states, self.count());
         let count = gains.len() / states;
-        let of = |at: usize| -> f64 {
-            let (a, friction) = (at / n, count - n + at % n);
+        let gain_derivative = |index: usize| -> f64 {
+            let (a, friction) = (index / n, count - n + index % n);
             let response: Vec<f64> = (0..states)
                 .map(|s| (0..states).map(|r| self.inverse[s * states + r] * gains[r * count + friction]).sum())
                 .collect();
-            let moved = (0..states).map(|s| {
+            let direct_changes = (0..states).map(|s| {
                 let row = &gain_derivatives[s * count..(s + 1) * count];
                 row[friction] + row[..states].iter().zip(&response).map(|(g, x)| g * x).sum::<f64>()
             });
-            moved.enumerate().map(|(s, v)| -self.inverse[self.velocities[a] * states + s] * v).sum()
+            direct_changes.enumerate().map(|(s, v)| -self.inverse[self.velocities[a] * states + s] * v).sum()
         };
-        let mut starts = derivatives.forcing.starts.clone();
-        starts.resize(n, (0.0, 0.0));
+        let mut initial_motion = derivatives.forcing.initial_motion.clone();
+        initial_motion.resize(n, (0.0, 0.0));
         let mut laws = derivatives.laws.clone();
         laws.resize(n, [0.0; 3]);
-        Ok(BodyDerivatives { starts, gains: (0..n * n).map(of).collect(), laws })
+        Ok(BodyDerivatives { initial_motion, gains: (0..n * n).map(gain_derivative).collect(), laws })
     }
 
-    /// Compute the derivatives of the mean friction force on each body in a pulse and write them to `work.means`. `at`
-    /// holds the solved states of the pulse.
+    /// Compute the derivatives of the mean friction force on each body in a pulse and write them to `work.means`.
+    /// `pulse_states` holds the solved states of the pulse.
     fn force_derivatives(
         &self,
-        at: &[BodyState],
+        pulse_states: &[BodyState],
         intervals: &[Interval],
-        given: &PulseInputDerivatives<'_>,
+        inputs: &PulseInputDerivatives<'_>,
         work: &mut DerivativeWorkspace,
     ) {
         let (n, problem) = (self.count(), &self.problem);
-        let DerivativeWorkspace { velocities, means, slopes, forces, ends } = work;
+        let DerivativeWorkspace { velocities, means, slopes, forces, end_velocities } = work;
         velocities.clear();
-        velocities.extend_from_slice(given.starts);
-        for row in [&mut *means, slopes, forces, ends] {
+        velocities.extend_from_slice(inputs.start_velocities);
+        for row in [&mut *means, slopes, forces, end_velocities] {
             row.clear();
             row.resize(n, 0.0);
         }
-        for ((states, interval), change) in at.chunks(n).zip(intervals).zip(given.intervals) {
+        for ((states, interval), change) in pulse_states.chunks(n).zip(intervals).zip(inputs.intervals) {
             let length = interval.length;
-            let gain = |a: usize, b: usize| change.length * problem.gain(a, b) + length * given.gains[a * n + b];
+            let gain = |a: usize, b: usize| change.length * problem.gain(a, b) + length * inputs.gains[a * n + b];
             for (a, state) in states.iter().enumerate() {
-                let pushed =
-                    |b: usize| given.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
-                let frictionless_change = given.ends[a] - given.starts[a] + (0..n).map(pushed).sum::<f64>();
-                let by_others = |b: usize| if a == b { 0.0 } else { gain(a, b) * states[b].pulse.force };
+                let force_change =
+                    |b: usize| inputs.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
+                let frictionless_change =
+                    inputs.end_velocities[a] - inputs.start_velocities[a] + (0..n).map(force_change).sum::<f64>();
+                let coupling_change = |b: usize| if a == b { 0.0 } else { gain(a, b) * states[b].pulse.force };
                 let free = velocities[a] + change.length * state.frictionless_change + length * frictionless_change
-                    - (0..n).map(by_others).sum::<f64>();
-                let derivatives = PulseDerivatives { start: velocities[a], free, gain: gain(a, a), law: given.laws[a] };
-                let (law, own) = (problem.law(a), length * problem.own(a));
-                ends[a] = free - gain(a, a) * state.pulse.force;
-                forces[a] = law.slope(state.start_velocity, state.free_velocity, own, &state.pulse, &derivatives).0;
+                    - (0..n).map(coupling_change).sum::<f64>();
+                let derivatives =
+                    PulseDerivatives { start: velocities[a], free, gain: gain(a, a), law: inputs.laws[a] };
+                let (law, own_gain) = (problem.law(a), length * problem.own_gain(a));
+                end_velocities[a] = free - gain(a, a) * state.pulse.force;
+                forces[a] =
+                    law.slope(state.start_velocity, state.free_velocity, own_gain, &state.pulse, &derivatives).0;
                 if n > 1 {
-                    let solved = (state.free_velocity, state.pulse);
-                    slopes[a] = problem.force_slope(a, length, state.start_velocity, &solved);
+                    let free_pulse = (state.free_velocity, state.pulse);
+                    slopes[a] = problem.force_slope(a, length, state.start_velocity, &free_pulse);
                 }
             }
             if n > 1 {
                 *forces = problem.solve_coupled(length, slopes, forces);
             }
             for (a, state) in states.iter().enumerate() {
-                let by_friction: f64 = (0..n).map(|b| length * problem.gain(a, b) * forces[b]).sum();
-                velocities[a] = if state.pulse.phase == Phase::Stick { 0.0 } else { ends[a] - by_friction };
+                let friction_change: f64 = (0..n).map(|b| length * problem.gain(a, b) * forces[b]).sum();
+                velocities[a] =
+                    if state.pulse.phase == Phase::Stick { 0.0 } else { end_velocities[a] - friction_change };
                 means[a] += change.length * state.pulse.force + length * forces[a];
             }
         }
@@ -370,34 +374,35 @@ impl ContactOperators {
         let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
         let (mut unit, mut matrix, mut work) = (zeros.clone(), no_gains.clone(), DerivativeWorkspace::default());
         for (pulse, inverse) in inverses.chunks(states * states).enumerate() {
-            let at = contacts.of_pulse(pulse);
-            let moves_freely =
-                |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
+            let pulse_states = contacts.pulse_states(pulse);
+            let moves_freely = |state: usize| {
+                !pulse_states.iter().zip(&self.outputs).any(|(body, &output)| body.is_resting && output == state)
+            };
             let first = out.channels.len();
             for b in 0..n {
                 for a in 0..states {
-                    let of = |s: usize| inverse[a * states + s] * gains[s * count + count - n + b];
-                    out.channels.push((0..states).filter(|&s| moves_freely(s)).map(of).sum());
+                    let path = |s: usize| inverse[a * states + s] * gains[s * count + count - n + b];
+                    out.channels.push((0..states).filter(|&s| moves_freely(s)).map(path).sum());
                 }
             }
             let intervals = jumps.intervals(pulse);
             let constant = vec![Interval { length: 0.0, forces: zeros.clone() }; intervals.len()];
-            (0..n * n).for_each(|at| matrix[at] = f64::from(u8::from(at % (n + 1) == 0)));
+            (0..n * n).for_each(|index| matrix[index] = f64::from(u8::from(index % (n + 1) == 0)));
             for c in 0..n {
                 unit.fill(0.0);
                 unit[c] = 1.0;
-                let given = PulseInputDerivatives {
-                    starts: &zeros,
-                    ends: &unit,
+                let inputs = PulseInputDerivatives {
+                    start_velocities: &zeros,
+                    end_velocities: &unit,
                     gains: &no_gains,
                     laws: &no_laws,
                     intervals: &constant,
                 };
-                self.force_derivatives(at, &intervals, &given, &mut work);
+                self.force_derivatives(pulse_states, &intervals, &inputs, &mut work);
                 for (a, slope) in work.means.iter().enumerate() {
                     for b in 0..n {
-                        let by_channels = out.channels[first + b * states + self.velocities[c]];
-                        matrix[a * n + b] -= slope * (by_channels + self.problem.gain(c, b));
+                        let channel_response = out.channels[first + b * states + self.velocities[c]];
+                        matrix[a * n + b] -= slope * (channel_response + self.problem.gain(c, b));
                     }
                 }
             }
@@ -420,23 +425,25 @@ impl ContactOperators {
         motion: &mut MotionDerivatives,
         x: &mut [f64],
     ) {
-        let at = contacts.of_pulse(pulse);
+        let pulse_states = contacts.pulse_states(pulse);
         let (states, n, count) = (self.states, self.count(), x.len());
-        let MotionDerivatives { outputs, velocities, ends, work } = motion;
-        for (a, end) in ends.iter_mut().enumerate() {
-            let through = |state: (usize, &BodyState)| {
+        let MotionDerivatives { outputs, velocities, end_velocities, work } = motion;
+        for (a, end) in end_velocities.iter_mut().enumerate() {
+            let gain_change = |state: (usize, &BodyState)| {
                 derivatives.gains[a * n + state.0 % n] * state.1.length * state.1.pulse.force
             };
-            *end = derivatives.starts[a].1 + x[self.velocities[a]] + at.iter().enumerate().map(through).sum::<f64>();
+            *end = derivatives.initial_motion[a].1
+                + x[self.velocities[a]]
+                + pulse_states.iter().enumerate().map(gain_change).sum::<f64>();
         }
-        let given = PulseInputDerivatives {
-            starts: velocities,
-            ends,
+        let inputs = PulseInputDerivatives {
+            start_velocities: velocities,
+            end_velocities,
             gains: &derivatives.gains,
             laws: &derivatives.laws,
             intervals: changes,
         };
-        self.force_derivatives(at, intervals, &given, work);
+        self.force_derivatives(pulse_states, intervals, &inputs, work);
         let solution = &responses.feedback[pulse * n * n..(pulse + 1) * n * n];
         let channels = &responses.channels[pulse * n * states..(pulse + 1) * n * states];
         for b in 0..n {
@@ -445,7 +452,7 @@ impl ContactOperators {
             x[count - n + b] = force;
         }
         for a in 0..n {
-            (outputs[a], velocities[a]) = (x[self.outputs[a]], derivatives.starts[a].1 + x[self.velocities[a]]);
+            (outputs[a], velocities[a]) = (x[self.outputs[a]], derivatives.initial_motion[a].1 + x[self.velocities[a]]);
         }
     }
 
@@ -457,7 +464,9 @@ impl ContactOperators {
         motion: &MotionDerivatives,
         free: &mut [f64],
     ) {
-        for (a, _) in contacts.of_pulse(pulse).iter().take(self.count()).enumerate().filter(|(_, at)| at.is_resting) {
+        for (a, _) in
+            contacts.pulse_states(pulse).iter().take(self.count()).enumerate().filter(|(_, state)| state.is_resting)
+        {
             free[self.outputs[a]] = motion.outputs[a];
         }
     }
@@ -473,12 +482,14 @@ impl ContactSolver<'_> {
         pulse: &mut impl PulseEquations,
         intervals: &[Interval],
     ) -> std::result::Result<(), PulseFailure> {
-        for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
-            *rests = before.1 && *now == 0.0;
+        for (is_resting, (last_output, velocity)) in
+            self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities))
+        {
+            *is_resting = last_output.1 && *velocity == 0.0;
         }
         loop {
-            for (a, rests) in self.is_resting.iter().enumerate() {
-                pulse.fix(self.contact.outputs[a], rests.then_some(self.last_outputs[a].0));
+            for (a, is_resting) in self.is_resting.iter().enumerate() {
+                pulse.fix(self.contact.outputs[a], is_resting.then_some(self.last_outputs[a].0));
             }
             self.solve_friction(pulse, intervals)?;
             let mut is_done = true;
@@ -510,42 +521,43 @@ impl ContactSolver<'_> {
         intervals: &[Interval],
     ) -> std::result::Result<(), PulseFailure> {
         let (contact, n) = (self.contact, self.contact.count());
-        let mut miss = f64::INFINITY;
-        let mut size: f64 = 0.0;
+        let mut error = f64::INFINITY;
+        let mut velocity_scale: f64 = 0.0;
         for _ in 0..MAX_PULSE_ITERATIONS {
             pulse.solve_with(&self.forces)?;
-            let through = |a: usize| (0..n).map(|b| contact.problem.gain(a, b) * self.forces[b]).sum::<f64>();
+            let friction_change = |a: usize| (0..n).map(|b| contact.problem.gain(a, b) * self.forces[b]).sum::<f64>();
             let free: Vec<f64> = (0..n)
-                .map(|a| self.initial_velocities[a] + *pulse.channel(contact.velocities[a]) + through(a))
+                .map(|a| self.initial_velocities[a] + *pulse.channel(contact.velocities[a]) + friction_change(a))
                 .collect();
             for (rounding, free) in self.rounding.iter_mut().zip(&free) {
                 *rounding = f64::max(*rounding, VELOCITY_ROUNDING_RATIO * free.abs());
             }
             self.solve_intervals(&free, intervals);
-            (miss, size) = (0.0, 0.0);
+            (error, velocity_scale) = (0.0, 0.0);
             for (a, free) in free.iter().enumerate() {
                 let states = self.contacts.iter().skip(a).step_by(n);
                 let force: f64 = states.map(|state| state.length * state.pulse.force).sum();
-                let own = contact.problem.own(a);
-                miss = f64::max(miss, (force - self.forces[a]).abs() * own);
-                size = size.max(self.velocities[a].abs() + free.abs() + contact.problem.breakaway(a) * own);
+                let own_gain = contact.problem.own_gain(a);
+                error = f64::max(error, (force - self.forces[a]).abs() * own_gain);
+                velocity_scale =
+                    velocity_scale.max(self.velocities[a].abs() + free.abs() + contact.problem.breakaway(a) * own_gain);
                 self.forces[a] = force;
             }
             if self.contacts.iter().any(|state| state.pulse.end.is_nan()) {
                 return Err(PulseFailure::Overflow);
             }
-            if miss <= FRICTION_ROUNDING_RATIO * size {
+            if error <= FRICTION_ROUNDING_RATIO * velocity_scale {
                 break;
             }
             if pulse.is_linear() {
                 // With linear equations, this iteration found the exact friction forces. The state channels follow from
                 // them.
                 pulse.solve_with(&self.forces)?;
-                miss = 0.0;
+                error = 0.0;
                 break;
             }
         }
-        if miss > MAX_FRICTION_ERROR_RATIO * size {
+        if error > MAX_FRICTION_ERROR_RATIO * velocity_scale {
             return Err(PulseFailure::Contact);
         }
         for a in 0..n {
@@ -558,21 +570,21 @@ impl ContactSolver<'_> {
     /// the pulse without friction.
     fn solve_intervals(&mut self, free: &[f64], intervals: &[Interval]) {
         let (problem, n) = (&self.contact.problem, self.contact.count());
-        let IntervalWorkspace { velocities, forces, frictionless, frictionless_changes, at } = &mut self.work;
+        let IntervalWorkspace { velocities, forces, frictionless, frictionless_changes, solutions } = &mut self.work;
         velocities.clone_from(&self.velocities);
         forces.clone_from(&self.forces);
         self.contacts.clear();
-        for Interval { length, forces: pushes } in intervals {
+        for Interval { length, forces: force_offsets } in intervals {
             frictionless_changes.clear();
             frictionless.clear();
             for (a, (&free, &start)) in free.iter().zip(&self.velocities).enumerate() {
-                let end = free + (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum::<f64>();
+                let end = free + (0..n).map(|b| problem.gain(a, b) * force_offsets[b]).sum::<f64>();
                 frictionless_changes.push(end - start);
                 // This value is exactly `free` if the interval is the whole pulse.
                 frictionless.push(length * end + (velocities[a] - length * start));
             }
-            problem.solve(*length, (velocities, frictionless), &self.rounding, forces, at);
-            for (a, &(free_velocity, pulse)) in at.iter().enumerate() {
+            problem.solve(*length, (velocities, frictionless), &self.rounding, forces, solutions);
+            for (a, &(free_velocity, pulse)) in solutions.iter().enumerate() {
                 self.contacts.push(BodyState {
                     length: *length,
                     frictionless_change: frictionless_changes[a],

@@ -17,11 +17,11 @@ const MAX_POLYNOMIAL_ORDER: usize = 3;
 /// Kernel of online convolutions. One kernel serves any number of signals.
 pub struct ConvolutionKernel {
     values: Vec<f64>,
-    memory: Memory,
+    form: KernelForm,
 }
 
 /// Form of a kernel for sums over past values.
-enum Memory {
+enum KernelForm {
     /// Spectra of the first values of the kernel. Each spectrum covers twice as many values as the previous one.
     Blocks(Vec<Kernel>),
     /// Coefficients of the kernel in the polynomials 1, n, n(n + 1)/2, … of the lag n ≥ 1.
@@ -39,7 +39,7 @@ impl ConvolutionKernel {
             spectra.push(Kernel::with_length(&values[..(2 * length).min(values.len())], 2 * length));
             length *= 2;
         }
-        Self { values, memory: Memory::Blocks(spectra) }
+        Self { values, form: KernelForm::Blocks(spectra) }
     }
 
     /// Kernel of the fractional integral of the given order. `values` holds the kernel from lag 0 on. For an integer
@@ -55,8 +55,8 @@ impl ConvolutionKernel {
         // extended to n ≤ 0 by its differences at 1, 2, ….
         let mut differences: Vec<f64> = values[1..=degrees].to_vec();
         for level in 1..degrees {
-            for at in (level..degrees).rev() {
-                differences[at] -= differences[at - 1];
+            for index in (level..degrees).rev() {
+                differences[index] -= differences[index - 1];
             }
         }
         // Forward differences at 1 become backward differences at 0: ∇^j p(0) = Σ_k (−1)^k C(j + k, k) Δ^{j+k} p(1).
@@ -71,7 +71,7 @@ impl ConvolutionKernel {
                 sum
             })
             .collect();
-        Self { values, memory: Memory::Polynomial(coefficients) }
+        Self { values, form: KernelForm::Polynomial(coefficients) }
     }
 
     /// Values of the kernel from lag 0 on.
@@ -96,9 +96,9 @@ impl<'a> OnlineConvolution<'a> {
     /// Convolution of an empty signal, to which [`OnlineConvolution::push`] appends values.
     #[must_use]
     pub fn new(kernel: &'a ConvolutionKernel) -> Self {
-        let (sums, signal) = match &kernel.memory {
-            Memory::Blocks(_) => (vec![0.0; kernel.values.len()], Vec::with_capacity(kernel.values.len())),
-            Memory::Polynomial(coefficients) => (vec![0.0; coefficients.len()], Vec::new()),
+        let (sums, signal) = match &kernel.form {
+            KernelForm::Blocks(_) => (vec![0.0; kernel.values.len()], Vec::with_capacity(kernel.values.len())),
+            KernelForm::Polynomial(coefficients) => (vec![0.0; coefficients.len()], Vec::new()),
         };
         Self { kernel, sums, signal, buffers: Buffers::default(), block: Vec::new() }
     }
@@ -106,7 +106,7 @@ impl<'a> OnlineConvolution<'a> {
     /// Contribution Σ_{j<k} κ_{k−j} x_j of the k past values to the next value of the convolution.
     #[must_use]
     pub fn past_contribution(&self) -> f64 {
-        if let Memory::Polynomial(coefficients) = &self.kernel.memory {
+        if let KernelForm::Polynomial(coefficients) = &self.kernel.form {
             return coefficients.iter().zip(&self.sums).map(|(c, sum)| c * sum).sum();
         }
         self.sums.get(self.signal.len()).copied().unwrap_or(0.0)
@@ -114,33 +114,33 @@ impl<'a> OnlineConvolution<'a> {
 
     /// Append the next value of the signal.
     pub fn push(&mut self, value: f64) {
-        let spectra = match &self.kernel.memory {
-            Memory::Polynomial(_) => {
-                let mut added = value;
+        let spectra = match &self.kernel.form {
+            KernelForm::Polynomial(_) => {
+                let mut increment = value;
                 for sum in &mut self.sums {
-                    *sum += added;
-                    added = *sum;
+                    *sum += increment;
+                    increment = *sum;
                 }
                 return;
             }
-            Memory::Blocks(spectra) => spectra,
+            KernelForm::Blocks(spectra) => spectra,
         };
         self.signal.push(value);
-        let known = self.signal.len();
-        let end = known.next_multiple_of(DIRECT_SUM_LENGTH).min(self.sums.len());
-        if let Some(coming) = self.sums.get_mut(known..end) {
-            coming.iter_mut().zip(&self.kernel.values[1..]).for_each(|(sum, c)| *sum += c * value);
+        let count = self.signal.len();
+        let end = count.next_multiple_of(DIRECT_SUM_LENGTH).min(self.sums.len());
+        if let Some(block_sums) = self.sums.get_mut(count..end) {
+            block_sums.iter_mut().zip(&self.kernel.values[1..]).for_each(|(sum, c)| *sum += c * value);
         }
-        if !known.is_multiple_of(DIRECT_SUM_LENGTH) || known >= self.sums.len() {
+        if !count.is_multiple_of(DIRECT_SUM_LENGTH) || count >= self.sums.len() {
             return;
         }
-        let level = (known / DIRECT_SUM_LENGTH).trailing_zeros() as usize;
+        let level = (count / DIRECT_SUM_LENGTH).trailing_zeros() as usize;
         let length = DIRECT_SUM_LENGTH << level;
-        let past = &self.signal[known - length..];
+        let past = &self.signal[count - length..];
         let Some(spectrum) = spectra.get(level).filter(|_| past.iter().any(|x| *x != 0.0)) else { return };
         self.block.resize(2 * length, 0.0);
         spectrum.apply(past, &mut self.block[..2 * length], &mut self.buffers);
-        self.sums[known..].iter_mut().zip(&self.block[length..2 * length]).for_each(|(sum, v)| *sum += v);
+        self.sums[count..].iter_mut().zip(&self.block[length..2 * length]).for_each(|(sum, v)| *sum += v);
     }
 }
 
@@ -149,18 +149,21 @@ impl<'a> OnlineConvolution<'a> {
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
-    let turn = libm::log(step) - digamma(eta + 1.0);
+    let log_slope = libm::log(step) - digamma(eta + 1.0);
     (0..m)
         .map(|n| {
             // (n + 1)^η − n^η without cancellation.
             let (value, slope) = if n == 0 {
                 (1.0, 0.0)
             } else {
-                let (n, near) = (n as f64, libm::log1p(1.0 / n as f64));
-                let (power, grown) = (libm::pow(n, eta), libm::expm1(eta * near));
-                (power * grown, power * (libm::log(n) * grown + near * (grown + 1.0)))
+                let (n, log_ratio) = (n as f64, libm::log1p(1.0 / n as f64));
+                let (power, relative_growth) = (libm::pow(n, eta), libm::expm1(eta * log_ratio));
+                (
+                    power * relative_growth,
+                    power * (libm::log(n) * relative_growth + log_ratio * (relative_growth + 1.0)),
+                )
             };
-            (scale * value, scale * (value * turn + slope))
+            (scale * value, scale * (value * log_slope + slope))
         })
         .unzip()
 }

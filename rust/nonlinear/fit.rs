@@ -13,7 +13,7 @@ use crate::parallel::Stop;
 
 /// Initial guess of a fit.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Start {
+pub struct InitialGuess {
     /// Values of the free orders.
     pub orders: Vec<f64>,
     /// Values of the free coefficients.
@@ -84,14 +84,14 @@ impl LeastSquaresProblem for OutputError<'_> {
             *order = (before + step).clamp(low, high);
             largest_change = largest_change.max((*order - before).abs());
         }
-        let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
+        let relative_change = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
             let before = *value;
             *value = self.model.model.coordinates[j].shift(before, *step);
             if self.model.is_nonnegative(j) {
                 *value = value.max(0.0);
             }
-            largest_change = largest_change.max(share(before, *value));
+            largest_change = largest_change.max(relative_change(before, *value));
         }
         for ((value, input), step) in next.inputs.iter_mut().zip(&self.model.model.inputs).zip(inputs) {
             let (before, (low, high)) = (*value, input.bounds);
@@ -99,10 +99,10 @@ impl LeastSquaresProblem for OutputError<'_> {
             largest_change = largest_change.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
         }
         for run in &mut next.states {
-            let (own, others) = states.split_at(run.len());
-            states = others;
-            for (value, step) in run.iter_mut().zip(own) {
-                largest_change = largest_change.max(share(*value, *value + step));
+            let (run_steps, remaining_steps) = states.split_at(run.len());
+            states = remaining_steps;
+            for (value, step) in run.iter_mut().zip(run_steps) {
+                largest_change = largest_change.max(relative_change(*value, *value + step));
                 *value += step;
             }
         }
@@ -128,8 +128,8 @@ impl LeastSquaresProblem for OutputError<'_> {
         if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.model.inputs.get(i))) {
             return (value - free.bounds.0, free.bounds.1 - value);
         }
-        let plain = self.model.model.coordinates.get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
-        if plain && self.model.is_nonnegative(j) {
+        let is_linear = self.model.model.coordinates.get(j).is_some_and(|c| c.derivative(2.0) == 1.0);
+        if is_linear && self.model.is_nonnegative(j) {
             return (point.coefficients[j], f64::INFINITY);
         }
         (f64::INFINITY, f64::INFINITY)
@@ -183,8 +183,8 @@ impl LeastSquaresProblem for InitialStateProblem<'_> {
 
     fn apply_step(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
         let next: Vec<f64> = states.iter().zip(steps).map(|(x, step)| x + step).collect();
-        let share = |(x, step): (&f64, &f64)| step.abs() / x.abs().max(f64::MIN_POSITIVE);
-        (next, states.iter().zip(steps).map(share).fold(0.0, f64::max))
+        let relative_change = |(x, step): (&f64, &f64)| step.abs() / x.abs().max(f64::MIN_POSITIVE);
+        (next, states.iter().zip(steps).map(relative_change).fold(0.0, f64::max))
     }
 
     fn has_kinks(&self, _states: &Vec<f64>, _parameter: usize) -> bool {
@@ -204,7 +204,7 @@ const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { eval
 ///
 /// Over a long run, the cost has local minima in the initial state. They have a wrong phase, or a wrong number of
 /// oscillations before a body sticks. Over the first fraction, the cost has one minimum.
-const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
+const FIT_FRACTIONS: [f64; 3] = [0.125, 0.25, 0.5];
 
 /// Estimate the initial state of a run, with all other parameters fixed.
 ///
@@ -220,22 +220,22 @@ fn estimate_initial_state(
     let problem = InitialStateProblem { model, experiment, orders, coefficients, inputs, stop };
     let mut guesses = model.state_guesses(orders, coefficients, experiment);
     let Some(first) = guesses.first().cloned().filter(|guess| !guess.is_empty()) else { return Ok(Vec::new()) };
-    let mut continued = first.clone();
-    for share in BEGINNING_SHARES {
+    let mut extended_guess = first.clone();
+    for fraction in FIT_FRACTIONS {
         let beginning =
-            experiment.clone().with_weights(&experiment.weights, Some(&beginning_weights(experiment, share)))?;
-        let part = InitialStateProblem { experiment: &beginning, ..problem };
-        match minimize(&part, continued.clone(), INITIAL_STATE_SETTINGS) {
-            Ok(found) => continued = found.point,
+            experiment.clone().with_weights(&experiment.weights, Some(&beginning_weights(experiment, fraction)))?;
+        let beginning_problem = InitialStateProblem { experiment: &beginning, ..problem };
+        match minimize(&beginning_problem, extended_guess.clone(), INITIAL_STATE_SETTINGS) {
+            Ok(optimum) => extended_guess = optimum.point,
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             _ => {}
         }
     }
-    guesses.push(continued);
+    guesses.push(extended_guess);
     let mut best = (f64::INFINITY, first);
     for guess in guesses {
         match minimize(&problem, guess, INITIAL_STATE_SETTINGS) {
-            Ok(found) if found.cost < best.0 => best = (found.cost, found.point),
+            Ok(optimum) if optimum.cost < best.0 => best = (optimum.cost, optimum.point),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // An initial guess whose simulation fails is skipped.
             _ => {}
@@ -244,11 +244,11 @@ fn estimate_initial_state(
     Ok(best.1)
 }
 
-/// Return the weight of each compared sample of each output: 1 in the first fraction `share` of the run, 0 after it.
+/// Return the weight of each compared sample of each output: 1 in the first fraction `fraction` of the run, 0 after it.
 #[allow(clippy::cast_precision_loss)]
-fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
+fn beginning_weights(experiment: &Experiment, fraction: f64) -> Vec<Vec<f64>> {
     let count = experiment.compared_count();
-    let weight = |k: usize| if (k as f64) < share * count as f64 { 1.0 } else { 0.0 };
+    let weight = |k: usize| if (k as f64) < fraction * count as f64 { 1.0 } else { 0.0 };
     vec![(0..count).map(weight).collect(); experiment.samples.len()]
 }
 
@@ -261,7 +261,7 @@ fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
 pub fn fit(
     model: &NonlinearModel,
     experiments: &[Experiment],
-    start: &Start,
+    start: &InitialGuess,
     settings: MinimizationSettings,
     stop: &Stop,
 ) -> Result<NonlinearFit> {
@@ -294,32 +294,32 @@ pub fn fit(
     }
     let problem = OutputError { model, experiments, stop };
     let start = Point { orders, coefficients, inputs, states };
-    let (found, residuals) = minimize_with_priors(&problem, &model.model.priors, Point::value, start, settings)?;
-    let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
+    let (optimum, residuals) = minimize_with_priors(&problem, &model.model.priors, Point::value, start, settings)?;
+    let parameter_count = optimum.point.orders.len() + optimum.point.coefficients.len() + optimum.point.inputs.len();
     let mut basis = Vec::new();
-    for column in found.jacobian.iter().skip(numbers) {
+    for column in optimum.jacobian.iter().skip(parameter_count) {
         extend_orthonormal(&mut basis, column.clone(), DEPENDENCE_TOLERANCE);
     }
-    let mut jacobian = found.jacobian;
-    jacobian.truncate(numbers);
+    let mut jacobian = optimum.jacobian;
+    jacobian.truncate(parameter_count);
     for column in &mut jacobian {
         for direction in &basis {
-            let along: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
-            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+            let component: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
+            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= component * q);
         }
     }
-    let Point { orders, coefficients, inputs, states } = found.point;
+    let Point { orders, coefficients, inputs, states } = optimum.point;
     Ok(NonlinearFit {
         initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
         orders,
         coefficients,
         inputs,
         states,
-        cost: found.cost,
+        cost: optimum.cost,
         residuals,
         jacobian,
-        evaluations: found.evaluations,
-        status: found.status,
+        evaluations: optimum.evaluations,
+        status: optimum.status,
     })
 }
 

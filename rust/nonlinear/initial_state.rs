@@ -43,11 +43,12 @@ impl EndVelocityForcing {
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
-        let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
+        let constant =
+            |terms: &Vec<(f64, f64)>| terms.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
         let initial_outputs = solve_feedthrough(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
         let mut rates = vec![PowerSum::default(); n];
-        for (i, own) in powers.iter().enumerate() {
-            for &(exponent, value) in own.iter().filter(|power| power.0.abs() >= ORDER_GRAIN) {
+        for (i, terms) in powers.iter().enumerate() {
+            for &(exponent, value) in terms.iter().filter(|power| power.0.abs() >= ORDER_GRAIN) {
                 rates[i].add(exponent - 1.0, value * exponent);
             }
             for link in links[i].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
@@ -65,17 +66,17 @@ impl EndVelocityForcing {
                 });
             }
         }
-        let given: Vec<f64> =
-            rates.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
-        let initial_velocities = solve_feedthrough(&given, links)?;
+        let constants: Vec<f64> =
+            rates.iter().map(|terms| terms.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
+        let initial_velocities = solve_feedthrough(&constants, links)?;
         let mut velocities = vec![vec![0.0; m]; n];
-        for (i, own) in rates.iter_mut().enumerate() {
-            own.add(0.0, -initial_velocities[i]);
+        for (i, terms) in rates.iter_mut().enumerate() {
+            terms.add(0.0, -initial_velocities[i]);
             for link in &links[i] {
                 let eta = link.integration;
-                own.add(eta, link.coefficient * initial_velocities[link.output] / libm::tgamma(eta + 1.0));
+                terms.add(eta, link.coefficient * initial_velocities[link.output] / libm::tgamma(eta + 1.0));
             }
-            for (exponent, value) in own.powers() {
+            for (exponent, value) in terms.powers() {
                 let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
                 velocities[i].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
             }
@@ -91,7 +92,7 @@ pub(super) struct PowerSum(Vec<(f64, f64, f64)>);
 impl PowerSum {
     pub(super) fn add(&mut self, exponent: f64, value: f64) {
         match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
-            Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
+            Some(power) => (power.1, power.2) = (power.1 + value, power.2.max(value.abs())),
             None => self.0.push((exponent, value, value.abs())),
         }
     }
@@ -115,19 +116,19 @@ pub(super) fn derivative_powers(
 ) -> Result<Vec<(f64, f64)>> {
     let mut sum = PowerSum::default();
     powers[equation].iter().for_each(|&(exponent, value)| sum.add(exponent, value));
-    let mut whole = 0.0;
-    while whole < order - ORDER_GRAIN {
-        let at = |own: &Vec<(f64, f64)>| -> f64 {
-            own.iter().filter(|p| (p.0 - whole).abs() < ORDER_GRAIN).map(|p| p.1).sum()
+    let mut integer_order = 0.0;
+    while integer_order < order - ORDER_GRAIN {
+        let coefficient_at = |terms: &Vec<(f64, f64)>| -> f64 {
+            terms.iter().filter(|p| (p.0 - integer_order).abs() < ORDER_GRAIN).map(|p| p.1).sum()
         };
-        let given: Vec<f64> = powers.iter().map(at).collect();
-        let initial_outputs = solve_feedthrough(&given, links)?;
+        let constants: Vec<f64> = powers.iter().map(coefficient_at).collect();
+        let initial_outputs = solve_feedthrough(&constants, links)?;
         for link in links[equation].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
-            let exponent = link.integration + whole;
-            let value = initial_outputs[link.output] * libm::tgamma(whole + 1.0);
+            let exponent = link.integration + integer_order;
+            let value = initial_outputs[link.output] * libm::tgamma(integer_order + 1.0);
             sum.add(exponent, link.coefficient * value / libm::tgamma(exponent + 1.0));
         }
-        whole += 1.0;
+        integer_order += 1.0;
     }
     let mut out = Vec::new();
     for (exponent, value) in sum.powers() {
@@ -135,8 +136,8 @@ pub(super) fn derivative_powers(
             out.push((exponent, value));
             continue;
         }
-        let is_whole = (exponent - exponent.round()).abs() < ORDER_GRAIN;
-        if value == 0.0 || (is_whole && exponent < order - ORDER_GRAIN) {
+        let is_integer = (exponent - exponent.round()).abs() < ORDER_GRAIN;
+        if value == 0.0 || (is_integer && exponent < order - ORDER_GRAIN) {
             continue;
         }
         if exponent - order <= -1.0 {
@@ -160,19 +161,19 @@ pub(super) fn power_term_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
         return power_means(exponent, m, step);
     }
     let (mut sum, scale) = (0.0, libm::tgamma(exponent + 1.0));
-    let summed = |v: f64| {
+    let cumulative = |v: f64| {
         sum += v;
         scale * sum
     };
-    kernel(exponent, m, step).into_iter().map(summed).collect()
+    kernel(exponent, m, step).into_iter().map(cumulative).collect()
 }
 
-/// Solve x = `given` + C x for the initial outputs or velocities x of all equations. C holds the coefficients of the
-/// terms with direct feedthrough (integration order 0). Return an error if the equations do not determine x.
-pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
-    let n = given.len();
+/// Solve x = `constants` + C x for the initial outputs or velocities x of all equations. C holds the coefficients of
+/// the terms with direct feedthrough (integration order 0). Return an error if the equations do not determine x.
+pub(super) fn solve_feedthrough(constants: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+    let n = constants.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
-        return Ok(given.to_vec());
+        return Ok(constants.to_vec());
     }
     let mut matrix = vec![0.0; n * n];
     for (i, row) in links.iter().enumerate() {
@@ -182,7 +183,7 @@ pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Ve
         }
     }
     let inverse = small::inverse(&matrix, n)?;
-    Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
+    Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * constants[j]).sum()).collect())
 }
 
 /// Free initial state of a run, which adds powers of t to the outputs.
@@ -195,7 +196,7 @@ pub(super) enum InitialTerm {
     /// Power of t that is due to the initial value of an input, or of a derivative of it.
     Jump {
         /// Indices of the equation and of the term in it.
-        at: (usize, usize),
+        term: (usize, usize),
         /// Order of the derivative of the input whose initial value enters: 0 for the input itself.
         derivative_order: u32,
     },
@@ -217,7 +218,7 @@ impl InitialTerm {
         filtered: &[bool],
         free: impl Fn(usize, usize) -> bool,
     ) -> Vec<Self> {
-        let followed = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
+        let is_simulated = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
         let mut all: Vec<Self> = Vec::new();
         for (i, Equation { structure, .. }) in equations.iter().enumerate() {
             match initial.base() {
@@ -228,12 +229,12 @@ impl InitialTerm {
                     if structure.order > 1.0 + ORDER_GRAIN {
                         all.push(Self::Rate(i));
                     }
-                    for (term, driver) in structure.terms.iter().enumerate().filter(|(_, t)| !followed(t.signal)) {
-                        for derivative_order in (0_u32..).take_while(|&k| f64::from(k) < driver.order - ORDER_GRAIN) {
-                            let exponent = structure.order - driver.order + f64::from(derivative_order);
-                            let known = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
-                            if free(i, term) || !known {
-                                all.push(Self::Jump { at: (i, term), derivative_order });
+                    for (term, input) in structure.terms.iter().enumerate().filter(|(_, t)| !is_simulated(t.signal)) {
+                        for derivative_order in (0_u32..).take_while(|&k| f64::from(k) < input.order - ORDER_GRAIN) {
+                            let exponent = structure.order - input.order + f64::from(derivative_order);
+                            let is_represented = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
+                            if free(i, term) || !is_represented {
+                                all.push(Self::Jump { term: (i, term), derivative_order });
                             }
                         }
                     }
@@ -244,7 +245,7 @@ impl InitialTerm {
             let offsets = initial.offset_exponents(structure.order).len();
             all.extend((0..offsets).filter_map(|k| u32::try_from(k).ok()).map(|k| Self::Offset(i, k)));
         }
-        for i in (0..equations.len()).filter(|&i| filtered.get(i).is_some_and(|&passes| passes)) {
+        for i in (0..equations.len()).filter(|&i| filtered.get(i).is_some_and(|&is_filtered| is_filtered)) {
             all.extend(initial.impulses().map(|e| Self::Power(i, e)));
         }
         all
@@ -258,20 +259,20 @@ impl InitialTerm {
     /// Return the powers of t in the outputs per unit of this state, as (equation, exponent, coefficient).
     pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
         // Caputo derivatives of a constant are zero, so only terms of order 0 respond to a level.
-        let powers_of_value = |output: usize, whole: f64| {
-            let mut all = vec![(output, whole, 1.0)];
+        let powers_of_value = |output: usize, degree: f64| {
+            let mut powers = vec![(output, degree, 1.0)];
             for (i, row) in links.iter().enumerate() {
-                for link in row.iter().filter(|link| link.output == output && link.order > whole + ORDER_GRAIN) {
-                    let exponent = link.integration + whole;
-                    all.push((i, exponent, -link.coefficient / libm::tgamma(exponent + 1.0)));
+                for link in row.iter().filter(|link| link.output == output && link.order > degree + ORDER_GRAIN) {
+                    let exponent = link.integration + degree;
+                    powers.push((i, exponent, -link.coefficient / libm::tgamma(exponent + 1.0)));
                 }
             }
-            all
+            powers
         };
         match self {
             Self::Level(i) => powers_of_value(i, 0.0),
             Self::Rate(i) => powers_of_value(i, 1.0),
-            Self::Jump { at: (i, term), derivative_order } => {
+            Self::Jump { term: (i, term), derivative_order } => {
                 let structure = &equations[i].structure;
                 vec![(i, structure.order - structure.terms[term].order + f64::from(derivative_order), 1.0)]
             }
@@ -286,12 +287,12 @@ impl InitialTerm {
 pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {
-        match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {
-            Some(known) => known.1 += value,
+        match out[i].iter_mut().find(|power| (power.0 - exponent).abs() < ORDER_GRAIN) {
+            Some(power) => power.1 += value,
             None => out[i].push((exponent, value)),
         }
     }
-    out.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
+    out.iter_mut().for_each(|terms| terms.sort_by(|a, b| a.0.total_cmp(&b.0)));
     out
 }
 

@@ -22,11 +22,11 @@ pub(super) struct Interval {
     pub(super) forces: Vec<f64>,
 }
 
-/// Jump of an input by `size` in the pulse with index `pulse`. `share` is the fraction of the pulse before the jump.
+/// Jump of an input by `size` in the pulse with index `pulse`. `fraction` is the fraction of the pulse before the jump.
 #[derive(Debug, Clone, Copy)]
 struct InputJump {
     pulse: usize,
-    share: f64,
+    fraction: f64,
     size: f64,
     signal: usize,
     /// Index of the jump among the jumps of its signal.
@@ -39,7 +39,7 @@ struct InputForce {
     signal: usize,
     body: usize,
     /// Indices of the equation and of the term in it.
-    at: (usize, usize),
+    term: (usize, usize),
     coefficient: f64,
 }
 
@@ -49,9 +49,9 @@ pub(super) struct ForceJumps {
     jumps: Vec<InputJump>,
     forces: Vec<InputForce>,
     /// Intervals of a pulse without jumps: one interval of length 1.
-    whole: [Interval; 1],
-    /// Derivatives of `whole`: zero.
-    whole_derivative: [Interval; 1],
+    whole_pulse: [Interval; 1],
+    /// Derivatives of `whole_pulse`: zero.
+    whole_pulse_derivative: [Interval; 1],
 }
 
 impl ForceJumps {
@@ -63,30 +63,30 @@ impl ForceJumps {
             for (k, (term, &coefficient)) in equation.structure.terms.iter().zip(&equation.coefficients).enumerate() {
                 let is_input = term.signal < system.recorded && system.output_index(i, term.signal).is_none();
                 if is_input && term.order < ORDER_GRAIN {
-                    forces.push(InputForce { signal: term.signal, body, at: (i, k), coefficient });
+                    forces.push(InputForce { signal: term.signal, body, term: (i, k), coefficient });
                 }
             }
         }
         let mut signals: Vec<usize> = forces.iter().map(|force| force.signal).collect();
         signals.sort_unstable();
         signals.dedup();
-        let of = |&signal: &usize| {
+        let jumps_of_signal = |&signal: &usize| {
             record.jumps(signal).iter().enumerate().map(move |(index, jump)| InputJump {
                 pulse: jump.pulse,
-                share: jump.share,
+                fraction: jump.fraction,
                 size: jump.after - jump.before,
                 signal,
                 index,
             })
         };
-        let mut jumps: Vec<InputJump> = signals.iter().flat_map(of).collect();
-        jumps.sort_by(|a, b| a.pulse.cmp(&b.pulse).then(a.share.total_cmp(&b.share)));
+        let mut jumps: Vec<InputJump> = signals.iter().flat_map(jumps_of_signal).collect();
+        jumps.sort_by(|a, b| a.pulse.cmp(&b.pulse).then(a.fraction.total_cmp(&b.fraction)));
         let bodies = system.frictions.len();
         let interval = |length: f64| [Interval { length, forces: vec![0.0; bodies] }];
-        Self { jumps, forces, whole: interval(1.0), whole_derivative: interval(0.0) }
+        Self { jumps, forces, whole_pulse: interval(1.0), whole_pulse_derivative: interval(0.0) }
     }
 
-    fn of_pulse(&self, pulse: usize) -> &[InputJump] {
+    fn pulse_jumps(&self, pulse: usize) -> &[InputJump] {
         let first = self.jumps.partition_point(|jump| jump.pulse < pulse);
         let count = self.jumps[first..].partition_point(|jump| jump.pulse == pulse);
         &self.jumps[first..first + count]
@@ -94,30 +94,30 @@ impl ForceJumps {
 
     /// Return the intervals of a pulse between its jumps.
     pub(super) fn intervals(&self, pulse: usize) -> Cow<'_, [Interval]> {
-        let jumps = self.of_pulse(pulse);
+        let jumps = self.pulse_jumps(pulse);
         if jumps.is_empty() {
-            return Cow::Borrowed(&self.whole);
+            return Cow::Borrowed(&self.whole_pulse);
         }
         let size = |jump: &InputJump, force: &InputForce| force.coefficient * jump.size;
-        let mean = |jump: &InputJump, force: &InputForce| size(jump, force) * (1.0 - jump.share);
-        Cow::Owned(self.split(jumps, |jump| jump.share, 1.0, size, mean))
+        let mean = |jump: &InputJump, force: &InputForce| size(jump, force) * (1.0 - jump.fraction);
+        Cow::Owned(self.split(jumps, |jump| jump.fraction, 1.0, size, mean))
     }
 
     /// Return the derivatives of the intervals of a pulse with respect to a parameter.
     pub(super) fn interval_derivatives(&self, pulse: usize, derivatives: &SystemDerivatives) -> Cow<'_, [Interval]> {
-        let jumps = self.of_pulse(pulse);
+        let jumps = self.pulse_jumps(pulse);
         if jumps.is_empty() {
-            return Cow::Borrowed(&self.whole_derivative);
+            return Cow::Borrowed(&self.whole_pulse_derivative);
         }
         let slope = |jump: &InputJump| {
             let input = derivatives.inputs.iter().find(|input| input.signal == jump.signal);
-            input.and_then(|input| input.jumps.get(jump.index)).map_or((0.0, 0.0), |s| (s.share, s.after - s.before))
+            input.and_then(|input| input.jumps.get(jump.index)).map_or((0.0, 0.0), |s| (s.fraction, s.after - s.before))
         };
         let size = |jump: &InputJump, force: &InputForce| {
-            derivatives.terms[force.at.0][force.at.1].0 * jump.size + force.coefficient * slope(jump).1
+            derivatives.terms[force.term.0][force.term.1].0 * jump.size + force.coefficient * slope(jump).1
         };
         let mean = |jump: &InputJump, force: &InputForce| {
-            size(jump, force) * (1.0 - jump.share) - force.coefficient * jump.size * slope(jump).0
+            size(jump, force) * (1.0 - jump.fraction) - force.coefficient * jump.size * slope(jump).0
         };
         Cow::Owned(self.split(jumps, |jump| slope(jump).0, 0.0, size, mean))
     }
@@ -125,22 +125,23 @@ impl ForceJumps {
     /// Split a pulse at its jumps and return the intervals. If the functions return derivatives, the result holds the
     /// derivatives of the intervals.
     ///
-    /// `place` returns the position of a jump as a fraction of the pulse, and `end` is the position of the end of the
-    /// pulse. `size` returns the change of a force at a jump. `mean` returns the contribution of this change to the
+    /// `position` returns the position of a jump as a fraction of the pulse, and `end` is the position of the end of
+    /// the pulse. `size` returns the change of a force at a jump. `mean` returns the contribution of this change to the
     /// mean force.
     fn split(
         &self,
         jumps: &[InputJump],
-        place: impl Fn(&InputJump) -> f64,
+        position: impl Fn(&InputJump) -> f64,
         end: f64,
         size: impl Fn(&InputJump, &InputForce) -> f64,
         mean: impl Fn(&InputJump, &InputForce) -> f64,
     ) -> Vec<Interval> {
-        let (mut means, mut intervals) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
+        let (mut means, mut intervals) =
+            (vec![0.0; self.whole_pulse[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
         let (mut level, mut last) = (means.clone(), 0.0);
         for jump in jumps {
-            intervals.push(Interval { length: place(jump) - last, forces: level.clone() });
-            last = place(jump);
+            intervals.push(Interval { length: position(jump) - last, forces: level.clone() });
+            last = position(jump);
             for force in self.forces.iter().filter(|force| force.signal == jump.signal) {
                 level[force.body] += size(jump, force);
                 means[force.body] += mean(jump, force);

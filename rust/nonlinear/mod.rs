@@ -13,12 +13,12 @@ pub mod convolution;
 mod fit;
 mod initial_state;
 mod jumps;
-mod march;
 mod model;
 mod system;
+mod time_stepping;
 
 pub use contact::BodyMotion;
-pub use fit::{fit, NonlinearFit, Start};
+pub use fit::{fit, InitialGuess, NonlinearFit};
 pub use model::{filtered_outputs, FreeFrictionLaw, NonlinearModel};
 pub(crate) use system::unsupported_with;
 pub use system::NonlinearSystem;
@@ -28,7 +28,7 @@ use crate::regressors::{add_impulses, split_impulses, Record};
 
 /// Simulation of a system: its outputs, and the motion of its bodies with friction.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FreeRun {
+pub struct NonlinearResponse {
     /// Pulse means of each output; NaN from the first pulse that overflows.
     pub outputs: Vec<Vec<f64>>,
     /// Motion of each body with friction.
@@ -86,11 +86,11 @@ impl NonlinearSystem {
     /// assert!((motion.outputs[0][99] - 0.25).abs() < 1e-9);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<FreeRun> {
+    pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<NonlinearResponse> {
         self.check()?;
         check_length("initial terms", self.equations.len(), initial.len())?;
         let (powers, impulses) = split_impulses(initial);
-        let operators = march::Operators::new(self, record)?;
+        let operators = time_stepping::Operators::new(self, record)?;
         let mut forcing = operators.initial_forcing(self, &powers)?;
         operators.add_inputs(self, record, &mut forcing);
         let (run, end) = operators.run(self, &forcing);
@@ -102,6 +102,6 @@ impl NonlinearSystem {
         outputs.truncate(self.equations.len());
         outputs.iter_mut().for_each(|row| row.resize(record.m(), f64::NAN));
         add_impulses(&mut outputs, &impulses, record.step());
-        Ok(FreeRun { outputs, bodies })
+        Ok(NonlinearResponse { outputs, bodies })
     }
 }

@@ -2,8 +2,8 @@
 
 use super::channels::{ForcingTerms, InputDerivative, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
-use super::march::{LinearizedRun, Operators, SensitivityCache};
 use super::system::NonlinearSystem;
+use super::time_stepping::{LinearizedRun, Operators, SensitivityCache};
 use crate::equation::Equation;
 use crate::error::{Error, Result};
 use crate::estimation::output_error::{Experiment, FreeModel, Monomial};
@@ -28,30 +28,30 @@ impl FreeFrictionLaw {
     /// Return the law of Coulomb friction alone, whose friction force does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
-        let known = |factor: f64| Monomial { factor, powers: Vec::new() };
-        Self { coulomb, stribeck: known(0.0), speed: known(1.0) }
+        let constant = |factor: f64| Monomial { factor, powers: Vec::new() };
+        Self { coulomb, stribeck: constant(0.0), speed: constant(1.0) }
     }
 
-    fn numbers(&self) -> [&Monomial; 3] {
+    fn monomials(&self) -> [&Monomial; 3] {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 
     /// Return the friction law at the given values of all free coefficients.
     pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
-        let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
+        let [coulomb, stribeck, speed] = self.monomials().map(|monomial| monomial.at(coefficients));
         FrictionLaw { coulomb, stribeck, speed }
     }
 
     /// Return the derivatives of Coulomb friction, Stribeck friction and Stribeck velocity with respect to the free
     /// coefficient with index `coefficient`.
     pub(super) fn slope(&self, coefficients: &[f64], coefficient: usize) -> [f64; 3] {
-        self.numbers().map(|number| number.slope(coefficients, coefficient))
+        self.monomials().map(|monomial| monomial.slope(coefficients, coefficient))
     }
 
     /// True if a free coefficient scales the Coulomb or Stribeck friction of this law and must therefore not be
     /// negative.
     pub(super) fn is_force(&self, coefficient: usize) -> bool {
-        [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
+        [&self.coulomb, &self.stribeck].iter().any(|monomial| monomial.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
 
@@ -133,11 +133,11 @@ pub(super) enum Parameter {
 }
 
 impl Parameter {
-    /// Return all parameters at a point: orders, coefficients and input parameters if `numbers` is true, followed by
-    /// the initial states of each run.
-    pub(super) fn all(point: &Point, numbers: bool) -> Vec<Self> {
+    /// Return all parameters at a point: orders, coefficients and input parameters if `with_parameters` is true,
+    /// followed by the initial states of each run.
+    pub(super) fn all(point: &Point, with_parameters: bool) -> Vec<Self> {
         let mut all = Vec::new();
-        if numbers {
+        if with_parameters {
             all.extend((0..point.orders.len()).map(Self::Order));
             all.extend((0..point.coefficients.len()).map(Self::Coefficient));
             all.extend((0..point.inputs.len()).map(Self::Input));
@@ -167,15 +167,15 @@ impl NonlinearModel {
             derived: self.derived.clone(),
             recorded,
             coupled: self.model.coupled || !self.frictions.is_empty(),
-            frictions: self.frictions.iter().map(|(place, law)| (*place, law.at(coefficients))).collect(),
+            frictions: self.frictions.iter().map(|(equation, law)| (*equation, law.at(coefficients))).collect(),
         }
     }
 
     fn states(&self, orders: &[f64]) -> (Vec<InitialTerm>, Vec<Equation>) {
         let is_order_free = |i: usize, term: usize| {
             let alpha = &self.model.equations[i].order.weights;
-            let own = &self.model.equations[i].terms[term].1.weights;
-            alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
+            let term_weights = &self.model.equations[i].terms[term].1.weights;
+            alpha.iter().zip(term_weights).any(|(a, w)| (a - w).abs() > 0.0)
         };
         let equations = self.system(orders, &vec![0.0; self.model.coordinates.len()], 0).equations;
         (InitialTerm::all(&equations, &self.model.initial, &self.filtered, is_order_free), equations)
@@ -192,13 +192,13 @@ impl NonlinearModel {
         operators.initial_forcing(&self.system(orders, coefficients, usize::MAX), &powers)
     }
 
-    /// Return the derivatives of the system of a run with respect to the parameter `moved`.
+    /// Return the derivatives of the system of a run with respect to `parameter`.
     fn derivatives(
         &self,
         point: &Point,
         run: usize,
         part: &ExperimentLinearization,
-        moved: &Parameter,
+        parameter: &Parameter,
     ) -> Result<SystemDerivatives> {
         let (values, equations) = (&point.states[run], &self.model.equations);
         let mut derivatives = SystemDerivatives {
@@ -207,35 +207,35 @@ impl NonlinearModel {
             laws: Vec::new(),
             inputs: Vec::new(),
         };
-        let difference = |at: &dyn Fn(f64) -> (Vec<f64>, Vec<f64>), by: f64| -> Result<ForcingTerms> {
-            let side = |by: f64| {
-                let (orders, coefficients) = at(by);
+        let difference = |perturbed: &dyn Fn(f64) -> (Vec<f64>, Vec<f64>), increment: f64| -> Result<ForcingTerms> {
+            let forcing_at = |increment: f64| {
+                let (orders, coefficients) = perturbed(increment);
                 self.initial_forcing(&part.operators, (&orders, &coefficients, values))
             };
-            let (mut up, down) = (side(by)?, side(-by)?);
-            let slope = |up: &mut f64, down: f64| *up = (*up - down) / (2.0 * by);
-            for (up, down) in up.channels.iter_mut().zip(down.channels) {
-                up.iter_mut().zip(down).for_each(|(up, down)| slope(up, down));
+            let (mut forward, backward) = (forcing_at(increment)?, forcing_at(-increment)?);
+            let slope = |forward: &mut f64, backward: f64| *forward = (*forward - backward) / (2.0 * increment);
+            for (forward, backward) in forward.channels.iter_mut().zip(backward.channels) {
+                forward.iter_mut().zip(backward).for_each(|(forward, backward)| slope(forward, backward));
             }
-            for (up, down) in up.starts.iter_mut().zip(down.starts) {
-                slope(&mut up.0, down.0);
-                slope(&mut up.1, down.1);
+            for (forward, backward) in forward.initial_motion.iter_mut().zip(backward.initial_motion) {
+                slope(&mut forward.0, backward.0);
+                slope(&mut forward.1, backward.1);
             }
-            Ok(up)
+            Ok(forward)
         };
-        let idle = values.iter().all(|x| *x == 0.0);
-        match *moved {
+        let is_at_rest = values.iter().all(|x| *x == 0.0);
+        match *parameter {
             Parameter::Order(j) => {
-                let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
+                let weight_of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
                 for (terms, equation) in derivatives.terms.iter_mut().zip(equations) {
-                    let alpha = of(&equation.order.weights);
-                    let orders = equation.terms.iter().map(|t| alpha - of(&t.1.weights)).chain([alpha]);
+                    let alpha = weight_of(&equation.order.weights);
+                    let orders = equation.terms.iter().map(|t| alpha - weight_of(&t.1.weights)).chain([alpha]);
                     *terms = orders.map(|order| (0.0, order)).collect();
                 }
-                if !idle {
-                    let shifted = |by: f64| {
+                if !is_at_rest {
+                    let shifted = |increment: f64| {
                         let mut orders = point.orders.clone();
-                        orders[j] += by;
+                        orders[j] += increment;
                         (orders, point.coefficients.clone())
                     };
                     derivatives.forcing = difference(&shifted, DIFFERENCE_STEP)?;
@@ -247,20 +247,20 @@ impl NonlinearModel {
                     *terms = coefficients.map(|coefficient| (coefficient, 0.0)).collect();
                 }
                 derivatives.laws = self.frictions.iter().map(|(_, law)| law.slope(&point.coefficients, j)).collect();
-                if !idle {
-                    let by = DIFFERENCE_STEP * point.coefficients[j].abs().max(1.0);
-                    let shifted = |by: f64| {
+                if !is_at_rest {
+                    let increment = DIFFERENCE_STEP * point.coefficients[j].abs().max(1.0);
+                    let shifted = |increment: f64| {
                         let mut coefficients = point.coefficients.clone();
-                        coefficients[j] += by;
+                        coefficients[j] += increment;
                         (point.orders.clone(), coefficients)
                     };
-                    derivatives.forcing = difference(&shifted, by)?;
+                    derivatives.forcing = difference(&shifted, increment)?;
                 }
             }
             Parameter::InitialTerm(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
-                let at = (point.orders.as_slice(), point.coefficients.as_slice(), unit.as_slice());
-                derivatives.forcing = self.initial_forcing(&part.operators, at)?;
+                let perturbed = (point.orders.as_slice(), point.coefficients.as_slice(), unit.as_slice());
+                derivatives.forcing = self.initial_forcing(&part.operators, perturbed)?;
             }
             Parameter::Input(k) => derivatives.inputs.push(part.input_slopes[k].clone()),
         }
@@ -320,9 +320,9 @@ impl NonlinearModel {
         if self.frictions.iter().any(|friction| friction.0 >= self.model.equations.len()) {
             return invalid("friction is given for an equation that does not exist", "count equations from 0");
         }
-        let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.model.coordinates.len());
-        let mut numbers = self.frictions.iter().flat_map(|(_, law)| law.numbers());
-        if numbers.any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
+        let has_valid_indices = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.model.coordinates.len());
+        let mut monomials = self.frictions.iter().flat_map(|(_, law)| law.monomials());
+        if monomials.any(|n| !has_valid_indices(n) || n.powers.len() > 1 || n.factor < 0.0) {
             return invalid(
                 "a friction coefficient is not a non-negative multiple of one free coefficient",
                 "give one such factor",
@@ -334,8 +334,8 @@ impl NonlinearModel {
                 let terms = if self.derived.is_empty() { "friction" } else { "non-linear terms" };
                 return invalid(&format!("{terms} with samples at nonuniform times"), "resample the runs");
             }
-            let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
-            if passes != self.filtered {
+            let applies_filter = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
+            if applies_filter != self.filtered {
                 return invalid("experiments whose outputs pass different filters", "give all runs the same filter");
             }
         }
@@ -388,8 +388,8 @@ impl NonlinearModel {
         let mut out = Evaluation::empty();
         for (experiment, values) in experiments.iter().zip(&point.states) {
             stop.check()?;
-            let (acting, input_slopes) = self.transform_inputs(experiment, &point.inputs)?;
-            let record = acting.as_ref().unwrap_or(&experiment.record);
+            let (transformed_record, input_slopes) = self.transform_inputs(experiment, &point.inputs)?;
+            let record = transformed_record.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
             // The optimizer shortens its step after this error.
             let overflow = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
@@ -412,34 +412,40 @@ impl NonlinearModel {
                 return Err(Error::Diverged { what: "simulation".into(), index });
             }
             out.residuals.extend(residuals);
-            out.parts.push(ExperimentLinearization { system, record: acting, operators, run, input_slopes });
+            out.parts.push(ExperimentLinearization {
+                system,
+                record: transformed_record,
+                operators,
+                run,
+                input_slopes,
+            });
         }
         Ok(out)
     }
 
     /// Return the derivatives of the weighted residuals, one vector for each parameter of [`Parameter::all`] with the
-    /// same `numbers`.
+    /// same `with_parameters`.
     pub(super) fn jacobian(
         &self,
         experiments: &[Experiment],
         point: &Point,
-        at: &Evaluation,
-        numbers: bool,
+        evaluation: &Evaluation,
+        with_parameters: bool,
         stop: &Stop,
     ) -> Result<Vec<Vec<f64>>> {
-        let all = Parameter::all(point, numbers);
+        let all = Parameter::all(point, with_parameters);
         let states = self.states(&point.orders).0;
-        let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
-        for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
+        let mut columns = vec![Vec::with_capacity(evaluation.residuals.len()); all.len()];
+        for (index, (experiment, part)) in experiments.iter().zip(&evaluation.parts).enumerate() {
             let record = part.record.as_ref().unwrap_or(&experiment.record);
             let mut cache = SensitivityCache::new(&part.operators, &part.run);
-            for (column, moved) in columns.iter_mut().zip(&all) {
-                if matches!(moved, Parameter::InitialTerm(run, _) if *run != index) {
+            for (column, parameter) in columns.iter_mut().zip(&all) {
+                if matches!(parameter, Parameter::InitialTerm(run, _) if *run != index) {
                     column.extend(std::iter::repeat_n(0.0, self.model.equations.len() * experiment.compared_count()));
                     continue;
                 }
                 stop.check()?;
-                let slopes = match moved {
+                let slopes = match parameter {
                     // If an order has fallen below an integer, there are fewer initial terms than at the initial guess.
                     Parameter::InitialTerm(_, state) if *state >= states.len() => {
                         vec![vec![0.0; record.m()]; self.model.equations.len()]
@@ -447,15 +453,15 @@ impl NonlinearModel {
                     Parameter::InitialTerm(_, state) if states[*state].is_impulse() => {
                         // The transient of a filter does not enter the equations.
                         let mut slopes = vec![vec![0.0; record.m()]; self.model.equations.len()];
-                        let mut own = vec![Vec::new(); self.model.equations.len()];
+                        let mut impulses = vec![Vec::new(); self.model.equations.len()];
                         if let InitialTerm::Power(i, e) = states[*state] {
-                            own[i].push((e, 1.0));
+                            impulses[i].push((e, 1.0));
                         }
-                        add_impulses(&mut slopes, &own, record.step());
+                        add_impulses(&mut slopes, &impulses, record.step());
                         slopes
                     }
                     _ => {
-                        let derivatives = self.derivatives(point, index, part, moved)?;
+                        let derivatives = self.derivatives(point, index, part, parameter)?;
                         part.operators.sensitivity(&part.system, record, &part.run, &mut cache, &derivatives)?
                     }
                 };
@@ -478,12 +484,12 @@ fn state_guesses(
     frictions: &[(usize, FrictionLaw)],
     experiment: &Experiment,
 ) -> Vec<Vec<f64>> {
-    let initial_values: Vec<(f64, f64)> =
-        experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
+    let initial_motions: Vec<(f64, f64)> =
+        experiment.samples.iter().map(|samples| initial_motion(samples, experiment)).collect();
     let with_force = |body: usize, force: f64| -> Vec<f64> {
         let value = |state: &InitialTerm| match *state {
-            InitialTerm::Level(i) => initial_values[i].0,
-            InitialTerm::Rate(i) => initial_values[i].1,
+            InitialTerm::Level(i) => initial_motions[i].0,
+            InitialTerm::Rate(i) => initial_motions[i].1,
             InitialTerm::Offset(i, 0) if i == body => force / libm::tgamma(equations[i].structure.order + 1.0),
             _ => 0.0,
         };
@@ -502,20 +508,20 @@ fn state_guesses(
 }
 
 /// Return the initial position and velocity of an output by linear regression over its first samples.
-fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
+fn initial_motion(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let first_samples = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]
     let (count, step) = (first_samples.len() as f64, experiment.record.step() * experiment.pulses_per_sample as f64);
     let middle = 0.5 * (count - 1.0);
     let mean = first_samples.iter().sum::<f64>() / count.max(1.0);
     #[allow(clippy::cast_precision_loss)]
-    let (mut across, mut along) = (0.0, 0.0);
+    let (mut covariance, mut time_variance) = (0.0, 0.0);
     for (k, value) in first_samples.iter().enumerate() {
         #[allow(clippy::cast_precision_loss)]
         let x = k as f64 - middle;
-        across += x * (value - mean);
-        along += x * x;
+        covariance += x * (value - mean);
+        time_variance += x * x;
     }
-    let rate = if along > 0.0 { across / along / step } else { 0.0 };
+    let rate = if time_variance > 0.0 { covariance / time_variance / step } else { 0.0 };
     (mean - rate * middle * step, rate)
 }

@@ -80,10 +80,10 @@ impl NonlinearSystem {
         let invalid = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
-        for (k, &(place, _)) in self.frictions.iter().enumerate() {
-            if place >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == place) {
+        for (k, &(equation, _)) in self.frictions.iter().enumerate() {
+            if equation >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == equation) {
                 return Err(Error::Structure {
-                    what: format!("friction in equation {place}"),
+                    what: format!("friction in equation {equation}"),
                     remedy: format!(
                         "give each of the {} equations at most one friction law, and number equations from 0",
                         self.equations.len()
@@ -91,9 +91,9 @@ impl NonlinearSystem {
                 });
             }
         }
-        for &(place, FrictionLaw { coulomb, stribeck, speed }) in &self.frictions {
+        for &(equation, FrictionLaw { coulomb, stribeck, speed }) in &self.frictions {
             check_finite("friction", &[coulomb, stribeck, speed])?;
-            let alpha = self.equations[place].structure.order;
+            let alpha = self.equations[equation].structure.order;
             if !(alpha > 1.0 && alpha <= 2.0) {
                 return invalid(
                     "order of a body with friction",
@@ -187,7 +187,7 @@ impl NonlinearSystem {
 
     /// Return the terms of each equation whose signal is a simulated output.
     pub(super) fn links(&self) -> Vec<Vec<Link>> {
-        let of = |(i, Equation { structure, coefficients }): (usize, &Equation)| {
+        let links_of_equation = |(i, Equation { structure, coefficients }): (usize, &Equation)| {
             (structure.terms.iter().zip(coefficients))
                 .filter_map(|(term, &coefficient)| {
                     let (order, integration) = (term.order, structure.order - term.order);
@@ -195,7 +195,7 @@ impl NonlinearSystem {
                 })
                 .collect()
         };
-        self.equations.iter().enumerate().map(of).collect()
+        self.equations.iter().enumerate().map(links_of_equation).collect()
     }
 
     /// Return true if a coupling term of `equation` uses the pulse means of the output `output`, like those of an
@@ -227,9 +227,9 @@ impl NonlinearSystem {
         self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
         // A derivative of an output depends on the same derivative of each output coupled to it. Outputs that enter its
         // end velocity by their pulse means are the exception.
-        let mut done = 0;
-        while done < states.len() {
-            let channel = states[done];
+        let mut processed = 0;
+        while processed < states.len() {
+            let channel = states[processed];
             for term in &self.equations[channel.equation()].structure.terms {
                 let eta = self.equations[channel.equation()].structure.order - term.order;
                 match self.output_index(channel.equation(), term.signal) {
@@ -239,7 +239,7 @@ impl NonlinearSystem {
                     _ => {}
                 }
             }
-            done += 1;
+            processed += 1;
         }
         states
     }

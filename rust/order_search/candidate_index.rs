@@ -39,31 +39,31 @@ impl<'a> CandidateIndex<'a> {
         for record in records {
             grid.structure(0).check(record.len(), |_| true)?;
         }
-        let mut needed = RequiredRegressors::new(&options.initial);
+        let mut required = RequiredRegressors::new(&options.initial);
         for block in grid.blocks() {
-            needed.add_alpha(block.alpha);
+            required.add_alpha(block.alpha);
             for (group, slice) in grid.groups().iter().zip(&block.tuples) {
                 for (axis, &first) in group.axes.iter().zip(&slice.first) {
-                    axis[first..].iter().for_each(|&order| needed.add_term(block.alpha, group.signal, order));
+                    axis[first..].iter().for_each(|&order| required.add_term(block.alpha, group.signal, order));
                 }
             }
         }
-        let (output, index, mut budget) = (grid.output(), needed.into_index(), Budget::default());
+        let (output, index, mut budget) = (grid.output(), required.into_index(), Budget::default());
         budget.add(records, output, &index, options, Bound::MAX_TEST_VECTORS);
         budget.check(options.memory)?;
-        let spare = budget.remaining_bytes(options.memory);
+        let spare_bytes = budget.remaining_bytes(options.memory);
         let problem = pool.install(|| {
             Ok(Problem::new(records, output, index, fixed, options, stop)?.with_bound(grid.count(), stop))
         })?;
         stop.check()?;
         let tables = tables(&grid, &problem)?;
-        Ok(Self { problem, grid, options: options.clone(), spare_bytes: spare, tables })
+        Ok(Self { problem, grid, options: options.clone(), spare_bytes, tables })
     }
 
     /// Write the column of each term of the candidate at the cursor to `positions`.
     pub(crate) fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
         let table = &self.tables[cursor.block()];
-        cursor.each(0, |term, digit| positions[term] = table[term][digit]);
+        cursor.for_each_term(0, |term, digit| positions[term] = table[term][digit]);
     }
 
     /// Write the columns of the initial terms of the candidate at a cursor to `initial`. Unchanged for zero initial
@@ -90,7 +90,7 @@ impl<'a> CandidateIndex<'a> {
     pub(crate) fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {
         let changed = cursor.advance();
         let table = &self.tables[cursor.block()];
-        cursor.each(changed, |term, digit| terms[term] = table[term][digit]);
+        cursor.for_each_term(changed, |term, digit| terms[term] = table[term][digit]);
     }
 }
 

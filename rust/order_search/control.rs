@@ -91,7 +91,7 @@ impl BatchPosition {
 
     /// Return true if the position is compatible with a batch that has `open` candidates to evaluate, whose evaluation
     /// sequence has the digest `order`.
-    pub(crate) fn fits(&self, open: u64, order: u64) -> bool {
+    pub(crate) fn is_compatible(&self, open: u64, order: u64) -> bool {
         self.end == 0 || (self.end <= open && self.order == order)
     }
 }
@@ -100,7 +100,7 @@ impl BatchPosition {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checkpoint {
     /// Position of the checkpoint.
-    pub place: BatchPosition,
+    pub position: BatchPosition,
     /// True if this is the first checkpoint of this evaluation of the range. It then replaces any earlier result of the
     /// range.
     pub replaces_previous: bool,

@@ -117,11 +117,11 @@ impl Points {
             let terms = pairs.map(|(&signal, &order)| Term { signal, order }).collect();
             let structure = Structure { output: self.output, order: point.order, terms };
             let is_input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
-            let fits = structure.check(self.records[0].len(), is_input).is_ok();
+            let is_valid = structure.check(self.records[0].len(), is_input).is_ok();
             // The correction of slope discontinuities has no derivative at jumps. A candidate must be ranked by the
             // response with which it will be simulated.
             let smooth = structure.terms.iter().all(|term| term.order <= structure.order);
-            structures.push((fits && smooth).then_some(structure));
+            structures.push((is_valid && smooth).then_some(structure));
         }
         let pool = pool(threads)?;
         self.fill_cache(&structures, &pool);
@@ -130,7 +130,7 @@ impl Points {
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
         let simulations = PerThread::<BlockSimulation>::new(&pool);
-        let this = &*self;
+        let evaluator = &*self;
         let raw: Vec<f64> = pool.install(|| {
             structures
                 .par_iter()
@@ -138,7 +138,7 @@ impl Points {
                 .map(|(structure, point)| {
                     let Some(structure) = structure else { return f64::INFINITY };
                     simulations.with(|simulation| {
-                        let error = this.error(structure, &point.coefficients, raw_limit, simulation, control);
+                        let error = evaluator.error(structure, &point.coefficients, raw_limit, simulation, control);
                         error.unwrap_or(f64::INFINITY)
                     })
                 })
@@ -151,7 +151,7 @@ impl Points {
 
     /// Compute the regressors of these structures that are not in the cache.
     fn fill_cache(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
-        let each = self.samples * std::mem::size_of::<f64>();
+        let bytes_per_column = self.samples * std::mem::size_of::<f64>();
         let mut requests: Vec<(Key, usize, f64)> = Vec::new();
         for structure in structures.iter().flatten() {
             for k in 0..structure.terms.len() {
@@ -161,7 +161,7 @@ impl Points {
         }
         requests.sort_unstable_by_key(|a| a.0);
         requests.dedup_by(|a, b| a.0 == b.0);
-        if (self.cache.len() + requests.len()) * each > MAX_CACHE_BYTES {
+        if (self.cache.len() + requests.len()) * bytes_per_column > MAX_CACHE_BYTES {
             self.cache.clear();
         }
         requests.retain(|(key, _, _)| !self.cache.contains_key(key));
@@ -170,7 +170,7 @@ impl Points {
             requests
                 .par_iter()
                 .map(|&(_, signal, eta)| {
-                    let one = |record: &Record| {
+                    let column_of_record = |record: &Record| {
                         if signal == output {
                             block_pulse_kernel(eta, record.m(), record.step())
                         } else if eta == 0.0 {
@@ -179,7 +179,7 @@ impl Points {
                             record.integral(signal, eta)
                         }
                     };
-                    records.iter().map(one).collect()
+                    records.iter().map(column_of_record).collect()
                 })
                 .collect()
         });
@@ -205,9 +205,11 @@ impl Points {
                     Some((signal == self.output, &cached_column[r][..], coefficients[k]))
                 })
                 .collect();
-            let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
+            let terms_of = |is_output: bool| {
+                columns.iter().filter(move |term| term.0 == is_output).map(|&(_, column, c)| (column, c))
+            };
             let target = record.signal(self.output);
-            match simulation.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
+            match simulation.accumulate_error(target, terms_of(true), terms_of(false), self.norm, sum, limit, control) {
                 // A NaN limit excludes all candidates.
                 Verdict::Score(raw) if raw <= limit => sum = raw,
                 _ => return None,

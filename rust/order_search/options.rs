@@ -68,8 +68,8 @@ fn sum_side_by_side(a: &[f64], b: &[f64], term: impl Fn(f64, f64) -> f64) -> f64
             sums[l] += term(a[l], b[l]);
         }
     }
-    let rest: f64 = a_rest.iter().zip(b_rest).map(|(&a, &b)| term(a, b)).sum();
-    sums.iter().sum::<f64>() + rest
+    let tail: f64 = a_rest.iter().zip(b_rest).map(|(&a, &b)| term(a, b)).sum();
+    sums.iter().sum::<f64>() + tail
 }
 
 /// Estimator of a candidate's coefficients.
@@ -219,7 +219,7 @@ impl Budget {
     /// Add the memory of the data that the candidates of one equation share, with at most `vectors` test vectors.
     pub(crate) fn add(&mut self, records: &[Record], output: usize, index: &Index, options: &Options, vectors: usize) {
         let width = index.keys().len() as u128;
-        let own = Bank::own(index, output) as u128;
+        let own = Bank::output_integral_count(index, output) as u128;
         let refined = options.refines();
         let bounded = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
         let mut largest = 0;

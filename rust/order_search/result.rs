@@ -102,7 +102,7 @@ impl Part {
     /// ```
     pub fn merge(&mut self, other: Self, top: usize) {
         self.rows.extend(other.rows);
-        trim(&mut self.rows, top);
+        truncate_rows(&mut self.rows, top);
         self.counts.add(&other.counts);
         self.failures.extend(other.failures);
         self.failures.sort_unstable();
@@ -156,7 +156,7 @@ impl Counts {
 }
 
 /// Sort the rows by score, then by index, and keep the first `top` rows.
-fn trim(rows: &mut Vec<Row>, top: usize) {
+fn truncate_rows(rows: &mut Vec<Row>, top: usize) {
     rows.sort_by(|a, b| a.score.total_cmp(&b.score).then(a.index.cmp(&b.index)));
     rows.truncate(top);
 }
@@ -177,13 +177,14 @@ impl TopRows {
     /// Insert rows, and remove rows that are not among the best `top`.
     pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
-        trim(&mut self.rows, self.top);
+        truncate_rows(&mut self.rows, self.top);
     }
 
     /// Return true if this row is in the table.
     pub(crate) fn contains(&self, row: &Row) -> bool {
-        let place = self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
-        self.rows.get(place).is_some_and(|r| r.index == row.index)
+        let position =
+            self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
+        self.rows.get(position).is_some_and(|r| r.index == row.index)
     }
 
     /// Lower the limit to the score of the worst row if pruning is enabled (`stopping`) and the table is full.

@@ -52,7 +52,7 @@ impl simd::SimdKernel for Screening<'_> {
     #[inline(always)]
     fn run(self) -> Self::Output {
         let Self { candidate_index, lo, hi, limit } = self;
-        let mut screened = (Vec::new(), Vec::new());
+        let mut outcome = (Vec::new(), Vec::new());
         let mut cursor = Cursor::at(&candidate_index.grid, lo);
         let mut index = lo;
         let width = candidate_index.grid.width();
@@ -63,13 +63,13 @@ impl simd::SimdKernel for Screening<'_> {
             candidate_index.positions(&cursor, &mut screen.terms);
             let sharing = RowBoundContext::of(candidate_index, limit);
             while index < hi {
-                let shared = sharing.as_ref().and_then(|sharing| {
-                    screen.screen_row(candidate_index, sharing, &mut cursor, (index, hi), &mut screened)
+                let common_factor = sharing.as_ref().and_then(|sharing| {
+                    screen.screen_row(candidate_index, sharing, &mut cursor, (index, hi), &mut outcome)
                 });
-                if let Some(candidates) = shared {
+                if let Some(candidates) = common_factor {
                     index += candidates;
                 } else if index + LANE_COUNT as u64 <= hi {
-                    screen.screen_next(candidate_index, &mut cursor, index, limit, &mut screened);
+                    screen.screen_next(candidate_index, &mut cursor, index, limit, &mut outcome);
                     index += LANE_COUNT as u64;
                 } else {
                     break;
@@ -79,10 +79,10 @@ impl simd::SimdKernel for Screening<'_> {
         let mut screen = Screen::<1>::new(width);
         candidate_index.positions(&cursor, &mut screen.terms);
         while index < hi {
-            screen.screen_next(candidate_index, &mut cursor, index, limit, &mut screened);
+            screen.screen_next(candidate_index, &mut cursor, index, limit, &mut outcome);
             index += 1;
         }
-        screened
+        outcome
     }
 }
 
@@ -154,7 +154,7 @@ impl<const L: usize> Screen<L> {
         &RowBoundContext { squares, limit }: &RowBoundContext<'_>,
         cursor: &mut Cursor<'_>,
         (index, hi): (u64, u64),
-        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
+        outcome: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) -> Option<u64> {
         let (term, digit, len) = cursor.adjacent_run()?;
         let len = usize::try_from(hi - index).map_or(len, |all| len.min(all));
@@ -162,20 +162,20 @@ impl<const L: usize> Screen<L> {
             return None;
         }
         let columns = &candidate_index.term_columns(cursor, term)[digit..digit + len];
-        let shared = CommonFactor::new(squares, &self.terms, term)?;
+        let common_factor = CommonFactor::new(squares, &self.terms, term)?;
         let mut open_positions = std::mem::take(&mut self.open_positions);
         open_positions.clear();
-        shared.append_open::<L>(columns, limit, &mut open_positions);
+        common_factor.append_open::<L>(columns, limit, &mut open_positions);
         for part in open_positions.chunks(L) {
             for (positions, &column) in self.positions.iter_mut().zip(&self.terms) {
-                *positions = Columns::one(column);
+                *positions = Columns::uniform(column);
             }
-            let mut at = [part[0]; L];
-            at[..part.len()].copy_from_slice(part);
-            let indices = at.map(|n| index + n as u64);
-            self.positions[term] = Columns::new(at.map(|n| columns[n]));
+            let mut lane_columns = [part[0]; L];
+            lane_columns[..part.len()].copy_from_slice(part);
+            let indices = lane_columns.map(|n| index + n as u64);
+            self.positions[term] = Columns::new(lane_columns.map(|n| columns[n]));
             self.positions[term].compare();
-            self.screen_positions(candidate_index, indices, part.len(), limit, screened);
+            self.screen_positions(candidate_index, indices, part.len(), limit, outcome);
         }
         self.open_positions = open_positions;
         cursor.skip(len - 1);
@@ -191,28 +191,28 @@ impl<const L: usize> Screen<L> {
         cursor: &mut Cursor<'_>,
         index: u64,
         limit: f64,
-        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
+        outcome: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self { positions, initial, terms, .. } = self;
         candidate_index.initial(cursor, initial);
         if let Some((term, digit)) = cursor.adjacent_block(L) {
             for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
-                *columns = Columns::one(column);
+                *columns = Columns::uniform(column);
             }
-            positions[term].at = part_of(&candidate_index.term_columns(cursor, term)[digit..]);
+            positions[term].indices = part_of(&candidate_index.term_columns(cursor, term)[digit..]);
             positions[term].compare();
             cursor.skip(L - 1);
             candidate_index.next(cursor, terms);
         } else {
             for n in 0..L {
                 for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
-                    columns.at[n] = column;
+                    columns.indices[n] = column;
                 }
                 candidate_index.next(cursor, terms);
             }
             positions.iter_mut().for_each(Columns::compare);
         }
-        self.screen_positions(candidate_index, std::array::from_fn(|n| index + n as u64), L, limit, screened);
+        self.screen_positions(candidate_index, std::array::from_fn(|n| index + n as u64), L, limit, outcome);
     }
 
     /// Screen the first `count` of the L candidates whose columns have been set. Append the candidates that no bound
@@ -250,20 +250,20 @@ impl<const L: usize> Screen<L> {
                 continue;
             }
             let (bound, guess) = match (&squares, &candidate_index.problem.bound) {
-                (Some((least, guess)), _) => (least[n], guess[n]),
+                (Some((lower_bound, guess)), _) => (lower_bound[n], guess[n]),
                 (None, Some(bound)) => {
                     // Unrefined coefficients give an estimate of the score but no valid bound.
-                    let refined = candidate_index.problem.refines();
-                    let limit = if refined { f64::INFINITY } else { limit };
-                    columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
+                    let refines = candidate_index.problem.refines();
+                    let limit = if refines { f64::INFINITY } else { limit };
+                    columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.indices[n]);
                     coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
                     weights.clear();
                     weights.extend(solve.initial.iter().map(|x| x[n]));
                     let e = initial.len();
-                    let (least, guess) = bound.evaluate(limit, |r| {
+                    let (lower_bound, guess) = bound.evaluate(limit, |r| {
                         (&columns[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
                     });
-                    (if refined { 0.0 } else { least }, guess)
+                    (if refines { 0.0 } else { lower_bound }, guess)
                 }
                 (None, None) => (0.0, low_discrepancy_position(index)),
             };
@@ -301,25 +301,25 @@ impl<const L: usize> Screen<L> {
         columns: &[usize],
         candidates: &[(u64, usize, usize)],
         limit: f64,
-        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
+        outcome: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         for (positions, &column) in self.positions.iter_mut().zip(columns) {
-            *positions = Columns::one(column);
+            *positions = Columns::uniform(column);
         }
         let Some(last) = candidates.last() else { return };
-        let of = |n: usize| candidates.get(n).unwrap_or(last);
-        let outer: [usize; L] = std::array::from_fn(|n| of(n).1);
-        let inner: [usize; L] = std::array::from_fn(|n| of(n).2);
-        for (term, at) in [(slice.outer, outer), (slice.inner, inner)] {
-            self.positions[term].at = at;
+        let candidate_or_last = |n: usize| candidates.get(n).unwrap_or(last);
+        let outer: [usize; L] = std::array::from_fn(|n| candidate_or_last(n).1);
+        let inner: [usize; L] = std::array::from_fn(|n| candidate_or_last(n).2);
+        for (term, column) in [(slice.outer, outer), (slice.inner, inner)] {
+            self.positions[term].indices = column;
             self.positions[term].compare();
         }
         self.screen_positions(
             candidate_index,
-            std::array::from_fn(|n| of(n).0),
+            std::array::from_fn(|n| candidate_or_last(n).0),
             candidates.len().min(L),
             limit,
-            screened,
+            outcome,
         );
     }
 }

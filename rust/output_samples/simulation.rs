@@ -11,7 +11,7 @@ use crate::expression::DerivedSignal;
 use crate::fractional::kernels::first_coefficient;
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
-use crate::nonlinear::{self, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
+use crate::nonlinear::{self, FreeFrictionLaw, InitialGuess, NonlinearModel, NonlinearSystem};
 use crate::parallel::Stop;
 use crate::recording::{Recording, Role, Sampling};
 use crate::regressors::Record;
@@ -256,7 +256,7 @@ impl OutputSimulation {
             initial,
         };
         let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };
-        let optimum = nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?;
+        let optimum = nonlinear::fit(&model, &experiments, &InitialGuess::default(), INITIAL_STATE_SETTINGS, stop)?;
         Ok(optimum.initial.into_iter().flatten().collect())
     }
 

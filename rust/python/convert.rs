@@ -49,11 +49,11 @@ pub enum InitialArg {
 pub type DerivedArg = (List<(String, f64)>, List<(usize, f64)>);
 
 pub fn derived_signals(arguments: List<DerivedArg>) -> PyResult<Vec<DerivedSignal>> {
-    let of = |(program, channels): DerivedArg| {
+    let signal = |(program, channels): DerivedArg| {
         let program = program.iter().map(|(name, value)| Instruction::parse(name, *value)).collect::<Result<_, _>>()?;
         DerivedSignal::new(Expression::new(program, channels.len())?, channels.into())
     };
-    Ok(arguments.into_iter().map(of).collect::<Result<_, Error>>()?)
+    Ok(arguments.into_iter().map(signal).collect::<Result<_, Error>>()?)
 }
 
 /// Copy a one-dimensional array to a vector. Return an error for a value that is not finite.
@@ -98,9 +98,9 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
     let record = Record::from_rows(*step, rows(signals)?, filter)?;
     Ok(match initial_state {
-        Some((states, levels, impulse_responses)) => {
+        Some((has_transient, levels, impulse_responses)) => {
             let impulse_responses = impulse_responses.as_ref().map(rows).transpose()?.unwrap_or_default();
-            record.with_initial_state(states.to_vec(), levels, impulse_responses)?
+            record.with_initial_state(has_transient.to_vec(), levels, impulse_responses)?
         }
         None => record,
     })
@@ -166,7 +166,7 @@ pub fn stack_rows<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<
 }
 
 /// Return the length of the last axis of an array.
-pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
+pub fn column_count(array: &PyReadonlyArray2<'_, f64>) -> usize {
     array.shape()[1]
 }
 
@@ -196,8 +196,8 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
         if let Ok(tuple) = object.cast::<PyTuple>() {
             return tuple.iter().map(item).collect::<PyResult<_>>().map(Self);
         }
-        let words = object.is_instance_of::<PyString>() || object.is_instance_of::<PyDict>();
-        if words || !object.hasattr("__getitem__")? {
+        let is_text_or_mapping = object.is_instance_of::<PyString>() || object.is_instance_of::<PyDict>();
+        if is_text_or_mapping || !object.hasattr("__getitem__")? {
             return Err(PyTypeError::new_err(format!("{} is not a sequence", object.get_type().name()?)));
         }
         let length = object.len()?;

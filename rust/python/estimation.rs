@@ -12,9 +12,9 @@ use super::recording::Experiment;
 use crate::equation::Initial;
 use crate::error::{check_finite, check_length, Error};
 use crate::estimation::instrumental_variables as instruments;
-use crate::estimation::least_squares::{self as batch, Estimate};
-use crate::estimation::multi_innovation::{self as stepwise, Innovation, RowBasis};
-use crate::estimation::output_error as joint;
+use crate::estimation::least_squares::{self as least_squares_estimator, Estimate};
+use crate::estimation::multi_innovation::{self as multi_innovation_estimator, Innovation, RowBasis};
+use crate::estimation::output_error;
 use crate::estimation::resonance_scan;
 use crate::estimation::streaming::{Streaming as StreamingFit, StreamingOptions};
 use crate::python::order_search::watch::run_interruptible;
@@ -26,17 +26,17 @@ use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
 
 /// Return the total number of pulses of all records.
-pub fn pulses(records: &[Record]) -> usize {
+pub fn count_pulses(records: &[Record]) -> usize {
     records.iter().map(Record::m).sum()
 }
 
 /// Return the total number of pulses of all experiments times the maximum number of evaluations.
-pub fn count_evaluated_pulses(experiments: &[joint::Experiment], evaluations: usize) -> usize {
+pub fn count_evaluated_pulses(experiments: &[output_error::Experiment], evaluations: usize) -> usize {
     experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
 }
 
-fn tuple(estimate: Estimate) -> EstimateTuple {
-    (estimate.coefficients, estimate.initial, estimate.exponents, estimate.dropped)
+fn estimate_tuple(estimate: Estimate) -> EstimateTuple {
+    (estimate.coefficients, estimate.initial, estimate.exponents, estimate.excluded_terms)
 }
 
 #[pyfunction]
@@ -52,8 +52,10 @@ pub fn least_squares(
     let records = records(&runs)?;
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
-    let points = pulses(&records);
-    Ok(tuple(run_interruptible(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
+    let points = count_pulses(&records);
+    Ok(estimate_tuple(run_interruptible(py, points, None, move |_| {
+        least_squares_estimator::fit(&records, &structure, &fixed, &initial)
+    })?))
 }
 
 /// (output error, coefficients) of a point; None if they are not finite.
@@ -68,18 +70,18 @@ pub fn projected_errors(
     inputs: List<bool>,
     fixed: List<Option<f64>>,
     terms: InitialArg,
-    own: List<f64>,
+    autoregressive_orders: List<f64>,
     points: List<List<f64>>,
 ) -> PyResult<Vec<PointTuple>> {
     let records = records(&runs)?;
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
     let points: Vec<Vec<f64>> = points.iter().map(|point| point.to_vec()).collect();
-    let work = pulses(&records).saturating_mul(points.len());
+    let work = count_pulses(&records).saturating_mul(points.len());
     let projections = run_interruptible(py, work, None, move |_| {
-        resonance_scan::fit_with_fixed_poles(&records, &structure, &fixed, &initial, &own, &points)
+        resonance_scan::fit_with_fixed_poles(&records, &structure, &fixed, &initial, &autoregressive_orders, &points)
     })?;
-    Ok(projections.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
+    Ok(projections.into_iter().map(|projection| projection.map(|p| (p.error, p.coefficients))).collect())
 }
 
 #[pyfunction]
@@ -99,19 +101,19 @@ pub fn multi_innovation<'py>(
     let records = records(&runs)?;
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
-    let points = pulses(&records);
+    let points = count_pulses(&records);
     let row_basis = if haar { RowBasis::Haar } else { RowBasis::Time };
     let innovation = Innovation { length, prior: prior(prior_covariance), row_basis };
     if recursion {
         let (estimate, trace) = run_interruptible(py, points, None, move |_| {
-            stepwise::recursion(&records, &structure, &fixed, &initial, &innovation)
+            multi_innovation_estimator::recursion(&records, &structure, &fixed, &initial, &innovation)
         })?;
-        return Ok((tuple(estimate), Some(stack_rows(py, &trace)?)));
+        return Ok((estimate_tuple(estimate), Some(stack_rows(py, &trace)?)));
     }
     let estimate = run_interruptible(py, points, None, move |_| {
-        stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation)
+        multi_innovation_estimator::closed_form(&records, &structure, &fixed, &initial, &innovation)
     })?;
-    Ok((tuple(estimate), None))
+    Ok((estimate_tuple(estimate), None))
 }
 
 /// Result of refined instrumental variables: estimate and covariance of each equation, and convergence of the
@@ -142,7 +144,7 @@ pub fn instrumental_variables(
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
     let (initial, fixed) = (initial(terms)?, to_vectors(fixed));
     let settings = instruments::InstrumentalSettings { iterations, tolerance };
-    let points = pulses(&measured).saturating_mul(iterations.max(1));
+    let points = count_pulses(&measured).saturating_mul(iterations.max(1));
     let fit = run_interruptible(py, points, None, move |stop| {
         let at_rest = initial == Initial::Rest;
         let measured = measured
@@ -160,9 +162,9 @@ pub fn instrumental_variables(
     Ok(InstrumentalFit { estimates, covariances, iterations, converged, damped })
 }
 
-/// Nonuniform samples: (sample positions in pulses, (positions in pulses, sizes) of the jumps of each held signal or
-/// None).
-pub type OwnTimesArg<'py> =
+/// Nonuniform samples: (sample positions in pulses, (positions in pulses, sizes) of the jumps of each
+/// zero-order-hold signal or None).
+pub type NonuniformSamplesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// Experiment from a dictionary with these fields as keys. `samples` and `robust_weights` have one row per output.
 /// `filter` holds (power series, flag of each output) of the filter for simulated outputs. `signals` holds (values at
@@ -177,7 +179,7 @@ pub struct ExperimentFields<'py> {
     weights: List<f64>,
     signals: List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
     robust_weights: Option<PyReadonlyArray2<'py, f64>>,
-    sample_times: Option<OwnTimesArg<'py>>,
+    sample_times: Option<NonuniformSamplesArg<'py>>,
 }
 
 /// Experiment that the core sampled, or a dictionary of its fields.
@@ -188,56 +190,58 @@ pub enum ExperimentArg<'py> {
     Given(ExperimentFields<'py>),
 }
 
-/// Return the jumps of a held signal near the sample times. Return an error if the times of the jumps do not ascend.
-pub fn jumps_near(
-    readings: &SampleInterpolation,
-    places: &PyReadonlyArray1<'_, f64>,
+/// Return the jumps of a zero-order-hold signal, assigned to the sample times near them. Return an error if the times
+/// of the jumps do not ascend.
+pub fn jumps_at_samples(
+    interpolation: &SampleInterpolation,
+    positions: &PyReadonlyArray1<'_, f64>,
     sizes: &PyReadonlyArray1<'_, f64>,
 ) -> PyResult<Jumps> {
-    let (places, sizes) = (vector("times of jumps", places)?, vector("jumps", sizes)?);
-    check_length("jumps", places.len(), sizes.len())?;
-    if let Some(k) = places.windows(2).position(|pair| pair[0] > pair[1]) {
+    let (positions, sizes) = (vector("times of jumps", positions)?, vector("jumps", sizes)?);
+    check_length("jumps", positions.len(), sizes.len())?;
+    if let Some(k) = positions.windows(2).position(|pair| pair[0] > pair[1]) {
         let what = format!("the jump times decrease at index {k}");
         return Err(Error::Structure { what, remedy: "give them in ascending order".into() }.into());
     }
-    Ok(readings.jumps(&places, &sizes))
+    Ok(interpolation.jumps(&positions, &sizes))
 }
 
-pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
+pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<output_error::Experiment> {
     let argument = match argument {
         ExperimentArg::Sampled(experiment) => return Ok(experiment.get().inner.clone()),
         ExperimentArg::Given(argument) => argument,
     };
     let (record, samples, weights) = (record(&argument.record)?, rows(&argument.samples)?, argument.weights.to_vec());
     let experiment = match &argument.sample_times {
-        None => joint::Experiment::new(record, argument.pulses_per_sample, samples, weights)?,
-        Some((places, jumps)) => {
-            let readings = SampleInterpolation::new(vector("times of nonuniform samples", places)?, record.m())?;
+        None => output_error::Experiment::new(record, argument.pulses_per_sample, samples, weights)?,
+        Some((positions, jumps)) => {
+            let interpolation =
+                SampleInterpolation::new(vector("times of nonuniform samples", positions)?, record.m())?;
             let jumps = (jumps.iter())
-                .map(|near| {
-                    let Some((places, sizes)) = near else { return Ok(None) };
-                    Ok(Some(jumps_near(&readings, places, sizes)?))
+                .map(|signal| {
+                    let Some((positions, sizes)) = signal else { return Ok(None) };
+                    Ok(Some(jumps_at_samples(&interpolation, positions, sizes)?))
                 })
                 .collect::<PyResult<Vec<_>>>()?;
-            joint::Experiment::with_nonuniform_samples(
+            output_error::Experiment::with_nonuniform_samples(
                 record,
                 samples,
                 weights,
-                joint::NonuniformSamples { readings, jumps },
+                output_error::NonuniformSamples { readings: interpolation, jumps },
             )?
         }
     };
     let experiment = match &argument.robust_weights {
         None => experiment,
-        Some(shares) => experiment.with_sample_weights(rows(shares)?)?,
+        Some(weights) => experiment.with_sample_weights(rows(weights)?)?,
     };
-    let instants = (argument.signals.iter())
+    let point_values = (argument.signals.iter())
         .map(|(values, is_hold)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
-            Ok(joint::PointValues { values, is_zero_order_hold: *is_hold })
+            Ok(output_error::PointValues { values, is_zero_order_hold: *is_hold })
         })
         .collect::<PyResult<Vec<_>>>()?;
-    let experiment = experiment.with_point_values(instants)?;
+    let experiment = experiment.with_point_values(point_values)?;
     Ok(match &argument.filter {
         None => experiment,
         Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.to_vec())?,
@@ -245,12 +249,12 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
 }
 
 /// Return the termination status of an optimization as text.
-pub fn status(status: joint::Status) -> &'static str {
+pub fn status(status: output_error::Status) -> &'static str {
     match status {
-        joint::Status::Converged => "converged",
-        joint::Status::Exhausted => "exhausted",
-        joint::Status::Stalled => "stalled",
-        joint::Status::DomainLimit => "wall",
+        output_error::Status::Converged => "converged",
+        output_error::Status::Exhausted => "exhausted",
+        output_error::Status::Stalled => "stalled",
+        output_error::Status::DomainLimit => "wall",
     }
 }
 
@@ -262,7 +266,7 @@ pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>
     run_detached(py, || {
         check_finite("alpha", &[alpha])?;
         own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
-        Ok(joint::stability::is_unstable(alpha, &own_terms))
+        Ok(output_error::stability::is_unstable(alpha, &own_terms))
     })
 }
 

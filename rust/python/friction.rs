@@ -24,7 +24,7 @@ pub fn friction_respond<'py>(
     let inputs = vec![true; record.len()];
     let frictions = frictions
         .into_iter()
-        .map(|(place, (coulomb, stribeck, speed))| (place, FrictionLaw { coulomb, stribeck, speed }))
+        .map(|(equation, (coulomb, stribeck, speed))| (equation, FrictionLaw { coulomb, stribeck, speed }))
         .collect();
     let equations = equations
         .into_iter()
@@ -37,7 +37,8 @@ pub fn friction_respond<'py>(
     let motion = run_interruptible(py, record.m(), None, move |_| system.run(&record, &to_vectors(terms)))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stack_rows(py, &motion.outputs)?)?;
-    let rows = |of: fn(&BodyMotion) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
+    let rows =
+        |field: fn(&BodyMotion) -> &Vec<f64>| motion.bodies.iter().map(|body| field(body).clone()).collect::<Vec<_>>();
     dict.set_item("velocity", stack_rows(py, &rows(|body| &body.velocity))?)?;
     dict.set_item("force", stack_rows(py, &rows(|body| &body.force))?)?;
     let stuck: Vec<Vec<bool>> =

@@ -3,7 +3,7 @@
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::convert::{check_size, columns, vector, List};
+use super::convert::{check_size, column_count, vector, List};
 use super::order_search::watch::run_interruptible;
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
 use crate::estimation::multi_innovation;
@@ -25,7 +25,7 @@ impl Batch {
         check_size(array)?;
         let values: Vec<f64> = array.as_array().iter().copied().collect();
         check_finite(name, &values)?;
-        Ok(Self { values, width: columns(array) })
+        Ok(Self { values, width: column_count(array) })
     }
 
     fn count(&self) -> usize {
@@ -72,7 +72,7 @@ impl Batch {
     }
 }
 
-/// Number of rows between two checks for a stop request.
+/// Number of rows interpolation two checks for a stop request.
 const MAX_BLOCK_ROWS: usize = 64;
 
 /// Return the kernels of fractional integrals of several orders as rows of `m` values. With `derivative`, return their
@@ -165,8 +165,8 @@ pub fn toeplitz_solve<'py>(
     })
 }
 
-/// Return the means of sampled signals over `m` equal pulses, one row per signal. Signals are held between samples if
-/// `hold`, otherwise linear.
+/// Return the means of sampled signals over `m` equal pulses, one row per signal. Signals are constant between samples
+/// if `hold`, otherwise linear.
 #[pyfunction]
 pub fn pulse_mean_rows<'py>(
     py: Python<'py>,
@@ -178,12 +178,12 @@ pub fn pulse_mean_rows<'py>(
     let count = batch.count();
     check_points("m", m)?;
     check_points("values of all rows", m.saturating_mul(count))?;
-    let between = if hold { Intersample::Hold } else { Intersample::Linear };
+    let interpolation = if hold { Intersample::Hold } else { Intersample::Linear };
     let values = run_interruptible(py, batch.values.len(), None, move |stop| {
         let mut values = Vec::with_capacity(m * count);
         for row in batch.values.chunks_exact(batch.width.max(1)) {
             stop.check()?;
-            values.extend(block_pulse::pulse_means(row, m, between)?.into_vec());
+            values.extend(block_pulse::pulse_means(row, m, interpolation)?.into_vec());
         }
         Ok(values)
     })?;

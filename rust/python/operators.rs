@@ -3,7 +3,7 @@
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::convert::{check_size, columns, copy_vector, matrix, rows, stack_rows, vector, List};
+use super::convert::{check_size, column_count, copy_vector, matrix, rows, stack_rows, vector, List};
 use super::errors::run_detached;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, Error};
@@ -17,8 +17,8 @@ use crate::signal::block_pulse;
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
 
-fn choice(name: &str, given: &str, known: &str) -> Error {
-    Error::Structure { what: format!("{name} '{given}' is not known"), remedy: format!("use one of {known}") }
+fn unknown_choice(name: &str, value: &str, choices: &str) -> Error {
+    Error::Structure { what: format!("{name} '{value}' is not known"), remedy: format!("use one of {choices}") }
 }
 
 #[pyfunction]
@@ -36,7 +36,7 @@ fn map_rows<'py>(
     x: &PyReadonlyArray2<'py, f64>,
     work: fn(&mut [f64]) -> crate::error::Result<()>,
 ) -> PyResult<Matrix<'py>> {
-    let (count, width, mut values) = flat(x)?;
+    let (count, width, mut values) = flatten(x)?;
     let values = run_interruptible(py, values.len(), None, move |stop| {
         for row in 0..count {
             stop.check()?;
@@ -50,9 +50,9 @@ fn map_rows<'py>(
 }
 
 /// Return the number of rows of a matrix, their length, and all values, row after row.
-fn flat(x: &PyReadonlyArray2<'_, f64>) -> PyResult<(usize, usize, Vec<f64>)> {
+fn flatten(x: &PyReadonlyArray2<'_, f64>) -> PyResult<(usize, usize, Vec<f64>)> {
     check_size(x)?;
-    Ok((x.as_array().nrows(), columns(x), x.as_array().iter().copied().collect()))
+    Ok((x.as_array().nrows(), column_count(x), x.as_array().iter().copied().collect()))
 }
 
 #[pyfunction]
@@ -136,9 +136,9 @@ pub fn fractional_integral<'py>(
         "block-pulse" => IntegralRule::BlockPulse,
         "trapezoidal" => IntegralRule::Trapezoidal,
         "grunwald-letnikov" => IntegralRule::GrunwaldLetnikov,
-        other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
+        other => return Err(unknown_choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
     };
-    let (count, width, mut values) = flat(&x)?;
+    let (count, width, mut values) = flatten(&x)?;
     let values = run_interruptible(py, values.len(), None, move |stop| {
         let rows_at_once = (MAX_BLOCK_POINTS / width.max(1)).max(1);
         for block in values.chunks_mut(rows_at_once * width.max(1)) {
@@ -166,16 +166,16 @@ pub fn fractional_derivative<'py>(
         "grunwald-letnikov" => Derivative::GrunwaldLetnikov,
         "riemann-liouville" => Derivative::RiemannLiouville,
         "caputo" => Derivative::Caputo,
-        other => return Err(choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
+        other => return Err(unknown_choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
     };
-    let ((count, width, values), (starts, terms, initial)) = (flat(&x)?, flat(&initial)?);
+    let ((count, width, values), (initial_rows, terms, initial)) = (flatten(&x)?, flatten(&initial)?);
     let values = run_interruptible(py, values.len(), None, move |stop| {
-        check_length("initial", count, starts)?;
+        check_length("initial", count, initial_rows)?;
         let mut derivatives = Vec::with_capacity(values.len());
         for row in 0..count {
             stop.check()?;
-            let (row, start) = (&values[row * width..][..width], &initial[row * terms..][..terms]);
-            derivatives.extend(integral::fractional_derivative(row, order, step, definition, start)?);
+            let (row, initial) = (&values[row * width..][..width], &initial[row * terms..][..terms]);
+            derivatives.extend(integral::fractional_derivative(row, order, step, definition, initial)?);
         }
         Ok(derivatives)
     })?;
@@ -211,7 +211,7 @@ pub fn filter_series(
     Ok(PyArray1::from_vec(py, run_detached(py, || filter.series(m, step))?))
 }
 
-fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+fn finite_rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
     let columns = rows(array)?;
     for column in &columns {
         check_finite("a column", column)?;
@@ -220,11 +220,12 @@ fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 }
 
 #[pyfunction]
-pub fn triangular_factor<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
-    let columns_of_matrix = finite(&given)?;
+pub fn triangular_factor<'py>(py: Python<'py>, transpose: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+    let columns_of_matrix = finite_rows(&transpose)?;
     let count = columns_of_matrix.len();
-    let factor =
-        run_interruptible(py, columns(&given), None, move |_| Ok(dense::triangular_factor(&columns_of_matrix)))?;
+    let factor = run_interruptible(py, column_count(&transpose), None, move |_| {
+        Ok(dense::triangular_factor(&columns_of_matrix))
+    })?;
     matrix(py, factor, count)
 }
 
@@ -232,12 +233,12 @@ pub fn triangular_factor<'py>(py: Python<'py>, given: PyReadonlyArray2<'py, f64>
 #[allow(clippy::type_complexity)]
 pub fn singular_values<'py>(
     py: Python<'py>,
-    given: PyReadonlyArray2<'py, f64>,
+    transpose: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
-    let columns_of_matrix = finite(&given)?;
-    let factors = run_interruptible(py, columns(&given), None, move |_| {
+    let columns_of_matrix = finite_rows(&transpose)?;
+    let factors = run_interruptible(py, column_count(&transpose), None, move |_| {
         dense::singular_values(&columns_of_matrix).ok_or_else(|| Error::Structure {
-            what: "singular values are not found".into(),
+            what: "the singular value decomposition did not converge".into(),
             remedy: "scale the columns".into(),
         })
     })?;

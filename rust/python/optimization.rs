@@ -56,8 +56,8 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     type Evaluation = Vec<f64>;
 
     fn evaluate(&self, point: &Vec<f64>) -> Result<Vec<f64>> {
-        self.call(&self.residuals, point, |answer| {
-            copy_vector("residuals", &answer.extract::<PyReadonlyArray1<'_, f64>>()?)
+        self.call(&self.residuals, point, |result| {
+            copy_vector("residuals", &result.extract::<PyReadonlyArray1<'_, f64>>()?)
         })
     }
 
@@ -66,33 +66,33 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     }
 
     fn jacobian(&self, point: &Vec<f64>, evaluation: &Vec<f64>) -> Result<Vec<Vec<f64>>> {
-        let answer =
-            self.call(&self.jacobian, point, |answer| rows(&answer.extract::<PyReadonlyArray2<'_, f64>>()?))?;
-        check_length("rows of the Jacobian", evaluation.len(), answer.len())?;
-        answer.iter().try_for_each(|row| check_length("a row of the Jacobian", point.len(), row.len()))?;
-        if let Some(index) = answer.iter().position(|row| row.iter().any(|v| !v.is_finite())) {
+        let result =
+            self.call(&self.jacobian, point, |result| rows(&result.extract::<PyReadonlyArray2<'_, f64>>()?))?;
+        check_length("rows of the Jacobian", evaluation.len(), result.len())?;
+        result.iter().try_for_each(|row| check_length("a row of the Jacobian", point.len(), row.len()))?;
+        if let Some(index) = result.iter().position(|row| row.iter().any(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "Jacobian".into(), index });
         }
-        Ok((0..point.len()).map(|k| answer.iter().map(|row| row[k]).collect()).collect())
+        Ok((0..point.len()).map(|k| result.iter().map(|row| row[k]).collect()).collect())
     }
 
     fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
-        let mut share: f64 = 1.0;
-        for (row, room) in self.constraints(point) {
-            let towards = inner(&row, steps);
-            let size: f64 = row.iter().zip(steps).map(|(a, s)| (a * s).abs()).sum();
-            if towards - room > CONSTRAINT_TOLERANCE * size + CONSTRAINT_ROUNDING {
-                share = share.min(room / towards);
+        let mut step_fraction: f64 = 1.0;
+        for (row, slack) in self.constraints(point) {
+            let slope = inner(&row, steps);
+            let rounding_scale: f64 = row.iter().zip(steps).map(|(a, s)| (a * s).abs()).sum();
+            if slope - slack > CONSTRAINT_TOLERANCE * rounding_scale + CONSTRAINT_ROUNDING {
+                step_fraction = step_fraction.min(slack / slope);
             }
         }
-        let next: Vec<f64> = point.iter().zip(steps).map(|(x, s)| x + share * s).collect();
-        let changes = steps.iter().zip(&next).map(|(s, x)| (share * s).abs() / x.abs().max(f64::MIN_POSITIVE));
+        let next: Vec<f64> = point.iter().zip(steps).map(|(x, s)| x + step_fraction * s).collect();
+        let changes = steps.iter().zip(&next).map(|(s, x)| (step_fraction * s).abs() / x.abs().max(f64::MIN_POSITIVE));
         (next.clone(), changes.fold(0.0, f64::max))
     }
 
     fn constraints(&self, point: &Vec<f64>) -> Vec<(Vec<f64>, f64)> {
-        let room = |(row, limit): (&Vec<f64>, &f64)| (row.clone(), (limit - inner(row, point)).max(0.0));
-        self.rows.iter().zip(&self.limits).map(room).collect()
+        let constraint = |(row, limit): (&Vec<f64>, &f64)| (row.clone(), (limit - inner(row, point)).max(0.0));
+        self.rows.iter().zip(&self.limits).map(constraint).collect()
     }
 
     fn signal_norm(&self, _: &Vec<f64>) -> f64 {

@@ -113,7 +113,9 @@ impl Recording {
         let channels = run.signals.iter().map(channel).collect::<PyResult<_>>()?;
         let free = run.free.iter().map(|(signal, law)| Ok((*signal, input_law(law)?)));
         let free_inputs = free.collect::<Result<_>>()?;
-        let filter = run.filter.map(|(top, bottom)| Filter { numerator: top.into(), denominator: bottom.into() });
+        let filter = run
+            .filter
+            .map(|(numerator, denominator)| Filter { numerator: numerator.into(), denominator: denominator.into() });
         run_attached(|| {
             let mut inner = recording::Recording::new(&run.name, run.step, times, channels, run.outputs.to_vec())?;
             inner.filter = filter;
@@ -144,24 +146,24 @@ impl Recording {
         ))
     }
 
-    /// Return the experiment with `every` pulses per sampling interval and decimated samples. `weights` holds the
-    /// weights of the outputs, and `shares` the robust weights of the compared samples, one row per output.
-    #[pyo3(signature = (every, decimation, weights, shares=None))]
+    /// Return the experiment with `pulses_per_sample` pulses per sampling interval and decimated samples. `weights`
+    /// holds the weights of the outputs, and `robust_weights` those of the compared samples, one row per output.
+    #[pyo3(signature = (pulses_per_sample, decimation, weights, robust_weights=None))]
     #[allow(clippy::needless_pass_by_value)]
     fn experiment(
         &self,
         py: Python<'_>,
-        every: usize,
+        pulses_per_sample: usize,
         decimation: usize,
         weights: List<f64>,
-        shares: Option<PyReadonlyArray2<'_, f64>>,
+        robust_weights: Option<PyReadonlyArray2<'_, f64>>,
     ) -> PyResult<Experiment> {
-        let shares = shares.as_ref().map(rows).transpose()?;
+        let robust_weights = robust_weights.as_ref().map(rows).transpose()?;
         let run = Arc::clone(&self.inner);
-        let points = run.len().saturating_mul(every).saturating_mul(run.channels().len());
+        let points = run.len().saturating_mul(pulses_per_sample).saturating_mul(run.channels().len());
         let inner = run_interruptible(py, points, None, move |_| {
-            let sampling = Sampling { pulses_per_sample: every, decimation, ..Sampling::default() };
-            let experiment = run.experiment(sampling)?.with_weights(&weights, shares.as_deref())?;
+            let sampling = Sampling { pulses_per_sample, decimation, ..Sampling::default() };
+            let experiment = run.experiment(sampling)?.with_weights(&weights, robust_weights.as_deref())?;
             experiment.check()?;
             Ok(experiment)
         })?;
@@ -171,8 +173,8 @@ impl Recording {
     /// Return the times \[s\] and sizes of the jumps of a zero-order-hold input; None for other signals.
     fn jumps<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Option<(Array<'py>, Array<'py>)>> {
         self.inner.channel(signal)?;
-        let discontinuities = run_detached(py, || Ok(self.inner.jumps(signal)))?;
-        Ok(discontinuities.map(|(times, sizes)| (PyArray1::from_vec(py, times), PyArray1::from_vec(py, sizes))))
+        let jumps = run_detached(py, || Ok(self.inner.jumps(signal)))?;
+        Ok(jumps.map(|(times, sizes)| (PyArray1::from_vec(py, times), PyArray1::from_vec(py, sizes))))
     }
 
     /// Return the values of a signal just after the given times \[s\]; None for a derived signal.
@@ -223,7 +225,7 @@ impl Experiment {
 }
 
 /// Return the exact means of a signal with nonuniform sample times over `m` pulses of length `step` \[s\]. The signal
-/// is held between samples if `hold`, otherwise linear.
+/// is constant between samples if `hold`, otherwise linear.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn nonuniform_means<'py>(
@@ -235,8 +237,8 @@ pub fn nonuniform_means<'py>(
     hold: bool,
 ) -> PyResult<Array<'py>> {
     let (times, samples) = (vector("times", &times)?, vector("samples", &samples)?);
-    let between = if hold { Intersample::Hold } else { Intersample::Linear };
-    let means = run_detached(py, || NonuniformSignal::new(&times, &samples, between)?.means(m, step))?;
+    let interpolation = if hold { Intersample::Hold } else { Intersample::Linear };
+    let means = run_detached(py, || NonuniformSignal::new(&times, &samples, interpolation)?.means(m, step))?;
     Ok(PyArray1::from_vec(py, means.into_vec()))
 }
 

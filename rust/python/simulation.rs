@@ -10,7 +10,7 @@ use super::convert::{
     DerivedArg, EquationArg, InitialArg, List, RecordArg, StructureArg,
 };
 use super::errors::run_detached;
-use super::estimation::jumps_near;
+use super::estimation::jumps_at_samples;
 use super::recording::Recording;
 use crate::error::check_length;
 use crate::friction::FrictionLaw;
@@ -119,8 +119,8 @@ pub fn metrics(
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
     let residuals = copy_vector("residuals", &residuals)?;
-    let figures = run_detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
-    Ok((figures.error, figures.rmse, figures.nr, figures.fit_percent))
+    let metrics = run_detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
+    Ok((metrics.error, metrics.rmse, metrics.nr, metrics.fit_percent))
 }
 
 #[pyfunction]
@@ -142,15 +142,15 @@ pub fn correlation<'py>(
 pub fn interpolate_samples<'py>(
     py: Python<'py>,
     means: PyReadonlyArray2<'py, f64>,
-    places: PyReadonlyArray1<'py, f64>,
+    positions: PyReadonlyArray1<'py, f64>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let (means, places) = (rows(&means)?, vector("times of nonuniform samples", &places)?);
+    let (means, positions) = (rows(&means)?, vector("times of nonuniform samples", &positions)?);
     let m = means.first().map_or(0, Vec::len);
-    let read = run_detached(py, || {
-        let readings = SampleInterpolation::new(places, m)?;
-        Ok(means.iter().map(|row| readings.interpolate(row)).collect::<Vec<_>>())
+    let samples = run_detached(py, || {
+        let interpolation = SampleInterpolation::new(positions, m)?;
+        Ok(means.iter().map(|row| interpolation.interpolate(row)).collect::<Vec<_>>())
     })?;
-    stack_rows(py, &read)
+    stack_rows(py, &samples)
 }
 
 #[pyfunction]
@@ -158,16 +158,16 @@ pub fn interpolate_samples<'py>(
 pub fn kink_correction<'py>(
     py: Python<'py>,
     m: usize,
-    places: PyReadonlyArray1<'py, f64>,
+    positions: PyReadonlyArray1<'py, f64>,
     jumps: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
     order: f64,
     step: f64,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-    let places = vector("times of nonuniform samples", &places)?;
-    let readings = SampleInterpolation::new(places, m)?;
-    let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
-    let lacking = run_detached(py, || Ok(readings.kink_corrections(&jumps, order, step)))?;
-    Ok(PyArray1::from_vec(py, lacking))
+    let positions = vector("times of nonuniform samples", &positions)?;
+    let interpolation = SampleInterpolation::new(positions, m)?;
+    let jumps = jumps_at_samples(&interpolation, &jumps.0, &jumps.1)?;
+    let correction = run_detached(py, || Ok(interpolation.kink_corrections(&jumps, order, step)))?;
+    Ok(PyArray1::from_vec(py, correction))
 }
 
 /// [(exponent, coefficient), …] of the initial terms by equation.
@@ -176,8 +176,8 @@ type TermsList = Vec<Vec<(f64, f64)>>;
 /// (samples of the outputs as rows, initial terms).
 type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, TermsList);
 
-fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<SamplesTuple<'py>> {
-    Ok((stack_rows(py, &found.outputs)?, found.initial))
+fn samples_tuple<'py>(py: Python<'py>, samples: OutputSamples) -> PyResult<SamplesTuple<'py>> {
+    Ok((stack_rows(py, &samples.outputs)?, samples.initial))
 }
 
 /// Model with known orders and coefficients on a recording, whose outputs can be simulated.
@@ -195,7 +195,7 @@ type TermsArg = (bool, List<List<(f64, f64)>>, bool);
 fn initial_terms((fitted, terms, has_level): TermsArg) -> InitialTerms {
     let terms = to_vectors(terms);
     if fitted {
-        let exponents = terms.into_iter().map(|own| own.into_iter().map(|term| term.0).collect()).collect();
+        let exponents = terms.into_iter().map(|terms| terms.into_iter().map(|term| term.0).collect()).collect();
         InitialTerms::Fitted { exponents, has_level }
     } else {
         InitialTerms::Given(terms)
@@ -218,7 +218,7 @@ impl OutputSimulation {
         let derived = derived_signals(derived)?;
         let signals = run.channels().len() + derived.len();
         let equations = equations(model, signals, &vec![true; signals])?;
-        let law = |(place, (coulomb, stribeck, speed))| (place, FrictionLaw { coulomb, stribeck, speed });
+        let law = |(equation, (coulomb, stribeck, speed))| (equation, FrictionLaw { coulomb, stribeck, speed });
         let frictions = frictions.into_iter().map(law).collect();
         let times = times.as_ref().map(|times| vector("sample times", times)).transpose()?;
         let points = run.len().saturating_mul(run.channels().len());
@@ -232,18 +232,18 @@ impl OutputSimulation {
         })
     }
 
-    /// Return (samples, initial terms) of a simulation on a grid of `every` pulses per sampling interval.
-    #[pyo3(signature = (every, terms, stop=None))]
+    /// Return (samples, initial terms) of a simulation on a grid of `pulses_per_sample` pulses per sampling interval.
+    #[pyo3(signature = (pulses_per_sample, terms, stop=None))]
     fn samples<'py>(
         &self,
         py: Python<'py>,
-        every: usize,
+        pulses_per_sample: usize,
         terms: TermsArg,
         stop: Option<&Stop>,
     ) -> PyResult<SamplesTuple<'py>> {
         let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
-        let points = self.points.saturating_mul(every);
-        samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(every, &initial))?)
+        let points = self.points.saturating_mul(pulses_per_sample);
+        samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(pulses_per_sample, &initial))?)
     }
 
     /// Return (exact samples, initial terms) of a model with integer orders. None if the model must be discretized by
@@ -308,40 +308,40 @@ impl OutputSimulation {
 
     /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. Return (exponent,
     /// coefficient) of each term, by equation.
-    #[pyo3(signature = (start, every, stop=None))]
+    #[pyo3(signature = (initial_terms, pulses_per_sample, stop=None))]
     fn fit_initial_states(
         &self,
         py: Python<'_>,
-        start: InitialArg,
-        every: usize,
+        initial_terms: InitialArg,
+        pulses_per_sample: usize,
         stop: Option<&Stop>,
     ) -> PyResult<TermsList> {
-        let (inner, initial) = (Arc::clone(&self.inner), initial(start)?);
-        run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_initial_states(initial, every, stop))
+        let (inner, initial) = (Arc::clone(&self.inner), initial(initial_terms)?);
+        run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_initial_states(initial, pulses_per_sample, stop))
     }
 }
 
 /// Extrapolate samples, simulated with the steps h, h/2, h/4, …, to zero step. Return (samples, relative change of each
-/// output, extrapolated additional values). `owners` holds the output index of each additional value.
+/// output, extrapolated additional values). `outputs` holds the output index of each additional value.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn richardson_limit<'py>(
     py: Python<'py>,
     grids: List<(PyReadonlyArray2<'py, f64>, List<f64>)>,
-    owners: List<usize>,
+    outputs: List<usize>,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<f64>>, Vec<f64>)> {
-    let grids = grids.iter().map(|(samples, numbers)| Ok((rows(samples)?, numbers.to_vec())));
+    let grids = grids.iter().map(|(samples, values)| Ok((rows(samples)?, values.to_vec())));
     let grids = grids.collect::<PyResult<Vec<_>>>()?;
     let limit = run_detached(py, || {
-        for (samples, numbers) in &grids {
+        for (samples, values) in &grids {
             check_length(
                 "outputs of a grid",
-                grids[0].0.len().max(owners.iter().max().map_or(0, |o| o + 1)),
+                grids[0].0.len().max(outputs.iter().max().map_or(0, |o| o + 1)),
                 samples.len(),
             )?;
-            check_length("numbers of a grid", owners.len(), numbers.len())?;
+            check_length("additional values of a grid", outputs.len(), values.len())?;
         }
-        Ok(output_samples::richardson_limit(grids, &owners).unwrap_or_default())
+        Ok(output_samples::richardson_limit(grids, &outputs).unwrap_or_default())
     })?;
     Ok((stack_rows(py, &limit.samples)?, PyArray1::from_vec(py, limit.change), limit.terms))
 }

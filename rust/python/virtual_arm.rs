@@ -249,7 +249,7 @@ impl VirtualArm {
                 guard.inner.rest(&reading);
                 Ok(())
             })?;
-            self.write(output, [0.0; 2])?;
+            self.apply_voltages(output, [0.0; 2])?;
             if guard.inner.fault().is_some() {
                 break;
             }
@@ -274,9 +274,9 @@ impl VirtualArm {
         check_length("noise", commands.nrows(), noise.nrows())?;
         for (command, noise) in commands.outer_iter().zip(noise.outer_iter()) {
             let delay = self.wait(py)? + self.plant.delay();
-            if !self.plant.sampling() {
+            if !self.plant.is_sampling() {
                 guard.inner.fail(Fault::Rig("the board returned no sample: samples were lost".into()));
-                self.write(output, [0.0; 2])?;
+                self.apply_voltages(output, [0.0; 2])?;
                 break;
             }
             let volts = run_attached(|| {
@@ -290,7 +290,7 @@ impl VirtualArm {
                 }
                 Ok(volts)
             })?;
-            self.write(output, volts)?;
+            self.apply_voltages(output, volts)?;
             if guard.inner.fault().is_some() {
                 break;
             }
@@ -334,10 +334,10 @@ impl VirtualArm {
     }
 
     /// Call `output` with two voltages, and advance the arm by one sample with the voltages that it returns.
-    fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
-        let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
+    fn apply_voltages(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
+        let (amplifier_volts, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
         run_attached(|| {
-            self.plant.advance(through, enabled);
+            self.plant.advance(amplifier_volts, enabled);
             Ok(())
         })
     }

@@ -72,8 +72,8 @@ impl Channel {
     /// ```
     pub fn check(&self) -> Result<()> {
         if matches!(self.role, Role::Input(_)) {
-            let all = std::iter::once(&self.samples).chain(&self.nonuniform);
-            all.into_iter().try_for_each(|samples| check_finite(&format!("signal {}", self.name), samples))?;
+            let sample_rows = std::iter::once(&self.samples).chain(&self.nonuniform);
+            sample_rows.into_iter().try_for_each(|samples| check_finite(&format!("signal {}", self.name), samples))?;
         }
         check_finite(&format!("delay of {}", self.name), &[self.lag()])?;
         let mut limits = self.nonlinearities.iter().filter_map(|(_, value)| *value);
@@ -116,14 +116,14 @@ impl Channel {
 
     /// Return samples with the known saturations and dead zones of the channel applied.
     pub(super) fn apply_limits<'a>(&self, samples: &'a [f64]) -> Cow<'a, [f64]> {
-        let mut limited = Cow::Borrowed(samples);
+        let mut values = Cow::Borrowed(samples);
         for (law, limit) in self.nonlinearities.iter().filter_map(|(law, value)| value.map(|value| (law, value))) {
-            for v in limited.to_mut() {
+            for v in values.to_mut() {
                 let clipped = v.clamp(-limit, limit);
                 *v = if *law == InputLaw::DeadZone { *v - clipped } else { clipped };
             }
         }
-        limited
+        values
     }
 
     /// Return the channel with the first `rows` uniform and the first `nonuniform` nonuniform samples.

@@ -100,8 +100,12 @@ impl Recordings {
         sampling.check()?;
         let bytes: usize = self.runs.iter().map(|run| run.bytes(sampling)).fold(0, usize::saturating_add);
         let names = || self.runs.iter().map(|run| format!("'{}'", run.name())).collect::<Vec<_>>().join(", ");
-        let every = sampling.pulses_per_sample;
-        check_memory(|| format!("grids of {every} pulses per sample of run {}", names()), bytes, self.memory)?;
+        let pulses_per_sample = sampling.pulses_per_sample;
+        check_memory(
+            || format!("grids of {pulses_per_sample} pulses per sample of run {}", names()),
+            bytes,
+            self.memory,
+        )?;
         self.runs.iter().map(|run| run.experiment(sampling)).collect()
     }
 
@@ -121,12 +125,12 @@ impl Recordings {
     #[must_use]
     pub fn inputs(&self) -> Vec<Option<Intersample>> {
         let is_held_input = |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_held_input());
-        let of = |(signal, channel): (usize, &Channel)| match channel.role {
+        let input_behavior = |(signal, channel): (usize, &Channel)| match channel.role {
             Role::Input(_) if is_held_input(signal) => Some(Intersample::Hold),
             Role::Input(_) => Some(Intersample::Linear),
             _ => None,
         };
-        self.runs.first().into_iter().flat_map(|run| run.channels().iter().enumerate()).map(of).collect()
+        self.runs.first().into_iter().flat_map(|run| run.channels().iter().enumerate()).map(input_behavior).collect()
     }
 
     /// Return the uniform samples of a signal in each run; NaN for missing samples.
@@ -145,8 +149,8 @@ impl Recordings {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn samples(&self, signal: usize) -> Result<Vec<&[f64]>> {
-        let of = |run| Recording::channel(run, signal).map(|channel| channel.samples.as_slice());
-        self.runs.iter().map(of).collect()
+        let samples_of_run = |run| Recording::channel(run, signal).map(|channel| channel.samples.as_slice());
+        self.runs.iter().map(samples_of_run).collect()
     }
 
     /// Return the record of each run over `m` block pulses, with all signals filtered by the sensor filter. Missing
@@ -169,11 +173,11 @@ impl Recordings {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
-        let of = |run: &Recording| {
+        let record_of_run = |run: &Recording| {
             let mut with_inputs = run.with_free_inputs(inputs)?;
             with_inputs.is_coupled = false;
             with_inputs.pulses(m, true)?.into_record()
         };
-        self.runs.iter().map(of).collect()
+        self.runs.iter().map(record_of_run).collect()
     }
 }

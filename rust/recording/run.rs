@@ -198,7 +198,7 @@ impl Recording {
             check_length(&format!("signal {}", channel.name), rows, channel.samples.len())?;
             if channel.role != Role::Derived {
                 let (expected, actual) = (times.as_ref().map(Vec::len), channel.nonuniform.as_ref().map(Vec::len));
-                check_length("samples at their own times", expected.unwrap_or(0), actual.unwrap_or(0))?;
+                check_length("samples at nonuniform times", expected.unwrap_or(0), actual.unwrap_or(0))?;
             }
             channel.check()?;
         }
@@ -348,7 +348,7 @@ impl Recording {
             if law == InputLaw::Delay {
                 channel.delay = Some(value);
             }
-            for (_, limit) in channel.nonlinearities.iter_mut().filter(|(of, limit)| *of == law && limit.is_none()) {
+            for (_, limit) in channel.nonlinearities.iter_mut().filter(|item| item.0 == law && item.1.is_none()) {
                 *limit = Some(value);
             }
             channel.check()?;
@@ -383,11 +383,11 @@ impl Recording {
         // Interpolation up to the last uniform sample requires the nonuniform sample that follows it.
         let end = (rows - 1) as f64 * self.step + self.step;
         let nonuniform = self.times.as_ref().map_or(0, |times| times.partition_point(|time| *time <= end));
-        let of = |channel: &Channel| channel.leading_part(rows, nonuniform);
+        let leading_channel = |channel: &Channel| channel.leading_part(rows, nonuniform);
         Ok(Cow::Owned(Self {
             name: self.name.clone(),
             times: self.times.as_ref().map(|times| times[..nonuniform].to_vec()),
-            channels: self.channels.iter().map(of).collect(),
+            channels: self.channels.iter().map(leading_channel).collect(),
             outputs: self.outputs.clone(),
             filter: self.filter.clone(),
             free_inputs: self.free_inputs.clone(),
@@ -399,8 +399,8 @@ impl Recording {
     /// enters them.
     #[must_use]
     pub fn is_all_filtered(&self) -> bool {
-        let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
-        self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !simulated(signal))
+        let is_simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
+        self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !is_simulated(signal))
     }
 
     /// True if the recording has nonuniform sample times.
@@ -418,13 +418,13 @@ impl Recording {
     /// transient is removed from filtered signals that enter other equations as measured.
     fn removed_transient(&self, signal: usize) -> Option<FilterStates> {
         let channel = &self.channels[signal];
-        let simulated = self.is_coupled && self.outputs.contains(&signal);
-        let commanded = channel.is_held_input() || (channel.delay.is_some() && channel.role != Role::Output);
-        let enters = channel.is_filtered && channel.enters_others && !simulated && !commanded;
-        if !enters || self.filter_states == 0 || channel.role == Role::Derived || !self.is_all_filtered() {
+        let is_simulated = self.is_coupled && self.outputs.contains(&signal);
+        let is_commanded = channel.is_held_input() || (channel.delay.is_some() && channel.role != Role::Output);
+        let enters_as_measured = channel.is_filtered && channel.enters_others && !is_simulated && !is_commanded;
+        if !enters_as_measured || self.filter_states == 0 || channel.role == Role::Derived || !self.is_all_filtered() {
             return None;
         }
-        FilterStates::of(self.filter.as_ref()?).filter(|states| states.lasts(self.step))
+        FilterStates::from_filter(self.filter.as_ref()?).filter(|states| states.has_lasting_transient(self.step))
     }
 
     /// Return the uniform samples of a signal as it enters the equations. Known saturations and dead zones are applied,
@@ -457,10 +457,9 @@ impl Recording {
         let limited = channel.apply_limits(channel.nonuniform.as_ref()?);
         let uniform = channel.apply_limits(&channel.samples);
         let Some(transient) = self.transient(signal, &uniform) else { return Some(limited) };
-        let held_values: Vec<f64> =
-            uniform.iter().zip(transient).map(|(v, held_values)| v - (v - held_values)).collect();
+        let transient_values: Vec<f64> = uniform.iter().zip(transient).map(|(v, offset)| v - (v - offset)).collect();
         let grid = self.uniform_times();
-        Some(limited.iter().zip(times).map(|(v, &time)| v - interpolate(time, &grid, &held_values)).collect())
+        Some(limited.iter().zip(times).map(|(v, &time)| v - interpolate(time, &grid, &transient_values)).collect())
     }
 
     fn transient(&self, signal: usize, samples: &[f64]) -> Option<Vec<f64>> {
@@ -509,24 +508,24 @@ impl Recording {
             && (channel.role != Role::Output || !channel.nonuniform.iter().flatten().any(|v| v.is_nan()))
         {
             let before = self.value_before(&self.acting_samples(signal));
-            let line = NonuniformSignal::new_unchecked(times, &samples, intersample);
-            return line.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
+            let interpolant = NonuniformSignal::new_unchecked(times, &samples, intersample);
+            return interpolant.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
         }
-        let acting = self.acting_samples(signal);
-        let mut samples = interpolate_gaps(&acting);
+        let acting_samples = self.acting_samples(signal);
+        let mut samples = interpolate_gaps(&acting_samples);
         if channel.lag() != 0.0 {
             let intervals = self.len() - 1;
             // On a finer grid a delayed command switches within a sampling interval. Its samples are therefore repeated
             // on that grid before the delay is applied.
-            let every = if intersample == Intersample::Hold && m.is_multiple_of(intervals) {
+            let count = if intersample == Intersample::Hold && m.is_multiple_of(intervals) {
                 (m / intervals).max(1)
             } else {
                 1
             };
             let before = self.value_before(&samples);
             let repeated: Vec<f64> =
-                samples.iter().flat_map(|v| std::iter::repeat_n(*v, every)).take(intervals * every + 1).collect();
-            samples = delay_samples(&repeated, channel.lag() / self.step * every as f64, before)?.into();
+                samples.iter().flat_map(|v| std::iter::repeat_n(*v, count)).take(intervals * count + 1).collect();
+            samples = delay_samples(&repeated, channel.lag() / self.step * count as f64, before)?.into();
         }
         pulse_means(&samples, m, intersample)
     }
@@ -574,20 +573,20 @@ impl Recording {
             }
             means.push(PulseMeans::new(row));
         }
-        let impulse_responses = match filter.and_then(FilterStates::of) {
+        let impulse_responses = match filter.and_then(FilterStates::from_filter) {
             Some(states) => states.impulse_responses(self.filter_states, m, step)?,
             None => Vec::new(),
         };
-        let transient = self.filter_states > 0 && series.is_some();
-        let within = |signal| self.with_signal(signal, |line| line.pulse_jumps(m, step)).unwrap_or_default();
+        let has_unknown_states = self.filter_states > 0 && series.is_some();
+        let pulse_jumps = |signal| self.with_signal(signal, |line| line.pulse_jumps(m, step)).unwrap_or_default();
         // A pulse that is longer than a sampling interval averages over jumps.
         let has_jumps = self.has_friction && m >= self.len() - 1;
-        let jumps = if has_jumps { (0..self.channels.len()).map(within).collect() } else { Vec::new() };
+        let jumps = if has_jumps { (0..self.channels.len()).map(pulse_jumps).collect() } else { Vec::new() };
         Ok(Pulses {
             step,
             means,
             filter: series,
-            has_transient: self.channels.iter().map(|channel| transient && channel.is_filtered).collect(),
+            has_transient: self.channels.iter().map(|channel| has_unknown_states && channel.is_filtered).collect(),
             initial_levels: (0..self.channels.len()).map(|signal| self.initial_level(signal)).collect(),
             impulse_responses,
             jumps,
@@ -631,7 +630,7 @@ impl Recording {
     /// ```
     pub fn experiment(&self, sampling: Sampling) -> Result<Experiment> {
         sampling.check()?;
-        let Sampling { pulses_per_sample: every, decimation, leading_intervals } = sampling;
+        let Sampling { pulses_per_sample, decimation, leading_intervals } = sampling;
         let run = match leading_intervals {
             Some(intervals) => self.leading_part(intervals.saturating_add(1))?,
             None => Cow::Borrowed(self),
@@ -639,24 +638,25 @@ impl Recording {
         let intervals = (run.len() - 1) / decimation;
         let run = run.leading_part(intervals * decimation + 1)?;
         let filtered = run.is_all_filtered();
-        let pulses = run.pulses(intervals.saturating_mul(every), filtered)?;
+        let pulses = run.pulses(intervals.saturating_mul(pulses_per_sample), filtered)?;
         let (m, step) = (pulses.means[0].values().len(), pulses.step);
         let filter = if filtered { None } else { run.filter.as_ref() };
         let filter = filter.map(|filter| filter.series(m, step)).transpose()?;
         let weights = vec![1.0; run.outputs.len()];
         let nonuniform = run.compares_nonuniform_samples();
-        let (experiment, unread, point_values) = if nonuniform {
+        let (experiment, sample_weights, point_values) = if nonuniform {
             run.nonuniform_experiment(pulses, decimation, weights)?
         } else {
             let point_values = (0..run.channels.len())
-                .map(|signal| run.point_values(signal, &pulses, every, decimation))
+                .map(|signal| run.point_values(signal, &pulses, pulses_per_sample, decimation))
                 .collect::<Result<_>>()?;
-            let samples = run.outputs.iter().map(|&output| run.compared_samples(output, &pulses, every, decimation));
-            let (samples, unread) = without_gaps(samples.collect());
+            let samples =
+                run.outputs.iter().map(|&output| run.compared_samples(output, &pulses, pulses_per_sample, decimation));
+            let (samples, sample_weights) = without_gaps(samples.collect());
             let record = pulses.into_record_with_initial_state()?;
-            (Experiment::new(record, every, samples, weights)?, unread, point_values)
+            (Experiment::new(record, pulses_per_sample, samples, weights)?, sample_weights, point_values)
         };
-        let experiment = match unread {
+        let experiment = match sample_weights {
             None => experiment,
             Some(sample_weights) if nonuniform => experiment.with_sample_weights(sample_weights)?,
             // The first and the last sample are not compared.
@@ -669,8 +669,8 @@ impl Recording {
         match filter {
             None => Ok(experiment),
             Some(series) => {
-                let passed = run.outputs.iter().map(|&output| run.channels[output].is_filtered).collect();
-                experiment.with_filter(series, passed)
+                let passes_filter = run.outputs.iter().map(|&output| run.channels[output].is_filtered).collect();
+                experiment.with_filter(series, passes_filter)
             }
         }
     }
@@ -706,8 +706,8 @@ impl Recording {
         signals.saturating_add(2 * rows * self.outputs.len()).saturating_mul(size_of::<f64>())
     }
 
-    /// Return the samples of each output to compare with a simulation on a grid of `every` block pulses per sampling
-    /// interval. They are filtered if the equations relate filtered signals. Missing samples are NaN.
+    /// Return the samples of each output to compare with a simulation on a grid of `pulses_per_sample` block pulses per
+    /// sampling interval. They are filtered if the equations relate filtered signals. Missing samples are NaN.
     ///
     /// # Errors
     /// The errors of [`Recording::pulses`], for an invalid number of pulses or a sample that is not finite.
@@ -721,26 +721,26 @@ impl Recording {
     /// assert_eq!(run.compared_rows(1)?, [[0.0, 1.0, 4.0, 9.0]]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn compared_rows(&self, every: usize) -> Result<Vec<Vec<f64>>> {
+    pub fn compared_rows(&self, pulses_per_sample: usize) -> Result<Vec<Vec<f64>>> {
         let mut outputs = self.outputs.iter().map(|&output| &self.channels[output]);
-        let passed = !self.is_all_filtered() || outputs.all(|channel| channel.is_filtered);
-        if passed || self.compares_nonuniform_samples() {
+        let is_filtered = !self.is_all_filtered() || outputs.all(|channel| channel.is_filtered);
+        if is_filtered || self.compares_nonuniform_samples() {
             return Ok(self.recorded_rows());
         }
-        let pulses = self.pulses((self.len() - 1).saturating_mul(every), true)?;
-        Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, every, 1)).collect())
+        let pulses = self.pulses((self.len() - 1).saturating_mul(pulses_per_sample), true)?;
+        Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, pulses_per_sample, 1)).collect())
     }
 
     /// Return a recording of `rows` samples that are zero. If `sample` is (signal, row), this one sample is 1.
     pub(crate) fn unit_recording(&self, rows: usize, sample: Option<(usize, usize)>) -> Self {
-        let of = |(signal, channel): (usize, &Channel)| {
+        let unit_channel = |(signal, channel): (usize, &Channel)| {
             let mut samples = vec![0.0; rows];
-            if let Some((_, row)) = sample.filter(|(of, _)| *of == signal) {
+            if let Some((_, row)) = sample.filter(|(index, _)| *index == signal) {
                 samples[row] = 1.0;
             }
             Channel { samples, ..channel.leading_part(0, 0) }
         };
-        let mut channels: Vec<Channel> = self.channels.iter().enumerate().map(of).collect();
+        let mut channels: Vec<Channel> = self.channels.iter().enumerate().map(unit_channel).collect();
         channels.iter_mut().for_each(|channel| {
             channel.nonlinearities.clear();
             channel.nonuniform = None;
@@ -760,12 +760,12 @@ impl Recording {
 
     /// Return the samples of an output to compare with a simulation. They are filtered if the equations relate filtered
     /// signals.
-    fn compared_samples(&self, output: usize, pulses: &Pulses, every: usize, decimation: usize) -> Vec<f64> {
+    fn compared_samples(&self, output: usize, pulses: &Pulses, stride: usize, decimation: usize) -> Vec<f64> {
         let channel = &self.channels[output];
         if pulses.filter.is_none() || channel.is_filtered {
             return channel.samples.iter().copied().step_by(decimation).collect();
         }
-        point_samples(pulses.means[output].values()).into_iter().step_by(every).collect()
+        point_samples(pulses.means[output].values()).into_iter().step_by(stride).collect()
     }
 
     /// Return the values of a signal at the sample times, after any jump at these times.
@@ -773,18 +773,18 @@ impl Recording {
     /// The values are None for derived signals. They are None for signals to which the sensor filter is applied
     /// numerically, because these have no jumps or slope discontinuities. They are also None for an output with missing
     /// samples.
-    fn point_values(&self, signal: usize, pulses: &Pulses, every: usize, decimation: usize) -> Result<PointValues> {
+    fn point_values(&self, signal: usize, pulses: &Pulses, stride: usize, decimation: usize) -> Result<PointValues> {
         let channel = &self.channels[signal];
-        let smooth = pulses.filter.is_some() && !channel.is_filtered;
-        let read = channel.nonuniform.as_ref().unwrap_or(&channel.samples);
-        let missing = channel.role == Role::Output && read.iter().any(|v| v.is_nan());
-        if channel.role == Role::Derived || missing || smooth {
+        let is_filtered_numerically = pulses.filter.is_some() && !channel.is_filtered;
+        let samples = channel.nonuniform.as_ref().unwrap_or(&channel.samples);
+        let has_gaps = channel.role == Role::Output && samples.iter().any(|v| v.is_nan());
+        if channel.role == Role::Derived || has_gaps || is_filtered_numerically {
             return Ok(PointValues::default());
         }
         let is_zero_order_hold = channel.is_held_input();
         if channel.lag() != 0.0 && is_zero_order_hold {
             // A delayed command switches between samples. Its value at a sample time is that of the pulse that follows.
-            let mut values: Vec<f64> = pulses.means[signal].values().iter().copied().step_by(every).collect();
+            let mut values: Vec<f64> = pulses.means[signal].values().iter().copied().step_by(stride).collect();
             values.extend(values.last().copied());
             return Ok(PointValues { values: Some(values), is_zero_order_hold });
         }
@@ -808,28 +808,30 @@ impl Recording {
         let last = self.duration() * (1.0 + TIME_TOLERANCE);
         let rows: Vec<usize> =
             (0..times.len()).filter(|&row| times[row] > 0.0 && times[row] <= last).step_by(decimation).collect();
-        let at: Vec<f64> = rows.iter().map(|&row| times[row]).collect();
+        let sample_times: Vec<f64> = rows.iter().map(|&row| times[row]).collect();
         let (m, step) = (pulses.means[0].values().len(), pulses.step);
-        let readings = SampleInterpolation::new(at.iter().map(|time| (time / step).min(m as f64)).collect(), m)?;
-        let of = |&output: &usize| {
-            let read = self.channels[output].nonuniform.as_deref().unwrap_or_default();
-            rows.iter().map(|&row| read[row]).collect()
+        let positions = sample_times.iter().map(|time| (time / step).min(m as f64)).collect();
+        let interpolation = SampleInterpolation::new(positions, m)?;
+        let output_samples = |&output: &usize| {
+            let samples_of_output = self.channels[output].nonuniform.as_deref().unwrap_or_default();
+            rows.iter().map(|&row| samples_of_output[row]).collect()
         };
-        let (samples, unread) = without_gaps(self.outputs.iter().map(of).collect());
+        let (samples, sample_weights) = without_gaps(self.outputs.iter().map(output_samples).collect());
         let mut jumps = Vec::with_capacity(self.channels.len());
         let mut point_values = Vec::with_capacity(self.channels.len());
         for signal in 0..self.channels.len() {
             jumps.push(self.jumps(signal).map(|(times, sizes)| {
-                let places: Vec<f64> = times.iter().map(|time| time / step).collect();
-                readings.jumps(&places, &sizes)
+                let positions: Vec<f64> = times.iter().map(|time| time / step).collect();
+                interpolation.jumps(&positions, &sizes)
             }));
             // A signal with a missing sample is not an input.
-            let values = self.values_at(signal, &at).filter(|values| !values.iter().any(|v| v.is_nan()));
+            let values = self.values_at(signal, &sample_times).filter(|values| !values.iter().any(|v| v.is_nan()));
             point_values.push(PointValues { values, is_zero_order_hold: false });
         }
         let record = pulses.into_record_with_initial_state()?;
-        let own = NonuniformSamples { readings, jumps };
-        Ok((Experiment::with_nonuniform_samples(record, samples, weights, own)?, unread, point_values))
+        let nonuniform = NonuniformSamples { readings: interpolation, jumps };
+        let experiment = Experiment::with_nonuniform_samples(record, samples, weights, nonuniform)?;
+        Ok((experiment, sample_weights, point_values))
     }
 
     /// Return the times \[s\] and sizes of the jumps of a zero-order-hold input with its delay applied; None for other
@@ -849,7 +851,7 @@ impl Recording {
         if !self.channels[signal].is_held_input() {
             return None;
         }
-        self.with_signal(signal, |line| line.jumps()).flatten()
+        self.with_signal(signal, |interpolant| interpolant.jumps()).flatten()
     }
 
     /// Return the values of a signal just after the given times \[s\], with delay, saturation and dead zone applied;
@@ -866,23 +868,23 @@ impl Recording {
     /// ```
     #[must_use]
     pub fn values_at(&self, signal: usize, times: &[f64]) -> Option<Vec<f64>> {
-        self.with_signal(signal, |line| line.at(times))
+        self.with_signal(signal, |interpolant| interpolant.at(times))
     }
 
     /// Apply a function to a signal at its own sample times, with saturations, dead zones and delay applied. Return
     /// None for a derived signal.
-    fn with_signal<T>(&self, signal: usize, of: impl FnOnce(NonuniformSignal<'_>) -> T) -> Option<T> {
+    fn with_signal<T>(&self, signal: usize, work: impl FnOnce(NonuniformSignal<'_>) -> T) -> Option<T> {
         let channel = &self.channels[signal];
         if channel.role == Role::Derived {
             return None;
         }
-        let (times, read) = match (&self.times, &channel.nonuniform) {
-            (Some(times), Some(read)) => (Cow::Borrowed(times.as_slice()), read),
+        let (times, measured) = match (&self.times, &channel.nonuniform) {
+            (Some(times), Some(measured)) => (Cow::Borrowed(times.as_slice()), measured),
             _ => (Cow::Owned(self.uniform_times()), &channel.samples),
         };
-        let samples = channel.apply_limits(read);
-        let line = NonuniformSignal::new_unchecked(&times, &samples, channel.intersample());
-        Some(of(line.with_delay(channel.lag(), self.value_before(&samples))))
+        let samples = channel.apply_limits(measured);
+        let interpolant = NonuniformSignal::new_unchecked(&times, &samples, channel.intersample());
+        Some(work(interpolant.with_delay(channel.lag(), self.value_before(&samples))))
     }
 }
 
@@ -893,6 +895,6 @@ fn without_gaps(samples: Vec<Vec<f64>>) -> (Vec<Vec<f64>>, Option<Vec<Vec<f64>>>
         return (samples, None);
     }
     let weights = samples.iter().map(|row| row.iter().map(|v| f64::from(u8::from(!v.is_nan()))).collect()).collect();
-    let zeroed = |row: Vec<f64>| row.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect();
-    (samples.into_iter().map(zeroed).collect(), Some(weights))
+    let replace_gaps = |row: Vec<f64>| row.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect();
+    (samples.into_iter().map(replace_gaps).collect(), Some(weights))
 }

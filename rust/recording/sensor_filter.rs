@@ -29,35 +29,35 @@ pub(super) struct FilterStates {
     /// Gain from the input of the filter to the last state.
     gain: f64,
     /// Magnitude of the fastest pole \[rad/s\].
-    fastest: f64,
+    fastest_pole: f64,
 }
 
 impl FilterStates {
     /// Return the state-space form of a filter. None if the filter has zeros, fractional orders or order 0, because its
     /// transients are then not impulse responses.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(super) fn of(filter: &Filter) -> Option<Self> {
-        let whole = |order: f64| order.fract() == 0.0;
-        let used = |terms: &[(f64, f64)]| terms.iter().copied().filter(|(c, _)| *c != 0.0).collect::<Vec<_>>();
-        let (top, bottom) = (used(&filter.numerator), used(&filter.denominator));
-        if top.iter().any(|(_, order)| *order > 0.0) || !bottom.iter().all(|(_, order)| whole(*order)) {
+    pub(super) fn from_filter(filter: &Filter) -> Option<Self> {
+        let is_integer = |order: f64| order.fract() == 0.0;
+        let nonzero_terms = |terms: &[(f64, f64)]| terms.iter().copied().filter(|(c, _)| *c != 0.0).collect::<Vec<_>>();
+        let (numerator, denominator) = (nonzero_terms(&filter.numerator), nonzero_terms(&filter.denominator));
+        if numerator.iter().any(|(_, order)| *order > 0.0) || !denominator.iter().all(|(_, order)| is_integer(*order)) {
             return None;
         }
-        let highest = bottom.iter().map(|(_, order)| *order as usize).max()?;
-        let mut powers = vec![0.0; highest + 1];
-        bottom.iter().for_each(|&(coefficient, order)| powers[order as usize] += coefficient);
+        let degree = denominator.iter().map(|(_, order)| *order as usize).max()?;
+        let mut powers = vec![0.0; degree + 1];
+        denominator.iter().for_each(|&(coefficient, order)| powers[order as usize] += coefficient);
         let size = powers.iter().rposition(|c| *c != 0.0).filter(|&size| size > 0)?;
         let mut system = vec![0.0; size * size];
         (1..size).for_each(|i| system[(i - 1) * size + i] = 1.0);
         (0..size).for_each(|k| system[(size - 1) * size + k] = -powers[k] / powers[size]);
         let gain = filter.numerator.iter().map(|(c, _)| c).sum::<f64>() / powers[size];
-        let fastest = spectral_radius(&powers[..=size])?;
-        Some(Self { size, system, gain, fastest })
+        let fastest_pole = spectral_radius(&powers[..=size])?;
+        Some(Self { size, system, gain, fastest_pole })
     }
 
     /// True if a transient lasts beyond the first sample at the sampling interval `step` \[s\].
-    pub(super) fn lasts(&self, step: f64) -> bool {
-        self.fastest * step <= MAX_POLE_STEP_PRODUCT
+    pub(super) fn has_lasting_transient(&self, step: f64) -> bool {
+        self.fastest_pole * step <= MAX_POLE_STEP_PRODUCT
     }
 
     /// Return the states just after an impulse and after its first `count` − 1 derivatives, one row for each.
@@ -77,16 +77,16 @@ impl FilterStates {
         self.system.chunks_exact(self.size).map(|row| row.iter().zip(state).map(|(a, x)| a * x).sum()).collect()
     }
 
-    /// Return the system matrix with `more` additional states, multiplied by `step`. `links` holds (row, column, value)
-    /// of the additional elements.
-    fn extended_system(&self, more: usize, links: &[(usize, usize, f64)], step: f64) -> Vec<f64> {
-        let n = self.size + more;
-        let mut whole = vec![0.0; n * n];
+    /// Return the system matrix with `extra_states` additional states, multiplied by `step`. `elements` holds (row,
+    /// column, value) of the additional elements.
+    fn extended_system(&self, extra_states: usize, elements: &[(usize, usize, f64)], step: f64) -> Vec<f64> {
+        let n = self.size + extra_states;
+        let mut extended = vec![0.0; n * n];
         for (i, row) in self.system.chunks_exact(self.size).enumerate() {
-            row.iter().enumerate().for_each(|(j, v)| whole[i * n + j] = v * step);
+            row.iter().enumerate().for_each(|(j, v)| extended[i * n + j] = v * step);
         }
-        links.iter().for_each(|&(i, j, value)| whole[i * n + j] = value * step);
-        whole
+        elements.iter().for_each(|&(i, j, value)| extended[i * n + j] = value * step);
+        extended
     }
 
     /// Return the initial transient of a filtered signal at its samples; None if it cannot be computed.
@@ -96,35 +96,39 @@ impl FilterStates {
     /// fitted together.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
-        let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
+        let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest_pole * step);
         let row_count =
-            if self.fastest > 0.0 { row_count.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
+            if self.fastest_pole > 0.0 { row_count.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
         let count = row_count.max(SAMPLES_PER_PARAMETER * (states + 2)).min(samples.len());
         // Level and slope of the input are two additional states. The slope is constant, and the level is its integral.
         let n = self.size;
-        let whole = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
-        let unit = |at: usize| (0..n + 2).map(|i| f64::from(u8::from(i == at))).collect::<Vec<f64>>();
+        let extended = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
+        let unit_state = |at: usize| (0..n + 2).map(|i| f64::from(u8::from(i == at))).collect::<Vec<f64>>();
         let impulses = self.impulse_states(states);
-        let mut starts: Vec<Vec<f64>> = impulses.iter().map(|state| [state.as_slice(), &[0.0; 2]].concat()).collect();
-        starts.extend([unit(n), unit(n + 1)]);
-        let mut columns = free_responses(&whole, n + 2, &starts, count, 0)?;
+        let mut initial_states: Vec<Vec<f64>> =
+            impulses.iter().map(|state| [state.as_slice(), &[0.0; 2]].concat()).collect();
+        initial_states.extend([unit_state(n), unit_state(n + 1)]);
+        let mut columns = free_responses(&extended, n + 2, &initial_states, count, 0)?;
         let first = columns.remove(states.checked_sub(1)?);
         let level = samples.first()? / first.first()?;
-        let sizes: Vec<f64> = columns.iter().map(|c| norm(c)).map(|s| if s == 0.0 { 1.0 } else { s }).collect();
-        let scaled: Vec<Vec<f64>> =
-            columns.iter().zip(&sizes).map(|(c, size)| c.iter().map(|v| v / size).collect()).collect();
-        let rest: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
+        let norms: Vec<f64> = columns.iter().map(|c| norm(c)).map(|s| if s == 0.0 { 1.0 } else { s }).collect();
+        let scaled: Vec<Vec<f64>> = columns
+            .iter()
+            .zip(&norms)
+            .map(|(c, norm_of_column)| c.iter().map(|v| v / norm_of_column).collect())
+            .collect();
+        let remainder: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
         #[allow(clippy::cast_precision_loss)]
-        let rounding = f64::EPSILON * rest.len().max(scaled.len()) as f64;
-        let mut scaled_states = minimum_norm_solution(&scaled, &rest, rounding)?;
-        scaled_states.iter_mut().zip(&sizes).for_each(|(x, size)| *x /= size);
+        let rounding = f64::EPSILON * remainder.len().max(scaled.len()) as f64;
+        let mut scaled_states = minimum_norm_solution(&scaled, &remainder, rounding)?;
+        scaled_states.iter_mut().zip(&norms).for_each(|(x, norm_of_column)| *x /= norm_of_column);
         scaled_states.truncate(states - 1);
         scaled_states.push(level);
-        let mut start = vec![0.0; n];
+        let mut initial_state = vec![0.0; n];
         for (state, x) in impulses.iter().zip(&scaled_states) {
-            start.iter_mut().zip(state).for_each(|(sum, v)| *sum += v * x);
+            initial_state.iter_mut().zip(state).for_each(|(sum, v)| *sum += v * x);
         }
-        free_responses(&self.extended_system(0, &[], step), n, &[start], samples.len(), 0)
+        free_responses(&self.extended_system(0, &[], step), n, &[initial_state], samples.len(), 0)
             .map(|mut rows| rows.remove(0))
     }
 
@@ -135,14 +139,15 @@ impl FilterStates {
     /// [`Error::OutOfRange`](crate::error::Error::OutOfRange) for too many pulses.
     pub(super) fn impulse_responses(&self, states: usize, m: usize, step: f64) -> Result<Vec<Vec<f64>>> {
         check_points("m", m)?;
-        if states == 0 || !self.lasts(step) {
+        if states == 0 || !self.has_lasting_transient(step) {
             return Ok(Vec::new());
         }
         // The integral of the response is an additional state.
         let n = self.size;
-        let starts: Vec<Vec<f64>> =
+        let initial_states: Vec<Vec<f64>> =
             self.impulse_states(states).iter().map(|state| [state.as_slice(), &[0.0]].concat()).collect();
-        let integrals = free_responses(&self.extended_system(1, &[(n, 0, 1.0)], step), n + 1, &starts, m + 1, n);
+        let integrals =
+            free_responses(&self.extended_system(1, &[(n, 0, 1.0)], step), n + 1, &initial_states, m + 1, n);
         let means = |row: Vec<f64>| row.windows(2).map(|pair| (pair[1] - pair[0]) / step).collect();
         Ok(integrals.unwrap_or_default().into_iter().map(means).collect())
     }
@@ -150,11 +155,17 @@ impl FilterStates {
 
 /// Return the free response of the state with index `state` at unit time steps, one row of `count` values for each
 /// initial state; None if it overflows.
-fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, state: usize) -> Option<Vec<Vec<f64>>> {
+fn free_responses(
+    system: &[f64],
+    n: usize,
+    initial_states: &[Vec<f64>],
+    count: usize,
+    state: usize,
+) -> Option<Vec<Vec<f64>>> {
     // Multiplication by a power of the transition matrix doubles the number of known steps.
     let mut power = exponential(system, n)?;
-    let rows = starts.len();
-    let mut responses: Vec<f64> = starts.concat();
+    let rows = initial_states.len();
+    let mut responses: Vec<f64> = initial_states.concat();
     let mut steps = 1;
     while steps < count {
         // States are rows, so that they are multiplied by the transposed transition.

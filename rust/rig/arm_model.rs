@@ -13,7 +13,7 @@
 //! current. At standstill it may have any value up to its limit. [`crate::friction::law`] computes it for one joint,
 //! and an iteration couples the two joints.
 
-use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
+use crate::equation::{check_regular, round_order, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
 use crate::fractional::exponential_sum::{decay, Rates};
 use crate::friction::law::{pulse, Phase};
@@ -23,7 +23,7 @@ use crate::linalg::small;
 /// trapezoidal steps.
 const MEMORY_TOLERANCE: f64 = 1e-10;
 /// Maximum number of iterations for the friction of both joints. Decoupled joints need one, coupled joints a few.
-const FRICTION_SWEEPS: usize = 60;
+const MAX_FRICTION_SWEEPS: usize = 60;
 /// Rounding error of a rate, relative to the largest change of the rate due to friction.
 const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
@@ -53,9 +53,9 @@ struct Operator {
     momentum: [f64; 4],
     /// Weights of the history states; empty for orders 0 and 1.
     weights: Vec<f64>,
-    /// Weight of the rate at the start of the substep. `now` is the weight of the rate at its end.
-    before: f64,
-    now: f64,
+    /// Weight of the rate at the start of the substep. `end_weight` is the weight of the rate at its end.
+    start_weight: f64,
+    end_weight: f64,
     /// Value of the derivative at the start of the substep.
     value: f64,
 }
@@ -71,15 +71,15 @@ pub struct Arm {
     coulomb: [f64; 2],
     /// Matrix (P − h/2·C)⁻¹ for a substep h. P and C hold the momenta and the forces per unit of rate at the end of the
     /// substep.
-    solve: [[f64; 4]; 4],
-    implicit: [[f64; 4]; 4],
+    step_inverse: [[f64; 4]; 4],
+    rate_forces: [[f64; 4]; 4],
     decay_factors: Vec<f64>,
-    first: Vec<f64>,
-    last: Vec<f64>,
-    past: [Vec<f64>; 4],
+    first_weights: Vec<f64>,
+    last_weights: Vec<f64>,
+    history: [Vec<f64>; 4],
     rate: [f64; 4],
     angle: [f64; 4],
-    linear: [f64; 4],
+    force: [f64; 4],
     friction: [f64; 2],
 }
 
@@ -95,21 +95,21 @@ impl Arm {
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
-        let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+        let out_of_range = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
             value,
             range: range.into(),
             remedy: "correct the times of the virtual arm".into(),
         };
         if horizon.is_nan() {
-            return Err(outside("horizon", horizon, "[0, ∞) s"));
+            return Err(out_of_range("horizon", horizon, "[0, ∞) s"));
         }
-        let parts = (step / longest_substep - 1e-9).ceil().max(1.0);
-        if parts > MAX_SUBSTEPS {
-            return Err(outside("substeps per sample", parts, &format!("[1, {MAX_SUBSTEPS}]")));
+        let substep_count = (step / longest_substep - 1e-9).ceil().max(1.0);
+        if substep_count > MAX_SUBSTEPS {
+            return Err(out_of_range("substeps per sample", substep_count, &format!("[1, {MAX_SUBSTEPS}]")));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-        let substeps = parts as usize;
+        let substeps = substep_count as usize;
         #[allow(clippy::cast_precision_loss)]
         let h = step / substeps as f64;
         let (mut operators, input) = accelerations(parameters)?;
@@ -117,20 +117,20 @@ impl Arm {
         for operator in &mut operators {
             operator.prepare(h, &rates);
         }
-        let (mut implicit, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
+        let (mut rate_forces, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
         for operator in &operators {
-            for (row, c) in implicit.iter_mut().zip(operator.force) {
-                row[operator.signal] += c * operator.now;
+            for (row, c) in rate_forces.iter_mut().zip(operator.force) {
+                row[operator.signal] += c * operator.end_weight;
             }
             for (row, c) in momenta.iter_mut().zip(operator.momentum) {
-                row[operator.signal] += c * operator.now;
+                row[operator.signal] += c * operator.end_weight;
             }
         }
-        let matrix: Vec<f64> = (0..16).map(|i| momenta[i / 4][i % 4] - h / 2.0 * implicit[i / 4][i % 4]).collect();
-        let inverse = small::inverse(&matrix, 4).map_err(|_| singular())?;
-        let mut solve = [[0.0; 4]; 4];
+        let matrix: Vec<f64> = (0..16).map(|i| momenta[i / 4][i % 4] - h / 2.0 * rate_forces[i / 4][i % 4]).collect();
+        let inverse = small::inverse(&matrix, 4).map_err(|_| singular_matrix_error())?;
+        let mut step_inverse = [[0.0; 4]; 4];
         for (i, value) in inverse.iter().enumerate() {
-            solve[i / 4][i % 4] = *value;
+            step_inverse[i / 4][i % 4] = *value;
         }
         let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
         let count = steps.len();
@@ -143,18 +143,18 @@ impl Arm {
             operators,
             input,
             coulomb: parameters.coulomb,
-            solve,
-            implicit,
+            step_inverse,
+            rate_forces,
             decay_factors: steps.iter().map(|s| s.0).collect(),
-            first: steps.iter().map(|s| h * s.1).collect(),
-            last: steps.iter().map(|s| h * s.2).collect(),
-            past: has_history.map(|any| vec![0.0; if any { count } else { 0 }]),
+            first_weights: steps.iter().map(|s| h * s.1).collect(),
+            last_weights: steps.iter().map(|s| h * s.2).collect(),
+            history: has_history.map(|any| vec![0.0; if any { count } else { 0 }]),
             rate: [0.0; 4],
             angle: [0.0; 4],
-            linear: [0.0; 4],
+            force: [0.0; 4],
             friction: [0.0; 2],
         };
-        let columns = arm.columns();
+        let columns = arm.rate_changes();
         for (k, column) in columns.iter().enumerate() {
             if arm.coulomb[k] > 0.0 && !(column[2 * k] > 0.0 && column[2 * k].is_finite()) {
                 return Err(Error::Structure {
@@ -184,7 +184,7 @@ impl Arm {
     /// Total number of history states of all angles.
     #[must_use]
     pub fn memory(&self) -> usize {
-        self.past.iter().map(Vec::len).sum()
+        self.history.iter().map(Vec::len).sum()
     }
 
     /// Advance by one sample with constant motor currents \[A\]. The computing time does not grow with the elapsed
@@ -197,18 +197,18 @@ impl Arm {
 
     fn substep(&mut self, current: [f64; 2]) {
         let h = self.substep;
-        let (mut history, mut gained) = ([0.0; 4], [0.0; 4]);
+        let (mut history_forces, mut momentum) = ([0.0; 4], [0.0; 4]);
         for operator in &mut self.operators {
             let s = operator.signal;
-            let mut value = operator.before * self.rate[s];
+            let mut value = operator.start_weight * self.rate[s];
             if operator.order == 0.0 {
                 value += self.angle[s];
             }
-            value += operator.weights.iter().zip(&self.past[s]).map(|(w, z)| w * z).sum::<f64>();
-            for (sum, c) in history.iter_mut().zip(operator.force) {
+            value += operator.weights.iter().zip(&self.history[s]).map(|(w, z)| w * z).sum::<f64>();
+            for (sum, c) in history_forces.iter_mut().zip(operator.force) {
                 *sum += c * value;
             }
-            for (sum, c) in gained.iter_mut().zip(operator.momentum) {
+            for (sum, c) in momentum.iter_mut().zip(operator.momentum) {
                 *sum += c * (operator.value - value);
             }
             // The contribution of the rate at the end of the substep is added below.
@@ -216,54 +216,55 @@ impl Arm {
         }
         let mut right = [0.0; 4];
         for (i, value) in right.iter_mut().enumerate() {
-            let driven: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
-            *value = gained[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
+            let input_force: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
+            *value = momentum[i] + h / 2.0 * (self.force[i] + history_forces[i]) + h * input_force;
         }
-        let mut rate = times(&self.solve, &right);
+        let mut rate = times(&self.step_inverse, &right);
         if self.coulomb != [0.0; 2] {
             self.apply_friction(&mut rate);
         }
         for operator in &mut self.operators {
-            operator.value += operator.now * rate[operator.signal];
+            operator.value += operator.end_weight * rate[operator.signal];
         }
-        let implicit = times(&self.implicit, &rate);
+        let rate_force = times(&self.rate_forces, &rate);
         for i in 0..4 {
-            self.linear[i] = history[i] + implicit[i];
+            self.force[i] = history_forces[i] + rate_force[i];
             self.angle[i] += h / 2.0 * (self.rate[i] + rate[i]);
             let (before, after) = (self.rate[i], rate[i]);
-            for (((z, decay_factors), first), last) in
-                self.past[i].iter_mut().zip(&self.decay_factors).zip(&self.first).zip(&self.last)
+            for (((z, decay_factor), first_weight), last_weight) in
+                self.history[i].iter_mut().zip(&self.decay_factors).zip(&self.first_weights).zip(&self.last_weights)
             {
-                *z = *z * decay_factors + first * before + last * after;
+                *z = *z * decay_factor + first_weight * before + last_weight * after;
             }
         }
         self.rate = rate;
     }
 
     /// Return the change of the rates at the end of a substep per ampere of each motor: four rates for each motor.
-    fn columns(&self) -> [[f64; 4]; 2] {
+    fn rate_changes(&self) -> [[f64; 4]; 2] {
         let h = self.substep;
-        std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
+        std::array::from_fn(|k| times(&self.step_inverse, &std::array::from_fn(|i| h * self.input[i][k])))
     }
 
     /// Subtract Coulomb friction from the rates at the end of a substep. Iterate over the friction laws of both joints
     /// until they converge.
     fn apply_friction(&mut self, rate: &mut [f64; 4]) {
-        let columns = self.columns();
-        let free = *rate;
+        let columns = self.rate_changes();
+        let frictionless = *rate;
         let mut friction = self.friction;
-        let mut rests = [false; 2];
-        for _ in 0..FRICTION_SWEEPS {
+        let mut is_resting = [false; 2];
+        for _ in 0..MAX_FRICTION_SWEEPS {
             let mut change = 0.0_f64;
             for k in (0..2).filter(|&k| self.coulomb[k] > 0.0) {
                 let (hub, other) = (2 * k, 1 - k);
-                let without = free[hub] - columns[other][hub] * friction[other];
-                let most = columns[k][hub] * self.coulomb[k];
-                let (sign, _, phase) = pulse(self.rate[hub], without, most, RATE_ROUNDING_RATIO * most);
+                let coupled_rate = frictionless[hub] - columns[other][hub] * friction[other];
+                let max_change = columns[k][hub] * self.coulomb[k];
+                let (sign, _, phase) =
+                    pulse(self.rate[hub], coupled_rate, max_change, RATE_ROUNDING_RATIO * max_change);
                 let next = self.coulomb[k] * sign;
                 change = change.max((next - friction[k]).abs());
                 friction[k] = next;
-                rests[k] = phase == Phase::Stick;
+                is_resting[k] = phase == Phase::Stick;
             }
             if change < 1e-15 {
                 break;
@@ -271,11 +272,11 @@ impl Arm {
         }
         self.friction = friction;
         for i in 0..4 {
-            rate[i] = free[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
+            rate[i] = frictionless[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
         }
         for k in 0..2 {
             // A joint at rest has a rate of exactly 0, so its encoder does not count.
-            if rests[k] {
+            if is_resting[k] {
                 rate[2 * k] = 0.0;
             }
         }
@@ -289,34 +290,34 @@ fn times(matrix: &[[f64; 4]; 4], vector: &[f64; 4]) -> [f64; 4] {
 impl Operator {
     fn prepare(&mut self, h: f64, rates: &Rates) {
         if self.order == 0.0 {
-            (self.before, self.now) = (h / 2.0, h / 2.0);
+            (self.start_weight, self.end_weight) = (h / 2.0, h / 2.0);
         } else if self.order == 1.0 {
-            (self.before, self.now) = (0.0, 1.0);
+            (self.start_weight, self.end_weight) = (0.0, 1.0);
         } else if self.order < 1.0 {
             // Exact integral I^q of a rate that is linear over the last substep. The exponentials represent the history
             // before it.
             let q = 1.0 - self.order;
             let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
-            (self.before, self.now) = (q * scale, scale);
-            self.weights = past_weights(rates, q, h);
+            (self.start_weight, self.end_weight) = (q * scale, scale);
+            self.weights = history_weights(rates, q, h);
         } else {
             let q = 2.0 - self.order;
             let scale = libm::pow(h, q - 1.0) / libm::tgamma(q + 1.0);
             // ∫ e^{−s(t−τ)} θ″ dτ = θ′(t) − s z(t).
-            let weights = past_weights(rates, q, h);
-            self.before = weights.iter().sum::<f64>() - scale;
-            self.now = scale;
+            let weights = history_weights(rates, q, h);
+            self.start_weight = weights.iter().sum::<f64>() - scale;
+            self.end_weight = scale;
             self.weights = weights.iter().zip(rates.rates()).map(|(w, s)| -w * s).collect();
         }
     }
 }
 
 /// Return the weights of the exponentials in the kernel of order `q` for lags longer than one substep `h`.
-fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
+fn history_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
 
-fn singular() -> Error {
+fn singular_matrix_error() -> Error {
     Error::Structure {
         what: "the equations of the arm cannot be solved for its angles: their leading matrix is singular".into(),
         remedy: "change an order, or a coupling inertia of the links".into(),
@@ -327,14 +328,14 @@ fn singular() -> Error {
 /// currents in each equation.
 fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
     check_length("equations of the arm", 4, parameters.equations.len())?;
-    let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+    let out_of_range = |name: &str, value: f64, range: &str| Error::OutOfRange {
         name: name.into(),
         value,
         range: range.into(),
         remedy: "correct the arm's parameters".into(),
     };
     if let Some(&value) = parameters.coulomb.iter().find(|c| !(**c >= 0.0 && c.is_finite())) {
-        return Err(outside("Coulomb friction", value, "[0, ∞) A"));
+        return Err(out_of_range("Coulomb friction", value, "[0, ∞) A"));
     }
     let mut operators: Vec<Operator> = Vec::new();
     let mut input = [[0.0; 2]; 4];
@@ -348,7 +349,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         }
         let alpha = structure.order;
         if !(alpha > 1.0 && alpha <= 2.0) {
-            return Err(outside("highest order of the arm", alpha, "(1, 2]"));
+            return Err(out_of_range("highest order of the arm", alpha, "(1, 2]"));
         }
         // Terms of the left-hand side have a negative sign on the right-hand side.
         let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
@@ -372,26 +373,26 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
             // From order 3 on, the momentum would have a derivative of order 2 or more, which trapezoidal steps do not
             // support.
             if !(0.0..3.0).contains(&order) {
-                return Err(outside("order of the arm", order, "[0, 3)"));
+                return Err(out_of_range("order of the arm", order, "[0, 3)"));
             }
             if c == 0.0 {
                 continue;
             }
-            let momentum = order > 1.0;
-            let order = tidy(if momentum { order - 1.0 } else { order });
+            let is_momentum = order > 1.0;
+            let order = round_order(if is_momentum { order - 1.0 } else { order });
             #[allow(clippy::float_cmp)]
             let position = operators.iter().position(|o| o.signal == signal && o.order == order);
-            let at = position.unwrap_or_else(|| {
+            let index = position.unwrap_or_else(|| {
                 operators.push(Operator { signal, order, ..Operator::default() });
                 operators.len() - 1
             });
-            if momentum {
-                operators[at].momentum[row] -= c;
+            if is_momentum {
+                operators[index].momentum[row] -= c;
             } else {
-                operators[at].force[row] += c;
+                operators[index].force[row] += c;
             }
         }
     }
-    check_regular(&parameters.equations).map_err(|_| singular())?;
+    check_regular(&parameters.equations).map_err(|_| singular_matrix_error())?;
     Ok((operators, input))
 }

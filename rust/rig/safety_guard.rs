@@ -197,16 +197,16 @@ pub enum Fault {
 pub struct Guard {
     settings: GuardSettings,
     fault: Option<Fault>,
-    rest: usize,
+    rest_count: usize,
     sums: [f64; 2],
     bias: [f64; 2],
     encoder_zero: [i32; 2],
-    previous: Option<[i32; 2]>,
+    previous_counts: Option<[i32; 2]>,
     unchanged_time: [f64; 2],
     gauges: [Gauge; 2],
     last_current: [f64; 2],
     mean_square_current: [f64; 2],
-    missed: u32,
+    consecutive_missed: u32,
     missed_deadline_count: u64,
     filters: Option<[Filter; 2]>,
 }
@@ -250,16 +250,16 @@ impl Guard {
         Ok(Self {
             settings,
             fault: None,
-            rest: 0,
+            rest_count: 0,
             sums: [0.0; 2],
             bias: [0.0; 2],
             encoder_zero: [0; 2],
-            previous: None,
+            previous_counts: None,
             unchanged_time: [0.0; 2],
             gauges: [Gauge::default(); 2],
             last_current: [0.0; 2],
             mean_square_current: [0.0; 2],
-            missed: 0,
+            consecutive_missed: 0,
             missed_deadline_count: 0,
             filters,
         })
@@ -298,44 +298,51 @@ impl Guard {
     /// encoder zero is the last count.
     pub fn rest(&mut self, reading: &Reading) {
         self.check(reading);
-        self.rest += 1;
+        self.rest_count += 1;
         #[allow(clippy::cast_precision_loss)]
-        let count = self.rest as f64;
+        let count = self.rest_count as f64;
         for j in 0..2 {
             self.sums[j] += reading.analog[j];
             self.bias[j] = self.sums[j] / count;
         }
         self.encoder_zero = reading.counts;
-        self.previous = Some(reading.counts);
+        self.previous_counts = Some(reading.counts);
     }
 
     /// Check a reading and convert it to hub angle and deflection of joint 1, then of joint 2 (θ₁₁, θ₁₂, θ₂₁, θ₂₂
-    /// \[rad\]), and both motor currents \[A\]. `late` \[s\] is the time from the deadline to this reading. A violated
+    /// \[rad\]), and both motor currents \[A\]. `delay` \[s\] is the time from the deadline to this reading. A violated
     /// limit latches a fault.
-    pub fn read(&mut self, reading: &Reading, late: f64) -> [f64; 6] {
+    pub fn read(&mut self, reading: &Reading, delay: f64) -> [f64; 6] {
         self.check(reading);
-        let mut hubs = [0.0; 2];
-        let mut bends = [0.0; 2];
+        let mut hub_angles = [0.0; 2];
+        let mut deflections = [0.0; 2];
         for j in 0..2 {
             let s = &self.settings;
-            hubs[j] = f64::from(reading.counts[j].wrapping_sub(self.encoder_zero[j])) * s.encoder_scale[j];
-            bends[j] = -(reading.analog[j] - self.bias[j]) * s.strain_scale[j];
-            if bends[j].abs() > s.deflection_limit[j] {
-                let (degrees, limit) = (bends[j].to_degrees(), s.deflection_limit[j].to_degrees());
+            hub_angles[j] = f64::from(reading.counts[j].wrapping_sub(self.encoder_zero[j])) * s.encoder_scale[j];
+            deflections[j] = -(reading.analog[j] - self.bias[j]) * s.strain_scale[j];
+            if deflections[j].abs() > s.deflection_limit[j] {
+                let (degrees, limit) = (deflections[j].to_degrees(), s.deflection_limit[j].to_degrees());
                 self.fail(Fault::Deflection { joint: j + 1, degrees, limit });
             }
             self.check_encoder(j, reading.counts[j]);
             self.check_gauge(j, reading.analog[j]);
         }
-        self.previous = Some(reading.counts);
-        self.check_deadline(late);
+        self.previous_counts = Some(reading.counts);
+        self.check_deadline(delay);
         if let Some(filters) = &mut self.filters {
-            for (filter, bend) in filters.iter_mut().zip(&mut bends) {
-                *bend = filter.step(*bend);
+            for (filter, deflection) in filters.iter_mut().zip(&mut deflections) {
+                *deflection = filter.step(*deflection);
             }
         }
         let scale = self.settings.sense_scale;
-        [hubs[0], bends[0], hubs[1], bends[1], -reading.analog[2] * scale, -reading.analog[3] * scale]
+        [
+            hub_angles[0],
+            deflections[0],
+            hub_angles[1],
+            deflections[1],
+            -reading.analog[2] * scale,
+            -reading.analog[3] * scale,
+        ]
     }
 
     /// Convert commanded currents \[A\] to voltages of both motors \[V\] within all limits. Every command passes
@@ -353,19 +360,20 @@ impl Guard {
             return [0.0; 2];
         }
         let s = &self.settings;
-        let share = (s.step / s.thermal_time).min(1.0);
+        let averaging_weight = (s.step / s.thermal_time).min(1.0);
         let mut volts = [0.0; 2];
         for j in 0..2 {
             let change = s.slew[j] * s.step;
-            let slewed = current[j]
+            let limited = current[j]
                 .clamp(-s.current_limit[j], s.current_limit[j])
                 .clamp(self.last_current[j] - change, self.last_current[j] + change);
             // Largest current that keeps the mean square within the continuous limit.
-            let room =
-                self.mean_square_current[j] + (s.continuous[j] * s.continuous[j] - self.mean_square_current[j]) / share;
-            let bearable = room.max(0.0).sqrt().min(s.current_limit[j]);
-            let last_current = slewed.clamp(-bearable, bearable);
-            self.mean_square_current[j] += share * (last_current * last_current - self.mean_square_current[j]);
+            let max_square = self.mean_square_current[j]
+                + (s.continuous[j] * s.continuous[j] - self.mean_square_current[j]) / averaging_weight;
+            let continuous_limit = max_square.max(0.0).sqrt().min(s.current_limit[j]);
+            let last_current = limited.clamp(-continuous_limit, continuous_limit);
+            self.mean_square_current[j] +=
+                averaging_weight * (last_current * last_current - self.mean_square_current[j]);
             self.last_current[j] = last_current;
             volts[j] = 0.0 - last_current / s.command_scale;
         }
@@ -391,7 +399,7 @@ impl Guard {
     }
 
     fn check_encoder(&mut self, j: usize, counts: i32) {
-        let Some(previous) = self.previous else { return };
+        let Some(previous) = self.previous_counts else { return };
         let change = i64::from(counts) - i64::from(previous[j]);
         let s = &self.settings;
         #[allow(clippy::cast_precision_loss)]
@@ -427,18 +435,18 @@ impl Guard {
         }
     }
 
-    fn check_deadline(&mut self, late: f64) {
+    fn check_deadline(&mut self, delay: f64) {
         let s = &self.settings;
-        if late > s.step {
-            self.missed += 1;
+        if delay > s.step {
+            self.consecutive_missed += 1;
             self.missed_deadline_count += 1;
         } else {
-            self.missed = 0;
+            self.consecutive_missed = 0;
         }
-        if late.is_nan() || late > s.late_limit {
-            self.fail(Fault::Late { milliseconds: 1e3 * late, limit: 1e3 * self.settings.late_limit });
-        } else if self.missed > s.missed_limit {
-            self.fail(Fault::Missed { count: self.missed });
+        if delay.is_nan() || delay > s.late_limit {
+            self.fail(Fault::Late { milliseconds: 1e3 * delay, limit: 1e3 * self.settings.late_limit });
+        } else if self.consecutive_missed > s.missed_limit {
+            self.fail(Fault::Missed { count: self.consecutive_missed });
         }
     }
 }
@@ -457,7 +465,7 @@ struct Gauge {
 struct Filter {
     input: [f64; 3],
     output: [f64; 2],
-    past: [f64; 2],
+    state: [f64; 2],
 }
 
 impl Filter {
@@ -467,14 +475,14 @@ impl Filter {
         Self {
             input: [k * k / a, 2.0 * k * k / a, k * k / a],
             output: [2.0 * (k * k - 1.0) / a, (1.0 - 2.0 * damping * k + k * k) / a],
-            past: [0.0; 2],
+            state: [0.0; 2],
         }
     }
 
     fn step(&mut self, x: f64) -> f64 {
-        let y = self.input[0] * x + self.past[0];
-        self.past[0] = self.input[1] * x - self.output[0] * y + self.past[1];
-        self.past[1] = self.input[2] * x - self.output[1] * y;
+        let y = self.input[0] * x + self.state[0];
+        self.state[0] = self.input[1] * x - self.output[0] * y + self.state[1];
+        self.state[1] = self.input[2] * x - self.output[1] * y;
         y
     }
 }

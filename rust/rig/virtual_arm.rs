@@ -99,7 +99,7 @@ pub struct Plant {
     pub arm: Arm,
     sensors: Sensors,
     current: [f64; 2],
-    frozen: [Option<i32>; 2],
+    frozen_counts: [Option<i32>; 2],
     injections: Vec<Injection>,
     sample: u64,
 }
@@ -111,7 +111,7 @@ impl Plant {
     /// The errors of [`Sensors::check`], for a value of the sensors out of range.
     pub fn new(arm: Arm, sensors: Sensors) -> Result<Self> {
         sensors.check()?;
-        Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
+        Ok(Self { arm, sensors, current: [0.0; 2], frozen_counts: [None; 2], injections: Vec::new(), sample: 0 })
     }
 
     /// Add a fault injection.
@@ -120,18 +120,20 @@ impl Plant {
     /// [`Error::OutOfRange`] for the index of a joint or a line that does not exist. [`Error::NotFinite`] for an angle
     /// or a delay that is not finite.
     pub fn inject(&mut self, injection: Injection) -> Result<()> {
-        let place = |name: &str, index: usize, count: usize| {
+        let check_index = |name: &str, index: usize, count: usize| {
             if index < count {
                 return Ok(());
             }
             #[allow(clippy::cast_precision_loss)]
-            Err(outside(name, index as f64, &format!("[0, {count})")))
+            Err(out_of_range(name, index as f64, &format!("[0, {count})")))
         };
         match injection {
-            Injection::DeadEncoder { joint, .. } | Injection::SaturatedGauge { joint, .. } => place("joint", joint, 2)?,
-            Injection::LimitSwitch { line, .. } => place("line", line, 4)?,
+            Injection::DeadEncoder { joint, .. } | Injection::SaturatedGauge { joint, .. } => {
+                check_index("joint", joint, 2)?
+            }
+            Injection::LimitSwitch { line, .. } => check_index("line", line, 4)?,
             Injection::Deflection { joint, angle, .. } => {
-                place("joint", joint, 2)?;
+                check_index("joint", joint, 2)?;
                 check_finite("injected deflection", &[angle])?;
             }
             Injection::Late { seconds, .. } => check_finite("injected delay", &[seconds])?,
@@ -152,21 +154,21 @@ impl Plant {
     pub fn read(&mut self, noise: [f64; 4]) -> Reading {
         let s = &self.sensors;
         let angles = self.arm.angles();
-        let mut bend = [angles[1], angles[3]];
+        let mut deflections = [angles[1], angles[3]];
         let mut analog = [0.0; 4];
         let mut switches = [1_i8; 4];
-        let mut rail = [false; 2];
+        let mut is_saturated = [false; 2];
         for injection in &self.injections {
             match *injection {
-                Injection::SaturatedGauge { joint, from } => rail[joint] |= self.sample >= from,
+                Injection::SaturatedGauge { joint, from } => is_saturated[joint] |= self.sample >= from,
                 Injection::LimitSwitch { line, from } if self.sample >= from => switches[line] = 0,
-                Injection::Deflection { joint, from, angle } if self.sample >= from => bend[joint] += angle,
+                Injection::Deflection { joint, from, angle } if self.sample >= from => deflections[joint] += angle,
                 _ => {}
             }
         }
         for j in 0..2 {
-            let strain = s.strain_bias[j] - bend[j] / s.strain_scale[j] + s.noise[j] * noise[j];
-            analog[j] = s.convert(if rail[j] { s.range } else { strain });
+            let strain = s.strain_bias[j] - deflections[j] / s.strain_scale[j] + s.noise[j] * noise[j];
+            analog[j] = s.convert(if is_saturated[j] { s.range } else { strain });
             let sense = s.sense_bias[j] - self.current[j] / s.sense_scale + s.noise[2 + j] * noise[2 + j];
             analog[2 + j] = s.convert(sense);
             for (line, excess) in [(2 * j, -angles[2 * j]), (2 * j + 1, angles[2 * j])] {
@@ -182,7 +184,7 @@ impl Plant {
             if let Injection::DeadEncoder { joint, from } = *injection
                 && self.sample >= from
             {
-                counts[joint] = *self.frozen[joint].get_or_insert(counts[joint]);
+                counts[joint] = *self.frozen_counts[joint].get_or_insert(counts[joint]);
             }
         }
         Reading { analog, counts, switches }
@@ -190,7 +192,7 @@ impl Plant {
 
     /// True if the board delivers samples.
     #[must_use]
-    pub fn sampling(&self) -> bool {
+    pub fn is_sampling(&self) -> bool {
         !self.injections.iter().any(|i| matches!(i, Injection::LostSamples { from } if self.sample >= *from))
     }
 
@@ -218,7 +220,7 @@ impl Plant {
 }
 
 /// Return the error for a parameter of the virtual arm that is out of range.
-fn outside(name: &str, value: f64, range: &str) -> Error {
+fn out_of_range(name: &str, value: f64, range: &str) -> Error {
     Error::OutOfRange {
         name: name.into(),
         value,
@@ -247,17 +249,17 @@ impl Sensors {
         let single = [("sense_scale", self.sense_scale), ("command_scale", self.command_scale), ("range", self.range)];
         for (name, value) in pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single) {
             if !(value > 0.0 && value.is_finite()) {
-                return Err(outside(name, value, "(0, ∞)"));
+                return Err(out_of_range(name, value, "(0, ∞)"));
             }
         }
         if let Some(&noise) = self.noise.iter().find(|v| !(**v >= 0.0 && v.is_finite())) {
-            return Err(outside("noise", noise, "[0, ∞) V"));
+            return Err(out_of_range("noise", noise, "[0, ∞) V"));
         }
         check_finite("strain_bias", &self.strain_bias)?;
         check_finite("sense_bias", &self.sense_bias)?;
         check_finite("current offset", &self.offset)?;
         if self.bits > MAX_BITS {
-            return Err(outside("bits", f64::from(self.bits), &format!("[0, {MAX_BITS}]")));
+            return Err(out_of_range("bits", f64::from(self.bits), &format!("[0, {MAX_BITS}]")));
         }
         Ok(())
     }
@@ -289,7 +291,7 @@ pub struct Pace {
 const SPIN_WAIT: Duration = Duration::from_micros(120);
 
 /// Maximum sampling interval in real time \[s\]: one day, so that times do not overflow.
-const LONGEST_STEP: f64 = 86_400.0;
+const MAX_REAL_TIME_STEP_S: f64 = 86_400.0;
 
 impl Pace {
     /// Timer that starts now, with a deadline every `step` \[s\]. The first deadline is the start.
@@ -298,8 +300,8 @@ impl Pace {
     /// [`Error::OutOfRange`] for a step that is not positive or longer than a day.
     pub fn new(step: f64) -> Result<Self> {
         check_step(step)?;
-        if step > LONGEST_STEP {
-            return Err(outside("step", step, "(0, 86400] s"));
+        if step > MAX_REAL_TIME_STEP_S {
+            return Err(out_of_range("step", step, "(0, 86400] s"));
         }
         Ok(Self { start: Instant::now(), step, samples: 0 })
     }
@@ -307,15 +309,15 @@ impl Pace {
     /// Wait for the next deadline. Return the time by which it was missed \[s\].
     pub fn wait(&mut self) -> f64 {
         #[allow(clippy::cast_precision_loss)]
-        let due = Duration::try_from_secs_f64(self.step * self.samples as f64)
+        let deadline = Duration::try_from_secs_f64(self.step * self.samples as f64)
             .ok()
-            .and_then(|since| self.start.checked_add(since))
+            .and_then(|elapsed| self.start.checked_add(elapsed))
             .unwrap_or(self.start);
         self.samples += 1;
         loop {
             let now = Instant::now();
-            match due.checked_duration_since(now) {
-                None => return now.duration_since(due).as_secs_f64(),
+            match deadline.checked_duration_since(now) {
+                None => return now.duration_since(deadline).as_secs_f64(),
                 Some(remaining) if remaining > SPIN_WAIT => std::thread::sleep(remaining - SPIN_WAIT),
                 Some(_) => std::hint::spin_loop(),
             }

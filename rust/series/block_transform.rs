@@ -26,17 +26,17 @@ struct Factors {
     shift: Square,
     /// Conjugates of `shift` divided by 64.
     inverse_shift: Square,
-    /// Twiddle factors e^{2πi jk/64} between the two passes.
-    between: Square,
+    /// Twiddle factors e^{2πi jk/64} twiddles the two passes.
+    twiddles: Square,
 }
 
 impl Factors {
     #[allow(clippy::cast_precision_loss)]
     fn new() -> Self {
-        let square = |scale: f64, turns: &dyn Fn(usize, usize) -> f64| -> Square {
+        let square = |scale: f64, angle: &dyn Fn(usize, usize) -> f64| -> Square {
             from_fn(|row| {
-                let part = |f: fn(f64) -> f64| from_fn(|lane| scale * f(2.0 * PI * turns(row, lane)));
-                [part(f64::cos), part(f64::sin)]
+                let tile = |f: fn(f64) -> f64| from_fn(|lane| scale * f(2.0 * PI * angle(row, lane)));
+                [tile(f64::cos), tile(f64::sin)]
             })
         };
         let terms = BLOCK_TERMS as f64;
@@ -44,7 +44,7 @@ impl Factors {
         Self {
             shift: square(1.0, &shift),
             inverse_shift: square(1.0 / terms, &|row, lane| -shift(row, lane)),
-            between: square(1.0, &|row, lane| (row * lane) as f64 / terms),
+            twiddles: square(1.0, &|row, lane| (row * lane) as f64 / terms),
         }
     }
 }
@@ -84,7 +84,7 @@ fn sum_rows<const RE: usize, const IM: usize>(x: &mut Square) {
 /// Multiply the elements by factors, or by their conjugates if `sign` is −1. Return the result with rows and lanes
 /// transposed.
 #[inline(always)]
-fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
+fn multiply_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     for row in 0..LANE_COUNT {
         for l in 0..LANE_COUNT {
             let (re, im) = (factors[row][0][l], sign * factors[row][1][l]);
@@ -124,7 +124,7 @@ impl simd::SimdKernel for ForwardTransform<'_> {
             }
         }
         sum_rows::<0, 1>(&mut x);
-        let mut y = turn_and_transpose(&mut x, &factors.between, 1.0);
+        let mut y = multiply_and_transpose(&mut x, &factors.twiddles, 1.0);
         sum_rows::<0, 1>(&mut y);
         y
     }
@@ -158,7 +158,7 @@ impl simd::SimdKernel for InverseTransform<'_> {
         let Self { factors, tiles } = self;
         let mut x: Square = from_fn(|row| tiles[row]);
         sum_rows::<1, 0>(&mut x);
-        let mut y = turn_and_transpose(&mut x, &factors.between, -1.0);
+        let mut y = multiply_and_transpose(&mut x, &factors.twiddles, -1.0);
         sum_rows::<1, 0>(&mut y);
         let shift = &factors.inverse_shift;
         from_fn(|j| {

@@ -24,20 +24,20 @@ const TILE_TERMS: usize = 8;
 /// Subtract a product from the remaining terms: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`.
 #[inline(always)]
 fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
-    let mut at = TILE_TERMS;
+    let mut offset = TILE_TERMS;
     let mut pairs = remainder.chunks_exact_mut(2 * TILE_TERMS);
     for pair in &mut pairs {
-        subtract_tile_product::<{ 2 * TILE_TERMS }>(pair, &series[at - TILE_TERMS..], solved);
-        at += 2 * TILE_TERMS;
+        subtract_tile_product::<{ 2 * TILE_TERMS }>(pair, &series[offset - TILE_TERMS..], solved);
+        offset += 2 * TILE_TERMS;
     }
     let mut tiles = pairs.into_remainder().chunks_exact_mut(TILE_TERMS);
     for tile in &mut tiles {
-        subtract_tile_product::<TILE_TERMS>(tile, &series[at - TILE_TERMS..], solved);
-        at += TILE_TERMS;
+        subtract_tile_product::<TILE_TERMS>(tile, &series[offset - TILE_TERMS..], solved);
+        offset += TILE_TERMS;
     }
     let rest = tiles.into_remainder();
     for (s, &y) in solved.iter().enumerate() {
-        for (term, &v) in rest.iter_mut().zip(&series[at - s..]) {
+        for (term, &v) in rest.iter_mut().zip(&series[offset - s..]) {
             *term -= v * y;
         }
     }
@@ -74,8 +74,8 @@ impl simd::SimdKernel for Substitution<'_> {
     #[inline(always)]
     fn run(self) {
         let mut head = [0.0; TILE_TERMS];
-        let known = self.divisor.len().min(TILE_TERMS);
-        head[..known].copy_from_slice(&self.divisor[..known]);
+        let count = self.divisor.len().min(TILE_TERMS);
+        head[..count].copy_from_slice(&self.divisor[..count]);
         head.iter_mut().for_each(|v| *v *= self.inverse);
         let mut remainder = self.block;
         while remainder.len() >= TILE_TERMS {
@@ -97,8 +97,8 @@ impl simd::SimdKernel for Substitution<'_> {
         for k in 0..remainder.len() {
             remainder[k] *= self.inverse;
             let y = remainder[k];
-            for (rest, &v) in remainder[k + 1..].iter_mut().zip(&self.divisor[1..]) {
-                *rest -= v * y;
+            for (term, &v) in remainder[k + 1..].iter_mut().zip(&self.divisor[1..]) {
+                *term -= v * y;
             }
         }
     }
@@ -264,10 +264,10 @@ impl simd::SimdKernel for Contributions<'_> {
 pub struct Division {
     n: usize,
     m: usize,
-    solved: usize,
+    solved_count: usize,
     /// For each unknown: the quotient in the solved terms, then the right-hand side minus the contributions of solved
     /// blocks.
-    rest: Vec<Vec<f64>>,
+    remainders: Vec<Vec<f64>>,
     /// Spectra by block length, the shortest first.
     levels: Vec<Level>,
     buffers: LevelBuffers,
@@ -277,7 +277,14 @@ impl Division {
     /// Return the initial state of a division for n unknown series of m terms, with right-hand sides of 0.
     #[must_use]
     pub fn new(n: usize, m: usize) -> Self {
-        Self { n, m, solved: 0, rest: vec![vec![0.0; m]; n], levels: Vec::new(), buffers: LevelBuffers::default() }
+        Self {
+            n,
+            m,
+            solved_count: 0,
+            remainders: vec![vec![0.0; m]; n],
+            levels: Vec::new(),
+            buffers: LevelBuffers::default(),
+        }
     }
 
     /// Reset the division for another divisor. Memory stays allocated.
@@ -288,8 +295,8 @@ impl Division {
 
     /// Reset the right-hand sides to 0. The spectra of the divisor are kept, so the divisor must not change.
     pub fn restart(&mut self) {
-        self.solved = 0;
-        self.rest.iter_mut().for_each(|r| r.fill(0.0));
+        self.solved_count = 0;
+        self.remainders.iter_mut().for_each(|r| r.fill(0.0));
     }
 
     /// Solve all terms for complete right-hand sides. `inverse` is the row-major inverse of the matrix of leading
@@ -304,7 +311,7 @@ impl Division {
         for (i, b) in rhs.iter().enumerate() {
             self.add(i, 0, b);
         }
-        while self.solved < terms {
+        while self.solved_count < terms {
             self.advance(inverse, |i, j, len| &matrix[i][j].as_ref()[..len]);
         }
     }
@@ -312,42 +319,42 @@ impl Division {
     /// Return the number of terms that are solved in every unknown series.
     #[must_use]
     pub fn solved_terms(&self) -> usize {
-        self.solved
+        self.solved_count
     }
 
     /// Add values to the right-hand side of equation i from term `start` on. These terms must not be solved yet.
     pub fn add(&mut self, i: usize, start: usize, values: &[f64]) {
-        for (rest, &v) in self.rest[i][start..].iter_mut().zip(values) {
-            *rest += v;
+        for (term, &v) in self.remainders[i][start..].iter_mut().zip(values) {
+            *term += v;
         }
     }
 
     /// Return the solved terms of unknown series i.
     #[must_use]
     pub fn quotient(&self, i: usize) -> &[f64] {
-        &self.rest[i][..self.solved]
+        &self.remainders[i][..self.solved_count]
     }
 
     /// Return all unknown series. Terms that are not solved yet are remainders.
     pub(super) fn quotients(&self) -> &[Vec<f64>] {
-        &self.rest
+        &self.remainders
     }
 
     /// Return all unknown series, which must be solved completely.
     #[must_use]
     pub fn into_quotients(self) -> Vec<Vec<f64>> {
-        self.rest
+        self.remainders
     }
 
     /// Return the number of terms of each divisor series that the next [`Division::advance`] reads.
     #[must_use]
     pub fn required_terms(&self) -> usize {
-        let hi = (self.solved + BLOCK_TERMS).min(self.m);
+        let hi = (self.solved_count + BLOCK_TERMS).min(self.m);
         if hi == self.m {
-            return hi - self.solved;
+            return hi - self.solved_count;
         }
-        let (_, len, place) = level_at(hi);
-        ((place + 1) * len).min(self.m)
+        let (_, len, count) = level_at(hi);
+        ((count + 1) * len).min(self.m)
     }
 
     /// Return the number of terms of an unknown series.
@@ -362,33 +369,33 @@ impl Division {
     /// `len` terms of the matrix series A_ij. `len` never exceeds [`Division::required_terms`].
     pub fn advance<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         self.solve_block(inverse, &series);
-        self.join(&series);
+        self.subtract_contributions(&series);
     }
 
     /// Do the first half of [`Division::advance`]: solve the next block of the quotients by forward substitution.
     pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
-        let lo = self.solved;
+        let lo = self.solved_count;
         let hi = (lo + BLOCK_TERMS).min(self.m);
         self.substitute(inverse, &series, lo, hi);
-        self.solved = hi;
+        self.solved_count = hi;
     }
 
     /// Do the second half of [`Division::advance`]: subtract the contributions of solved blocks from later terms.
-    pub fn join<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
-        let (n, hi) = (self.n, self.solved);
+    pub fn subtract_contributions<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
+        let (n, hi) = (self.n, self.solved_count);
         if hi == self.m {
             return;
         }
-        let (level, len, place) = level_at(hi);
+        let (level, len, count) = level_at(hi);
         let end = (hi + len).min(self.m);
         while self.levels.len() <= level {
             let len = self.levels.last().map_or(BLOCK_TERMS, |level| level.len * MAX_LEVEL_BLOCKS);
             self.levels.push(Level::new(len, n, self.m));
         }
-        let Self { rest, levels, buffers, m, .. } = self;
+        let Self { remainders, levels, buffers, m, .. } = self;
         let level = &mut levels[level];
         let stride = level.capacity * n;
-        for segment in level.known_segments..place {
+        for segment in level.known_segments..count {
             for k in 0..n * n {
                 let (i, j) = (k / n, k % n);
                 let terms = ((segment + 2) * len).min(*m);
@@ -397,17 +404,17 @@ impl Division {
                 buffers.transform(&level.transform, values, &mut level.segment_spectra[at..], n * stride);
             }
         }
-        level.known_segments = level.known_segments.max(place);
-        for (j, rest) in rest.iter().enumerate() {
-            let at = (place - 1) * n + j;
-            buffers.transform(&level.transform, &rest[hi - len..hi], &mut level.blocks[at..], stride);
+        level.known_segments = level.known_segments.max(count);
+        for (j, remainder) in remainders.iter().enumerate() {
+            let at = (count - 1) * n + j;
+            buffers.transform(&level.transform, &remainder[hi - len..hi], &mut level.blocks[at..], stride);
         }
         let mut sum = std::mem::take(&mut level.sum);
-        for (i, rest) in rest.iter_mut().enumerate() {
-            simd::dispatch_simd(Contributions { n, i, count: place, level, sum: &mut sum });
+        for (i, remainder) in remainders.iter_mut().enumerate() {
+            simd::dispatch_simd(Contributions { n, i, count, level, sum: &mut sum });
             let contribution = buffers.invert(&level.transform, &sum);
-            for (rest, &v) in rest[hi..end].iter_mut().zip(contribution) {
-                *rest -= v;
+            for (term, &v) in remainder[hi..end].iter_mut().zip(contribution) {
+                *term -= v;
             }
         }
         level.sum = sum;
@@ -424,23 +431,23 @@ impl Division {
     ) {
         let n = self.n;
         if n == 1 {
-            let (divisor, block) = (series(0, 0, hi - lo), &mut self.rest[0][lo..hi]);
+            let (divisor, block) = (series(0, 0, hi - lo), &mut self.remainders[0][lo..hi]);
             simd::dispatch_simd(Substitution { divisor, inverse: inverse[0], block });
             return;
         }
         let mut values = vec![0.0; n];
         for k in lo..hi {
             for (i, value) in values.iter_mut().enumerate() {
-                *value = (0..n).map(|j| inverse[i * n + j] * self.rest[j][k]).sum();
+                *value = (0..n).map(|j| inverse[i * n + j] * self.remainders[j][k]).sum();
             }
             for (j, &y) in values.iter().enumerate() {
-                self.rest[j][k] = y;
+                self.remainders[j][k] = y;
             }
             for i in 0..n {
                 for (j, &y) in values.iter().enumerate() {
                     let a = series(i, j, hi - lo);
-                    for (rest, &v) in self.rest[i][k + 1..hi].iter_mut().zip(&a[1..]) {
-                        *rest -= v * y;
+                    for (term, &v) in self.remainders[i][k + 1..hi].iter_mut().zip(&a[1..]) {
+                        *term -= v * y;
                     }
                 }
             }
@@ -589,8 +596,8 @@ impl<'a> Solver<'a> {
         for i in 0..n {
             let mut unit = vec![vec![0.0; m]; n];
             unit[i].first_mut().into_iter().for_each(|first| *first = 1.0);
-            for (row, answer) in rows.iter_mut().zip(self.solve(&unit)?) {
-                row.push(answer);
+            for (row, solution) in rows.iter_mut().zip(self.solve(&unit)?) {
+                row.push(solution);
             }
         }
         Ok(rows)

@@ -52,8 +52,8 @@ pub fn multiply_signals(series: &[f64], signals: &mut [f64]) {
     let m = series.len();
     let Some((&first, rest)) = series.split_first() else { return };
     if rest.iter().all(|&v| v == 0.0) {
-        let whole = signals.len() / m * m;
-        signals[..whole].iter_mut().for_each(|v| *v *= first);
+        let length = signals.len() / m * m;
+        signals[..length].iter_mut().for_each(|v| *v *= first);
     } else if m <= MAX_DIRECT_TERMS {
         signals.chunks_exact_mut(m).for_each(|signal| signal.copy_from_slice(&direct(series, signal, m)));
     } else {
@@ -153,8 +153,8 @@ impl Kernel {
             *x *= k;
         }
         self.plan.inverse(spectrum, &mut buffers.time, &mut buffers.workspace);
-        let read = out.len().min(buffers.time.len());
-        out[..read].copy_from_slice(&buffers.time[..read]);
+        let length = out.len().min(buffers.time.len());
+        out[..length].copy_from_slice(&buffers.time[..length]);
     }
 
     /// Multiply by another series in the frequency domain. Both spectra must be for the same total number of terms, and

@@ -38,18 +38,18 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     for row in 1..=eta {
         let mut next = vec![0.0; row + 1];
         for (l, value) in next.iter_mut().enumerate() {
-            let same = stirling.get(l).map_or(0.0, |s| (l + 1) as f64 * s);
-            *value = same + if l > 0 { stirling[l - 1] } else { 0.0 };
+            let kept = stirling.get(l).map_or(0.0, |s| (l + 1) as f64 * s);
+            *value = kept + if l > 0 { stirling[l - 1] } else { 0.0 };
         }
         stirling = next;
     }
     let scale = (1..=eta).fold(1.0, |product, k| product * step / (k + 1) as f64);
     let mut factorial = 1.0;
     let mut weights = Vec::with_capacity(eta + 1);
-    for (l, number) in stirling.iter().enumerate() {
+    for (l, stirling_number) in stirling.iter().enumerate() {
         factorial *= (l + 1) as f64;
         let sign = if (eta - l).is_multiple_of(2) { 1.0 } else { -1.0 };
-        weights.push(scale * sign * factorial * number);
+        weights.push(scale * sign * factorial * stirling_number);
     }
     weights
 }
@@ -77,7 +77,7 @@ pub struct RunningSumSystem {
     /// Sampling interval \[s\].
     step: f64,
     /// Weight of unknown j in running sum l of equation i, at index (i·(sums + 1) + l)·n + j for n equations.
-    own: Vec<f64>,
+    unknown_weights: Vec<f64>,
     /// Inverse of the matrix of leading coefficients, row-major.
     inverse: Vec<f64>,
 }
@@ -95,15 +95,15 @@ impl RunningSumSystem {
             let what = format!("integrals of order {highest} by {sums} running sums");
             return Err(Error::Structure { what, remedy: format!("give the highest order, {MAX_SUMS} at most") });
         }
-        let mut own = vec![0.0; n * (sums + 1) * n];
-        let mut leading: Vec<f64> = (0..n * n).map(|at| f64::from(u8::from(at / n == at % n))).collect();
+        let mut unknown_weights = vec![0.0; n * (sums + 1) * n];
+        let mut leading: Vec<f64> = (0..n * n).map(|index| f64::from(u8::from(index / n == index % n))).collect();
         for &(i, j, order, c) in terms {
             for (l, weight) in running_sums(order, step).iter().enumerate() {
-                own[(i * (sums + 1) + l) * n + j] += c * weight;
+                unknown_weights[(i * (sums + 1) + l) * n + j] += c * weight;
             }
             leading[i * n + j] -= c * crate::fractional::kernels::first_coefficient(order_to_float(order), step);
         }
-        Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
+        Ok(Self { n, sums, step, unknown_weights, inverse: small::inverse(&leading, n)? })
     }
 
     /// Solve the system for each list of inputs. Return n unknown series of m terms per list.
@@ -116,7 +116,7 @@ impl RunningSumSystem {
     pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
         for source in lists.iter().flatten() {
             if source.series.len() < m {
-                check_length("forcing series", m, source.series.len())?;
+                check_length("input series", m, source.series.len())?;
             }
         }
         if self.n > 1 {
@@ -131,37 +131,43 @@ impl RunningSumSystem {
             5 => Self::solve_one_unknown::<6>,
             _ => Self::solve_one_unknown::<7>,
         };
-        let solved = lists.chunks(RIGHT_SIDE_LANES).flat_map(|part| solve(self, m, part));
-        Ok(solved.map(|answer| vec![answer]).collect())
+        let solutions = lists.chunks(RIGHT_SIDE_LANES).flat_map(|group| solve(self, m, group));
+        Ok(solutions.map(|solution| vec![solution]).collect())
     }
 
     /// Solve a system of one unknown for up to [`RIGHT_SIDE_LANES`] lists of inputs. L is the number of running sums
     /// plus one.
     fn solve_one_unknown<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
-        let mut own = [0.0; L];
-        own.copy_from_slice(&self.own[..L]);
-        let driven: Vec<Vec<(Vec<f64>, &[f64])>> = lists
+        let mut unknown_weights = [0.0; L];
+        unknown_weights.copy_from_slice(&self.unknown_weights[..L]);
+        let weighted_inputs: Vec<Vec<(Vec<f64>, &[f64])>> = lists
             .iter()
             .map(|list| list.iter().map(|source| (self.weights(source), source.series)).collect())
             .collect();
         let mut out = vec![vec![0.0; m]; lists.len()];
         let mut states = [[0.0; RIGHT_SIDE_LANES]; L];
         let mut inputs = vec![[[0.0; RIGHT_SIDE_LANES]; L]; CHUNK_TERMS.min(m)];
-        let mut answer = vec![[0.0; RIGHT_SIDE_LANES]; CHUNK_TERMS.min(m)];
+        let mut solution = vec![[0.0; RIGHT_SIDE_LANES]; CHUNK_TERMS.min(m)];
         for start in (0..m).step_by(CHUNK_TERMS) {
             let length = CHUNK_TERMS.min(m - start);
             inputs[..length].fill([[0.0; RIGHT_SIDE_LANES]; L]);
-            for (lane, sources) in driven.iter().enumerate() {
+            for (lane, sources) in weighted_inputs.iter().enumerate() {
                 for (weights, series) in sources {
                     for (input, value) in inputs.iter_mut().zip(&series[start..start + length]) {
                         input.iter_mut().zip(weights).for_each(|(sum, w)| sum[lane] += w * value);
                     }
                 }
             }
-            let (inputs, answer) = (&inputs[..length], &mut answer[..length]);
-            dispatch_simd(Block { own: &own, inverse: self.inverse[0], states: &mut states, inputs, answer });
+            let (inputs, solution) = (&inputs[..length], &mut solution[..length]);
+            dispatch_simd(Block {
+                unknown_weights: &unknown_weights,
+                inverse: self.inverse[0],
+                states: &mut states,
+                inputs,
+                solution,
+            });
             for (lane, series) in out.iter_mut().enumerate() {
-                series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
+                series[start..start + length].iter_mut().zip(&*solution).for_each(|(value, y)| *value = y[lane]);
             }
         }
         out
@@ -185,23 +191,23 @@ impl RunningSumSystem {
             }
         }
         let mut out: Vec<Vec<f64>> = (0..n).map(|_| Vec::with_capacity(m)).collect();
-        let (mut sums, mut open, mut y) = (vec![0.0; n * stride], vec![0.0; n], vec![0.0; n]);
+        let (mut sums, mut known_sums, mut y) = (vec![0.0; n * stride], vec![0.0; n], vec![0.0; n]);
         for input in inputs.chunks_exact(n * stride) {
-            for (i, sum) in open.iter_mut().enumerate() {
-                let at = i * stride;
-                *sum = input[at] + (1..stride).map(|l| input[at + l] + sums[at + l]).sum::<f64>();
+            for (i, sum) in known_sums.iter_mut().enumerate() {
+                let index = i * stride;
+                *sum = input[index] + (1..stride).map(|l| input[index + l] + sums[index + l]).sum::<f64>();
             }
             for (i, value) in y.iter_mut().enumerate() {
-                *value = (0..n).map(|j| self.inverse[i * n + j] * open[j]).sum();
+                *value = (0..n).map(|j| self.inverse[i * n + j] * known_sums[j]).sum();
                 out[i].push(*value);
             }
             for i in 0..n {
-                let mut above = 0.0;
+                let mut higher_sum = 0.0;
                 for l in (1..stride).rev() {
-                    let at = i * stride + l;
-                    let of_unknowns: f64 = (0..n).map(|j| self.own[at * n + j] * y[j]).sum();
-                    sums[at] += input[at] + of_unknowns + above;
-                    above = sums[at];
+                    let index = i * stride + l;
+                    let unknown_part: f64 = (0..n).map(|j| self.unknown_weights[index * n + j] * y[j]).sum();
+                    sums[index] += input[index] + unknown_part + higher_sum;
+                    higher_sum = sums[index];
                 }
             }
         }
@@ -213,7 +219,7 @@ impl RunningSumSystem {
 /// the widest vector instructions available.
 struct Block<'a, const L: usize> {
     /// Weight of the unknown in each running sum.
-    own: &'a [f64; L],
+    unknown_weights: &'a [f64; L],
     /// Reciprocal of the leading coefficient of the equation.
     inverse: f64,
     /// Values of the running sums, updated in place.
@@ -221,7 +227,7 @@ struct Block<'a, const L: usize> {
     /// Input of each running sum for each right-hand side, by term.
     inputs: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
     /// Values of the unknown for each right-hand side, by term.
-    answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
+    solution: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
 
 impl<const L: usize> SimdKernel for Block<'_, L> {
@@ -230,22 +236,22 @@ impl<const L: usize> SimdKernel for Block<'_, L> {
     #[inline(always)]
     fn run(self) {
         let mut states = *self.states;
-        for (input, y) in self.inputs.iter().zip(self.answer) {
-            let mut open = input[0];
+        for (input, y) in self.inputs.iter().zip(self.solution) {
+            let mut known_sum = input[0];
             for l in 1..L {
                 for w in 0..RIGHT_SIDE_LANES {
-                    open[w] += input[l][w] + states[l][w];
+                    known_sum[w] += input[l][w] + states[l][w];
                 }
             }
-            let mut above = [0.0; RIGHT_SIDE_LANES];
+            let mut higher_sum = [0.0; RIGHT_SIDE_LANES];
             for w in 0..RIGHT_SIDE_LANES {
-                y[w] = self.inverse * open[w];
+                y[w] = self.inverse * known_sum[w];
             }
             for l in (1..L).rev() {
                 for w in 0..RIGHT_SIDE_LANES {
-                    states[l][w] += input[l][w] + self.own[l] * y[w] + above[w];
+                    states[l][w] += input[l][w] + self.unknown_weights[l] * y[w] + higher_sum[w];
                 }
-                above = states[l];
+                higher_sum = states[l];
             }
         }
         *self.states = states;

@@ -74,7 +74,7 @@ pub struct PulseJump {
     /// Index of the pulse.
     pub pulse: usize,
     /// Fraction of the pulse that precedes the jump.
-    pub share: f64,
+    pub fraction: f64,
     /// Value before the jump.
     pub before: f64,
     /// Value after the jump.
@@ -100,23 +100,23 @@ pub struct PulseJump {
 /// # }
 /// ```
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<PulseMeans> {
+pub fn pulse_means(samples: &[f64], m: usize, intersample: Intersample) -> Result<PulseMeans> {
     let Some(intervals) = samples.len().checked_sub(1).filter(|&n| n > 0) else {
         return Err(Error::Length { name: "samples".into(), expected: 2, found: samples.len() });
     };
     check_pulses(m)?;
     check_finite("samples", samples)?;
     // Integral over interval j from its start to a fraction x of it.
-    let partial = |j: usize, x: f64| match between {
+    let partial = |j: usize, x: f64| match intersample {
         Intersample::Hold => samples[j] * x,
         Intersample::Linear => x * (samples[j] + 0.5 * x * (samples[j + 1] - samples[j])),
     };
     // Edge k of the pulses is at interval k·n/m. Integer quotient and remainder make edges exact.
     let edge = |k: usize| {
         let product = k as u128 * intervals as u128;
-        let whole = (product / m as u128) as usize;
+        let quotient = (product / m as u128) as usize;
         let fraction = (product % m as u128) as f64 / m as f64;
-        (whole, fraction)
+        (quotient, fraction)
     };
     let per_pulse = m as f64 / intervals as f64;
     let mut means = Vec::with_capacity(m);
@@ -125,9 +125,9 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Pu
         let (next_j, next_x) = edge(k);
         let mut integral = 0.0;
         if next_j == j {
-            integral += slice_integral(samples, between, j, x, next_x);
+            integral += slice_integral(samples, intersample, j, x, next_x);
         } else {
-            integral += if x == 0.0 { partial(j, 1.0) } else { slice_integral(samples, between, j, x, 1.0) };
+            integral += if x == 0.0 { partial(j, 1.0) } else { slice_integral(samples, intersample, j, x, 1.0) };
             for i in j + 1..next_j {
                 integral += partial(i, 1.0);
             }
@@ -156,8 +156,8 @@ pub(crate) fn check_pulses(m: usize) -> Result<()> {
 
 /// Return the integral over the part of interval `j` from the fraction `a` to the fraction `b` of its length. No
 /// difference of two partial integrals is formed, so no digits cancel.
-fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f64) -> f64 {
-    match between {
+fn slice_integral(samples: &[f64], intersample: Intersample, j: usize, a: f64, b: f64) -> f64 {
+    match intersample {
         Intersample::Hold => samples[j] * (b - a),
         Intersample::Linear => {
             (b - a) * (samples[j] + 0.5 * (a + b) * (samples.get(j + 1).unwrap_or(&samples[j]) - samples[j]))
@@ -187,14 +187,14 @@ pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64
     let (count, whole) = (samples.len(), delay.floor());
     let fraction = delay - whole;
     let whole = whole.clamp(-(count as f64), count as f64) as isize;
-    let at = |j: usize, back: isize| delayed_row(j, back).map_or(before, |i| samples[i.min(count - 1)]);
+    let sample_before = |j: usize, back: isize| delayed_row(j, back).map_or(before, |i| samples[i.min(count - 1)]);
     Ok((0..count)
         .map(|j| {
-            let near = at(j, whole);
+            let nearer = sample_before(j, whole);
             if fraction == 0.0 {
-                near
+                nearer
             } else {
-                (1.0 - fraction) * near + fraction * at(j, whole + 1)
+                (1.0 - fraction) * nearer + fraction * sample_before(j, whole + 1)
             }
         })
         .collect())
@@ -235,7 +235,7 @@ struct NearbyJump {
     /// Index of the first pulse of the interpolation, relative to the pulse of the jump.
     first: isize,
     /// Fraction of the pulse of the jump that precedes the jump.
-    share: f64,
+    fraction: f64,
     size: f64,
 }
 
@@ -244,14 +244,14 @@ struct NearbyJump {
 pub struct SampleInterpolation {
     first: Vec<usize>,
     weights: Vec<[f64; STENCIL_PULSES]>,
-    places: Vec<f64>,
+    positions: Vec<f64>,
 }
 
 /// Jumps of one held signal near each sample time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jumps {
     starts: Vec<usize>,
-    near: Vec<NearbyJump>,
+    jumps: Vec<NearbyJump>,
 }
 
 impl SampleInterpolation {
@@ -266,14 +266,14 @@ impl SampleInterpolation {
     /// # fn main() -> ftlm::error::Result<()> {
     /// // Means of t³ over pulses of 1 s.
     /// let means: Vec<f64> = (0..6).map(|k| 0.25 * (f64::from(k + 1).powi(4) - f64::from(k).powi(4))).collect();
-    /// let readings = ftlm::signal::block_pulse::SampleInterpolation::new(vec![0.3, 2.5, 5.9], 6)?;
-    /// let read = readings.interpolate(&means);
-    /// assert!(read.iter().zip([0.3_f64, 2.5, 5.9]).all(|(y, t)| (y - t.powi(3)).abs() < 1e-9));
+    /// let interpolation = ftlm::signal::block_pulse::SampleInterpolation::new(vec![0.3, 2.5, 5.9], 6)?;
+    /// let samples = interpolation.interpolate(&means);
+    /// assert!(samples.iter().zip([0.3_f64, 2.5, 5.9]).all(|(y, t)| (y - t.powi(3)).abs() < 1e-9));
     /// # Ok(())
     /// # }
     /// ```
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    pub fn new(places: Vec<f64>, m: usize) -> Result<Self> {
+    pub fn new(positions: Vec<f64>, m: usize) -> Result<Self> {
         if m < STENCIL_PULSES {
             return Err(Error::Length {
                 name: "pulses around a nonuniform sample".into(),
@@ -281,8 +281,8 @@ impl SampleInterpolation {
                 found: m,
             });
         }
-        check_finite("times of nonuniform samples", &places)?;
-        if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
+        check_finite("times of nonuniform samples", &positions)?;
+        if let Some(&value) = positions.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
             let remedy = "remove samples before or after the time span of the inputs".into();
             return Err(Error::OutOfRange {
                 name: "time of a nonuniform sample".into(),
@@ -293,9 +293,9 @@ impl SampleInterpolation {
         }
         let half = STENCIL_PULSES / 2;
         let first: Vec<usize> =
-            places.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL_PULSES)).collect();
-        let weights = places.iter().zip(&first).map(|(p, &f)| stencil(p - f as f64)).collect();
-        Ok(Self { first, weights, places })
+            positions.iter().map(|p| ((p + 0.5) as usize).saturating_sub(half).min(m - STENCIL_PULSES)).collect();
+        let weights = positions.iter().zip(&first).map(|(p, &f)| stencil(p - f as f64)).collect();
+        Ok(Self { first, weights, positions })
     }
 
     /// Number of sample times.
@@ -319,29 +319,29 @@ impl SampleInterpolation {
         self.first.iter().zip(&self.weights).map(value).collect()
     }
 
-    /// Return the jumps of a held signal near each sample time. `at` holds the ascending positions of the jumps in
-    /// pulses, and `sizes` their sizes.
+    /// Return the jumps of a held signal near each sample time. `positions` holds the ascending positions of the jumps
+    /// in pulses, and `sizes` their sizes.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
-    pub fn jumps(&self, at: &[f64], sizes: &[f64]) -> Jumps {
-        let mut out = Jumps { starts: vec![0], near: Vec::new() };
-        for (&place, &first) in self.places.iter().zip(&self.first) {
-            let from = at.partition_point(|&p| p < place - KINK_RANGE_PULSES);
-            let to = at.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
+    pub fn jumps(&self, positions: &[f64], sizes: &[f64]) -> Jumps {
+        let mut result = Jumps { starts: vec![0], jumps: Vec::new() };
+        for (&sample_position, &first) in self.positions.iter().zip(&self.first) {
+            let from = positions.partition_point(|&p| p < sample_position - KINK_RANGE_PULSES);
+            let to = positions.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
             for (&p, &size) in
-                at[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
+                positions[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
             {
                 let pulse = p.floor();
-                out.near.push(NearbyJump {
-                    time_since_jump: place - p,
+                result.jumps.push(NearbyJump {
+                    time_since_jump: sample_position - p,
                     first: first as isize - pulse as isize,
-                    share: p - pulse,
+                    fraction: p - pulse,
                     size,
                 });
             }
-            out.starts.push(out.near.len());
+            result.starts.push(result.jumps.len());
         }
-        out
+        result
     }
 
     /// Return the corrections of the samples of the fractional integral of order `eta` of a zero-order-hold signal.
@@ -351,25 +351,27 @@ impl SampleInterpolation {
     #[allow(clippy::cast_precision_loss)]
     pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
         let scale = libm::pow(step, eta);
-        let (corner, mean) = (scale / libm::tgamma(eta + 1.0), scale / libm::tgamma(eta + 2.0));
+        let (kink_scale, mean_scale) = (scale / libm::tgamma(eta + 1.0), scale / libm::tgamma(eta + 2.0));
         // Mean response over the n-th pulse after a jump at the start of a pulse.
-        let longest = jumps.near.iter().map(|near| near.first).max().unwrap_or(0).max(0) + STENCIL_PULSES as isize;
+        let longest = jumps.jumps.iter().map(|jump| jump.first).max().unwrap_or(0).max(0) + STENCIL_PULSES as isize;
         let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
-        let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
-        let lacking = |near: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
-            let sample = match near.time_since_jump {
+        let pulse_response = |n: isize| usize::try_from(n).map_or(0.0, |n| mean_scale * (powers[n + 1] - powers[n]));
+        let correction = |jump: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
+            let sample = match jump.time_since_jump {
                 time if time < 0.0 => 0.0,
-                time if eta == 0.0 && time == 0.0 => corner,
-                time => corner * libm::pow(time, eta),
+                time if eta == 0.0 && time == 0.0 => kink_scale,
+                time => kink_scale * libm::pow(time, eta),
             };
-            let sampled_share: f64 = (near.first..)
+            let interpolated: f64 = (jump.first..)
                 .zip(weights)
-                .map(|(n, w)| w * ((1.0 - near.share) * of_pulse(n) + near.share * of_pulse(n - 1)))
+                .map(|(n, w)| w * ((1.0 - jump.fraction) * pulse_response(n) + jump.fraction * pulse_response(n - 1)))
                 .sum();
-            near.size * (sample - sampled_share)
+            jump.size * (sample - interpolated)
         };
         let spans = jumps.starts.iter().zip(jumps.starts.iter().skip(1)).zip(&self.weights);
-        spans.map(|((&from, &to), weights)| jumps.near[from..to].iter().map(|n| lacking(n, weights)).sum()).collect()
+        spans
+            .map(|((&from, &to), weights)| jumps.jumps[from..to].iter().map(|n| correction(n, weights)).sum())
+            .collect()
     }
 }
 
@@ -378,11 +380,11 @@ impl SampleInterpolation {
 #[allow(clippy::cast_precision_loss)]
 fn stencil(x: f64) -> [f64; STENCIL_PULSES] {
     let slope = |m: usize| -> f64 {
-        let others: Vec<f64> = (0..=STENCIL_PULSES).filter(|&j| j != m).map(|j| j as f64).collect();
-        let below: f64 = others.iter().map(|j| m as f64 - j).product();
-        let skipping =
-            |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
-        (0..others.len()).map(skipping).sum::<f64>() / below
+        let other_nodes: Vec<f64> = (0..=STENCIL_PULSES).filter(|&j| j != m).map(|j| j as f64).collect();
+        let denominator: f64 = other_nodes.iter().map(|j| m as f64 - j).product();
+        let product_without =
+            |i: usize| other_nodes.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
+        (0..other_nodes.len()).map(product_without).sum::<f64>() / denominator
     };
     let mut weights = [0.0; STENCIL_PULSES];
     let mut sum = 0.0;

@@ -103,18 +103,19 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
         });
     }
     // Correlations at lags above a quarter of a run are estimated from too few samples.
-    let reach = lags.max(shortest / 4);
-    let (cross, own_x, own_y) =
-        (pool_covariances(x, y, reach), pool_covariances(x, x, reach), pool_covariances(y, y, reach));
-    let (power_x, power_y) = (own_x[reach], own_y[reach]);
+    let max_lag = lags.max(shortest / 4);
+    let (cross, auto_x, auto_y) =
+        (pool_covariances(x, y, max_lag), pool_covariances(x, x, max_lag), pool_covariances(y, y, max_lag));
+    let (power_x, power_y) = (auto_x[max_lag], auto_y[max_lag]);
     let scale = (power_x * power_y).sqrt();
-    let over = |value: f64, by: f64| if by > 0.0 { value / by } else { 0.0 };
-    let values = cross[reach - lags..=reach + lags].iter().map(|c| over(*c, scale)).collect();
+    let ratio_or_zero = |value: f64, divisor: f64| if divisor > 0.0 { value / divisor } else { 0.0 };
+    let values = cross[max_lag - lags..=max_lag + lags].iter().map(|c| ratio_or_zero(*c, scale)).collect();
     let count = x.iter().map(Vec::len).sum::<usize>() as f64;
     let (mut sum, mut time, mut window) = (1.0, 1.0, 0);
     while window < shortest / 4 && (window as f64) < WINDOW_CORRELATION_TIMES * time {
         window += 1;
-        let (rx, ry) = (over(own_x[reach + window], power_x), over(own_y[reach + window], power_y));
+        let (rx, ry) =
+            (ratio_or_zero(auto_x[max_lag + window], power_x), ratio_or_zero(auto_y[max_lag + window], power_y));
         sum += 2.0 * rx * ry;
         time += 2.0 * rx * rx;
     }
@@ -156,8 +157,8 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     product.iter_mut().zip(other).for_each(|(a, b)| *a *= b.conj());
     let mut time = vec![0.0; plan.len()];
     plan.inverse(&mut product, &mut time, &mut workspace);
-    let behind = time[time.len() - lags..].iter();
-    behind.chain(&time[..=lags]).copied().collect()
+    let negative_lags = time[time.len() - lags..].iter();
+    negative_lags.chain(&time[..=lags]).copied().collect()
 }
 
 /// Return the cross-covariances by their definition, as a reference for tests of [`covariances`]. O(N lags).
@@ -165,6 +166,6 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     let sum =
-        |lagged: &[f64], behind: &[f64], k: usize| lagged.iter().skip(k).zip(behind).map(|(a, b)| a * b).sum::<f64>();
+        |lagged: &[f64], leading: &[f64], k: usize| lagged.iter().skip(k).zip(leading).map(|(a, b)| a * b).sum::<f64>();
     (1..=lags).rev().map(|k| sum(y, x, k)).chain((0..=lags).map(|k| sum(x, y, k))).collect()
 }

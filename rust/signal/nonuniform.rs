@@ -48,10 +48,10 @@ impl<'a> NonuniformSignal<'a> {
         if delay < 0.0 {
             let (first, last) = (self.at(&[-delay])[0], self.times.len().checked_sub(1));
             let first_row = self.times.partition_point(|t| t + delay <= 0.0);
-            let ends = last.map(|k| (self.times[k], self.values[k]));
+            let last_sample = last.map(|k| (self.times[k], self.values[k]));
             let shifted = self.times.iter().zip(self.values.iter()).skip(first_row).map(|(t, v)| (t + delay, *v));
             let (times, values): (Vec<f64>, Vec<f64>) =
-                std::iter::once((0.0, first)).chain(shifted).chain(ends).unzip();
+                std::iter::once((0.0, first)).chain(shifted).chain(last_sample).unzip();
             return Self { times: times.into(), values: values.into(), ..self };
         }
         let times = std::iter::once(0.0).chain(self.times.iter().map(|t| t + delay)).collect();
@@ -86,14 +86,14 @@ impl<'a> NonuniformSignal<'a> {
     /// Return the means of a zero-order-hold signal, without rounding error if the value is constant within a pulse.
     fn hold_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
         let m = edges.len() - 1;
-        let close = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
+        let is_equal = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
         // A switching time within rounding of a pulse edge counts as this edge.
         let switches: Vec<f64> = (self.times.iter())
             .map(|&time| {
                 let after = edges.partition_point(|edge| *edge < time).min(m);
-                let near = if after > 0 && close(edges[after - 1], time) { after - 1 } else { after };
-                if close(edges[near], time) {
-                    edges[near]
+                let nearest = if after > 0 && is_equal(edges[after - 1], time) { after - 1 } else { after };
+                if is_equal(edges[nearest], time) {
+                    edges[nearest]
                 } else {
                     time
                 }
@@ -109,16 +109,16 @@ impl<'a> NonuniformSignal<'a> {
                 row
             };
             row = advance(row, start);
-            let (first, mut at, mut more) = (self.values[row], start, 0.0);
-            while at < end {
+            let (first, mut part_start, mut sum) = (self.values[row], start, 0.0);
+            while part_start < end {
                 let next = switches.get(row + 1).copied().unwrap_or(f64::INFINITY).min(end);
-                more += (self.values[row] - first) * ((next - at) / step);
-                at = next;
-                if at < end {
-                    row = advance(row, at);
+                sum += (self.values[row] - first) * ((next - part_start) / step);
+                part_start = next;
+                if part_start < end {
+                    row = advance(row, part_start);
                 }
             }
-            means.push(first + more);
+            means.push(first + sum);
         }
         means
     }
@@ -143,13 +143,15 @@ impl<'a> NonuniformSignal<'a> {
     /// Return the values at given times \[s\]. At a jump of a zero-order-hold signal, this is the value after the jump.
     #[must_use]
     pub fn at(&self, times: &[f64]) -> Vec<f64> {
-        let (own, values) = (&self.times, &self.values);
+        let (sample_times, values) = (&self.times, &self.values);
         if self.intersample == Intersample::Linear {
-            return times.iter().map(|&time| interpolate(time, own, values)).collect();
+            return times.iter().map(|&time| interpolate(time, sample_times, values)).collect();
         }
         // Times that differ from a switching time by rounding only count as equal to it.
-        let slack = TIME_TOLERANCE * own.last().copied().unwrap_or(0.0).max(1e-300);
-        let value_before = |time: &f64| values[own.partition_point(|at| *at <= time + slack).saturating_sub(1)];
+        let tolerance = TIME_TOLERANCE * sample_times.last().copied().unwrap_or(0.0).max(1e-300);
+        let value_before = |time: &f64| {
+            values[sample_times.partition_point(|sample_time| *sample_time <= time + tolerance).saturating_sub(1)]
+        };
         times.iter().map(value_before).collect()
     }
 
@@ -171,12 +173,12 @@ impl<'a> NonuniformSignal<'a> {
             return Vec::new();
         }
         let jump = |(values, &time): (&[f64], &f64)| {
-            let place = time / step;
-            let pulse = place.floor();
-            let is_inside = (place - place.round()).abs() > EDGE_TOLERANCE_PULSES;
+            let position = time / step;
+            let pulse = position.floor();
+            let is_inside = (position - position.round()).abs() > EDGE_TOLERANCE_PULSES;
             (is_inside && values[0] != values[1]).then_some(PulseJump {
                 pulse: pulse as usize,
-                share: place - pulse,
+                fraction: position - pulse,
                 before: values[0],
                 after: values[1],
             })
@@ -235,6 +237,6 @@ pub fn interpolate_gaps(samples: &[f64]) -> Cow<'_, [f64]> {
     let finite_samples = || samples.iter().enumerate().filter(|(_, v)| !v.is_nan());
     let rows: Vec<f64> = finite_samples().map(|(row, _)| row as f64).collect();
     let values: Vec<f64> = finite_samples().map(|(_, v)| *v).collect();
-    let filled = |(row, &v): (usize, &f64)| if v.is_nan() { interpolate(row as f64, &rows, &values) } else { v };
-    Cow::Owned(samples.iter().enumerate().map(filled).collect())
+    let fill = |(row, &v): (usize, &f64)| if v.is_nan() { interpolate(row as f64, &rows, &values) } else { v };
+    Cow::Owned(samples.iter().enumerate().map(fill).collect())
 }

@@ -115,21 +115,23 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     }
 }
 
-/// Return the autocovariances of series at lags 0 to `most`, and the number of sample pairs at each lag. O(most · N)
+/// Return the autocovariances of series at lags 0 to `max_lag`, and the number of sample pairs at each lag. O(most · N)
 /// for N samples.
 ///
 /// NaN counts as a missing sample. Each series is centered on its own mean, and the results are pooled.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
-    let (mut sums, mut pairs) = (vec![0.0; most + 1], vec![0.0; most + 1]);
+pub fn autocovariances(series: &[&[f64]], max_lag: usize) -> (Vec<f64>, Vec<f64>) {
+    let (mut sums, mut pairs) = (vec![0.0; max_lag + 1], vec![0.0; max_lag + 1]);
     for values in series {
         let x = subtract_mean(values);
-        let gaps = values.iter().any(|v| v.is_nan());
-        let weights: Vec<f64> = if gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
-        for lag in 0..(most + 1).min(x.len()) {
+        let has_gaps = values.iter().any(|v| v.is_nan());
+        let weights: Vec<f64> =
+            if has_gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
+        for lag in 0..(max_lag + 1).min(x.len()) {
             sums[lag] += inner(&x[lag..], &x[..x.len() - lag]);
-            pairs[lag] += if gaps { inner(&weights[lag..], &weights[..x.len() - lag]) } else { (x.len() - lag) as f64 };
+            pairs[lag] +=
+                if has_gaps { inner(&weights[lag..], &weights[..x.len() - lag]) } else { (x.len() - lag) as f64 };
         }
     }
     sums.iter_mut().zip(&pairs).for_each(|(sum, count)| *sum /= count.max(1.0));
@@ -186,27 +188,27 @@ fn subtract_mean(values: &[f64]) -> Vec<f64> {
 /// ```
 #[must_use]
 pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
-    let all: Vec<Vec<f64>> = series.iter().map(|values| subtract_mean(values)).collect();
-    let largest = all.iter().flatten().fold(0.0_f64, |most, v| most.max(v.abs()));
+    let centered: Vec<Vec<f64>> = series.iter().map(|values| subtract_mean(values)).collect();
+    let largest = centered.iter().flatten().fold(0.0_f64, |peak, v| peak.max(v.abs()));
     if largest == 0.0 {
         return 0.0;
     }
     // Division by the largest magnitude keeps fourth powers in the range of floating-point numbers.
-    let all: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v / largest).collect()).collect();
-    let squares: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v * v).collect()).collect();
-    let summed = |parts: &[Vec<f64>], lag: usize| -> f64 {
+    let centered: Vec<Vec<f64>> = centered.iter().map(|x| x.iter().map(|v| v / largest).collect()).collect();
+    let squares: Vec<Vec<f64>> = centered.iter().map(|x| x.iter().map(|v| v * v).collect()).collect();
+    let lag_sum = |parts: &[Vec<f64>], lag: usize| -> f64 {
         parts.iter().filter(|x| x.len() > lag).map(|x| inner(&x[lag..], &x[..x.len() - lag])).sum()
     };
-    let of = |lag: usize| {
-        let (product, power) = (summed(&all, lag), summed(&squares, lag));
+    let lag_term = |lag: usize| {
+        let (product, power) = (lag_sum(&centered, lag), lag_sum(&squares, lag));
         if power > 0.0 {
             product * product / power
         } else {
             0.0
         }
     };
-    let longest = all.iter().map(Vec::len).max().unwrap_or(0);
-    (1..=lags.min(longest)).map(of).sum()
+    let longest = centered.iter().map(Vec::len).max().unwrap_or(0);
+    (1..=lags.min(longest)).map(lag_term).sum()
 }
 
 /// True if a series is consistent with white noise by the [`portmanteau`] test at 1 %. Series of at most `lags` + 1
@@ -237,8 +239,8 @@ const MIN_TRANSFORM_LENGTH: usize = 4096;
 /// Return the whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance.
 ///
 /// The Yule–Walker equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233). Covariances
-/// are pooled over the series, each about its own mean. The order n, at most `most`, minimizes the Bayesian information
-/// criterion. NaN counts as a missing sample.
+/// are pooled over the series, each about its own mean. The order n, at most `max_order`, minimizes the Bayesian
+/// information criterion. NaN counts as a missing sample.
 ///
 /// ```
 /// // Every other value the opposite: x_k = −0.9 x_{k−1} + a bounded disturbance.
@@ -249,15 +251,16 @@ const MIN_TRANSFORM_LENGTH: usize = 4096;
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
+pub fn whitening_filter(series: &[&[f64]], max_order: usize) -> (Vec<f64>, f64) {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
-    let most = most.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
-    let (mut covariance, pairs) = autocovariances(series, most);
-    let (count, all) = (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
-    for (lag, (value, &of)) in covariance.iter_mut().zip(&pairs).enumerate() {
+    let max_order = max_order.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
+    let (mut covariance, pairs) = autocovariances(series, max_order);
+    let (count, sample_count) =
+        (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
+    for (lag, (value, &pair_count)) in covariance.iter_mut().zip(&pairs).enumerate() {
         // A lag with few pairs gets a small weight, so that the covariances belong to a positive spectrum.
-        let whole = series.iter().map(|x| x.len().saturating_sub(lag)).sum::<usize>() as f64;
-        *value *= if of > 0.0 { (if whole > 0.0 { whole } else { 1.0 }) / all } else { 0.0 };
+        let full_count = series.iter().map(|x| x.len().saturating_sub(lag)).sum::<usize>() as f64;
+        *value *= if pair_count > 0.0 { (if full_count > 0.0 { full_count } else { 1.0 }) / sample_count } else { 0.0 };
     }
     let (mut best, mut current) = (vec![1.0], vec![1.0]);
     let mut power = covariance[0];
@@ -265,8 +268,8 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     if power.is_nan() || power <= 0.0 {
         return (best, 0.0);
     }
-    let mut least = count * libm::log(power);
-    for order in 1..=most {
+    let mut best_criterion = count * libm::log(power);
+    for order in 1..=max_order {
         let reflection =
             -current.iter().zip(covariance[1..=order].iter().rev()).map(|(a, c)| a * c).sum::<f64>() / power;
         current.push(0.0);
@@ -277,8 +280,8 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
             break;
         }
         let criterion = count * libm::log(power) + order as f64 * libm::log(count);
-        if criterion < least {
-            (least, remaining) = (criterion, power);
+        if criterion < best_criterion {
+            (best_criterion, remaining) = (criterion, power);
             best.clone_from(&current);
         }
     }
@@ -289,8 +292,8 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 ///
 /// The series is not centered. Yule–Walker estimates shift a root near 1, such as that of a random walk, inward, and
 /// thus underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order n,
-/// at most `most`, minimizes Schwarz's criterion. NaN marks a missing sample. Pairs of samples that begin or end at it
-/// are omitted.
+/// at most `max_order`, minimizes Schwarz's criterion. NaN marks a missing sample. Pairs of samples that begin or end
+/// at it are omitted.
 ///
 /// ```
 /// // The sum of ±1 is a random walk: each value predicts the next one.
@@ -305,35 +308,39 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
+pub fn burg_filter(series: &[f64], max_order: usize) -> (Vec<f64>, f64) {
     let present: Vec<bool> = series.iter().map(|v| !v.is_nan()).collect();
     let mut forward: Vec<f64> = series.iter().map(|v| if v.is_nan() { 0.0 } else { *v }).collect();
     let mut backward = forward.clone();
     let count = present.iter().filter(|v| **v).count().max(1) as f64;
     let mut power = inner(&forward, &forward) / count;
     let (mut best, mut current, mut remaining) = (vec![1.0], vec![1.0], power);
-    let mut least = count * libm::log(power);
-    for order in 1..=most.min(series.len().saturating_sub(1)) {
+    let mut best_criterion = count * libm::log(power);
+    for order in 1..=max_order.min(series.len().saturating_sub(1)) {
         let pairs = (order..series.len()).filter(|&t| present[t] && present[t - order]);
-        let (across, total) = pairs.fold((0.0, 0.0), |(across, total), t| {
-            let (one, other) = (forward[t], backward[t - 1]);
-            (across + one * other, total + one * one + other * other)
+        let (cross_product, total) = pairs.fold((0.0, 0.0), |(cross_product, total), t| {
+            let (forward_error, backward_error) = (forward[t], backward[t - 1]);
+            (
+                cross_product + forward_error * backward_error,
+                total + forward_error * forward_error + backward_error * backward_error,
+            )
         });
-        let reflection = -2.0 * across / total;
+        let reflection = -2.0 * cross_product / total;
         power *= 1.0 - reflection * reflection;
         if power.is_nan() || power <= 0.0 {
             break;
         }
         for t in (order..series.len()).rev() {
-            let (one, other) = (forward[t], backward[t - 1]);
-            (forward[t], backward[t]) = (one + reflection * other, other + reflection * one);
+            let (forward_error, backward_error) = (forward[t], backward[t - 1]);
+            (forward[t], backward[t]) =
+                (forward_error + reflection * backward_error, backward_error + reflection * forward_error);
         }
         current.push(0.0);
         let reversed: Vec<f64> = current.iter().rev().copied().collect();
         current.iter_mut().zip(reversed).for_each(|(a, b)| *a += reflection * b);
         let criterion = count * libm::log(power) + libm::log(count) * order as f64;
-        if criterion < least {
-            (least, remaining) = (criterion, power);
+        if criterion < best_criterion {
+            (best_criterion, remaining) = (criterion, power);
             best.clone_from(&current);
         }
     }
@@ -363,10 +370,10 @@ pub struct ArxModel {
 
 /// Fit an ARX model to series with a common noise spectrum, by least squares. O((lags · inputs)² · N) for N samples.
 ///
-/// An AR model without inputs would model the response to an input as noise. The order of the AR part, at most `most`,
-/// minimizes the Bayesian information criterion. Inputs have lags 1 to `most`, or fewer if samples are few. Lag 0 is
-/// omitted, because under feedback the input at lag 0 contains the current noise. NaN marks a missing sample of a
-/// series. Each input has one row per series, without missing samples.
+/// An AR model without inputs would model the response to an input as noise. The order of the AR part, at most
+/// `max_order`, minimizes the Bayesian information criterion. Inputs have lags 1 to `max_order`, or fewer if samples
+/// are few. Lag 0 is omitted, because under feedback the input at lag 0 contains the current noise. NaN marks a missing
+/// sample of a series. Each input has one row per series, without missing samples.
 ///
 /// ```
 /// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.
@@ -383,13 +390,13 @@ pub struct ArxModel {
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
-pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxModel {
+pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], max_order: usize) -> ArxModel {
     let counts: Vec<usize> = series.iter().map(|x| x.iter().filter(|v| !v.is_nan()).count()).collect();
-    let most = most.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
-    let lags = most.min(counts.iter().sum::<usize>() / (MIN_SAMPLES_PER_INPUT_LAG * inputs.len().max(1)));
-    let start = most.max(lags);
+    let max_order = max_order.min(counts.iter().min().copied().unwrap_or(0) / MIN_SAMPLES_PER_COEFFICIENT);
+    let lags = max_order.min(counts.iter().sum::<usize>() / (MIN_SAMPLES_PER_INPUT_LAG * inputs.len().max(1)));
+    let start = max_order.max(lags);
     let fixed = 1 + inputs.len() * lags;
-    let size = fixed + most + 1;
+    let size = fixed + max_order + 1;
     // Series and inputs are scaled to one, so that the squares of values of any unit are in range.
     let (series, scale) = scale_to_one(series);
     let inputs: Vec<Vec<Vec<f64>>> = inputs.iter().map(|input| scale_to_one(input).0).collect();
@@ -427,7 +434,7 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
     let mut regression = Regression::new(gram);
     (0..fixed).for_each(|column| regression.add(column));
     let mut best = (f64::INFINITY, regression.clone(), 0);
-    for order in 0..=most {
+    for order in 0..=max_order {
         if order > 0 {
             regression.add(fixed + order - 1);
         }
@@ -471,7 +478,7 @@ fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
             subtract_mean(row).into_iter().zip(*row).map(|(v, raw)| if raw.is_nan() { f64::NAN } else { v }).collect()
         })
         .collect();
-    let largest = centered.iter().flatten().fold(0.0_f64, |most, v| most.max(v.abs()));
+    let largest = centered.iter().flatten().fold(0.0_f64, |peak, v| peak.max(v.abs()));
     let scale = if largest > 0.0 { largest } else { 1.0 };
     (centered.into_iter().map(|row| row.into_iter().map(|v| v / scale).collect()).collect(), scale)
 }
@@ -566,7 +573,7 @@ pub fn multiply_toeplitz(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> 
             time[count..].fill(0.0);
             plan.transform(&mut time, &mut spectrum, &mut workspace);
             // The spectrum of an even sequence is real.
-            spectrum.iter_mut().zip(&circle).for_each(|(bin, of)| *bin *= of.re);
+            spectrum.iter_mut().zip(&circle).for_each(|(bin, factor)| *bin *= factor.re);
             plan.inverse(&mut spectrum, &mut time, &mut workspace);
             time[..count].to_vec()
         })

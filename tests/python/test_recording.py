@@ -205,7 +205,7 @@ def test_the_core_refuses_runs_that_are_none():
     refused = [
         ({**recording_arguments(), "step": 0.0}, ftlm.ModelError, "step = 0"),
         ({**recording_arguments(), "outputs": [2]}, ftlm.ModelError, "output 2 of 2 signals"),
-        ({**recording_arguments(), "times": np.arange(5.0)}, ftlm.DataError, "samples at their own times"),
+        ({**recording_arguments(), "times": np.arange(5.0)}, ftlm.DataError, "samples at nonuniform times"),
         ({**recording_arguments(), "signals": []}, ftlm.DataError, "length 0"),
         (shorter, ftlm.DataError, "signal u has length 4"),
         (unknown, ftlm.ModelError, "role 'spline'"),

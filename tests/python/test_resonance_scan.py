@@ -116,7 +116,7 @@ def test_what_no_step_carries_and_twins_are_none() -> None:
     [
         ({"fixed": [None, None]}, "fixed"),
         ({"fixed": [float("nan")]}, "fixed"),
-        ({"own": [-1.0]}, "own term"),
+        ({"autoregressive_orders": [-1.0]}, "autoregressive term"),
         ({"points": [[-1.0, 2.0]]}, "point"),
         ({"runs": []}, "records"),
     ],
@@ -128,7 +128,7 @@ def test_what_does_not_fit_is_refused(change: dict[str, object], word: str) -> N
         "inputs": INPUTS,
         "fixed": [None],
         "terms": (False, []),
-        "own": [1.0],
+        "autoregressive_orders": [1.0],
         "points": [[-1.0]],
     }
     with pytest.raises(FtlmError, match=word):

@@ -104,14 +104,14 @@ fn one_step_of_both_equations_is_that_of_full_matrices() {
     let oracle = dense_step(&noisy, &start, &fixed);
     let structures = [start[0].structure.clone(), start[1].structure.clone()];
     let none = [vec![], vec![]];
-    let (one, exponents, dropped) = (std::slice::from_ref(&noisy), [vec![], vec![]], none);
+    let (one, exponents, excluded_terms) = (std::slice::from_ref(&noisy), [vec![], vec![]], none);
     let problem = CoupledProblem {
         records: one,
         clean: one,
         structures: &structures,
         fixed: &fixed,
         exponents: &exponents,
-        dropped: &dropped,
+        excluded_terms: &excluded_terms,
     };
     let begin: Vec<Vec<f64>> = start.iter().map(|e| e.coefficients.clone()).collect();
     let found = problem.refine(&begin, InstrumentalSettings { iterations: 1, tolerance: 0.0 }).unwrap().unwrap();
@@ -230,7 +230,7 @@ fn a_start_that_grows_is_left_alone() {
     let (_, noisy) = measured(400, 0.02, &[vec![], vec![]], 17);
     let truth = pair();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
-    let (one, exponents, dropped) = (std::slice::from_ref(&noisy), [vec![], vec![]], [vec![], vec![]]);
+    let (one, exponents, excluded_terms) = (std::slice::from_ref(&noisy), [vec![], vec![]], [vec![], vec![]]);
     let fixed = [vec![None; 3], vec![None; 3]];
     let problem = CoupledProblem {
         records: one,
@@ -238,7 +238,7 @@ fn a_start_that_grows_is_left_alone() {
         structures: &structures,
         fixed: &fixed,
         exponents: &exponents,
-        dropped: &dropped,
+        excluded_terms: &excluded_terms,
     };
     let begin = vec![vec![-20.0, 3.0, 10.0], vec![40.0, -90.0, 6.0]];
     assert_eq!(problem.refine(&begin, InstrumentalSettings::default()).unwrap(), None);

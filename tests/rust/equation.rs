@@ -1,6 +1,6 @@
 //! Equations: which orders make one, its initial terms, order laws, sensor filters.
 
-use ftlm::equation::{grains, tidy, AffineOrder, Equation, Filter, Initial, Structure};
+use ftlm::equation::{grains, round_order, AffineOrder, Equation, Filter, Initial, Structure};
 use ftlm::error::Error;
 use ftlm::simulate;
 use proptest::prelude::*;
@@ -56,7 +56,7 @@ fn orders_that_make_no_equation_are_named() {
 
 #[test]
 fn orders_are_kept_to_the_grain() {
-    assert_eq!(tidy(0.1 + 0.2).to_bits(), 0.3_f64.to_bits());
+    assert_eq!(round_order(0.1 + 0.2).to_bits(), 0.3_f64.to_bits());
     assert_eq!(grains(1.95), 1_950_000_000);
     assert_eq!(grains(-0.05), -50_000_000);
     let s = structure(0, 1.95, &[(0, 1.9), (1, 1.95)]);
@@ -209,9 +209,9 @@ proptest! {
 
     #[test]
     fn tidying_is_idempotent_and_near(order in -6.0..6.0_f64) {
-        let tidied = tidy(order);
+        let tidied = round_order(order);
         prop_assert!((tidied - order).abs() <= 0.51e-9);
-        prop_assert_eq!(tidy(tidied).to_bits(), tidied.to_bits());
+        prop_assert_eq!(round_order(tidied).to_bits(), tidied.to_bits());
         prop_assert_eq!(grains(tidied), grains(order));
     }
 
@@ -220,7 +220,7 @@ proptest! {
         alpha in 0.05..3.0_f64,
         orders in prop::collection::vec((0usize..3, 0.0..1.0_f64), 0..5),
     ) {
-        let terms: Vec<(usize, f64)> = orders.iter().map(|&(s, x)| (s, tidy(x * (alpha - 0.01)))).collect();
+        let terms: Vec<(usize, f64)> = orders.iter().map(|&(s, x)| (s, round_order(x * (alpha - 0.01)))).collect();
         let exponents = structure(0, alpha, &terms).initial_exponents(&Initial::Caputo);
         prop_assert_eq!(exponents[0], 0.0);
         prop_assert!(exponents.windows(2).all(|p| p[0] < p[1]));

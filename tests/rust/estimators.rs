@@ -49,7 +49,7 @@ fn coefficients_of_exact_data_are_recovered() {
         let record = obeying(&model, m, 0.01, &[], 0.0, seed);
         let found = least_squares::fit(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         check("recovered coefficients", relative_distance(&found.coefficients, &model.coefficients), 1e-12);
-        assert_eq!((found.initial, found.exponents, found.dropped), (vec![vec![]], vec![], vec![]));
+        assert_eq!((found.initial, found.exponents, found.excluded_terms), (vec![vec![]], vec![], vec![]));
     }
 }
 
@@ -171,14 +171,14 @@ fn dependent_terms_are_named_and_dependent_initial_terms_dropped() {
     let once = structure(0, 1.8, &[(0, 0.9), (2, 0.8)]);
     let powers = Initial::Powers(vec![0.0, 1.0, 1.5]);
     let found = least_squares::fit(&[constant.clone(), base.clone()], &once, &[None, None], &powers).unwrap();
-    assert_eq!(found.dropped, []);
+    assert_eq!(found.excluded_terms, []);
     let found = least_squares::fit(std::slice::from_ref(&constant), &once, &[None, None], &powers).unwrap();
-    assert_eq!(found.dropped, [(0, 1)]);
+    assert_eq!(found.excluded_terms, [(0, 1)]);
     assert_eq!(found.initial[0][1], 0.0);
     assert!(found.initial[0][0] != 0.0 && found.initial[0][2] != 0.0);
     let both = [with_signal(&base, 2, vec![1.0; 300]), constant];
     let first = Initial::Powers(vec![1.0]);
-    assert_eq!(least_squares::fit(&both, &once, &[None, None], &first).unwrap().dropped, [(1, 0)]);
+    assert_eq!(least_squares::fit(&both, &once, &[None, None], &first).unwrap().excluded_terms, [(1, 0)]);
 }
 
 #[test]
@@ -612,8 +612,8 @@ proptest! {
             // Each relative to what its own column's size makes of the target.
             prop_assert!((b[i] - oracle[i]).abs() <= 1e-10 * norm(&target) / norm(&columns[i]));
         }
-        let (by_factor, dropped) = least_squares::solve(&columns, &target, k).unwrap();
-        prop_assert!(dropped.is_empty());
+        let (by_factor, excluded_columns) = least_squares::solve(&columns, &target, k).unwrap();
+        prop_assert!(excluded_columns.is_empty());
         for i in 0..k {
             prop_assert!((by_factor[i] - b[i]).abs() <= 1e-10 * norm(&target) / norm(&columns[i]));
         }

@@ -7,7 +7,7 @@ use ftlm::estimation::output_error::{
 };
 use ftlm::friction::law::Phase;
 use ftlm::friction::FrictionLaw;
-use ftlm::nonlinear::{fit, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
+use ftlm::nonlinear::{fit, FreeFrictionLaw, InitialGuess, NonlinearModel, NonlinearSystem};
 use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Role, Sampling};
 use ftlm::regressors::Record;
@@ -33,7 +33,7 @@ fn record(step: f64, m: usize, inputs: &[&[(f64, f64)]]) -> Result<Record, Error
             row[pulse] += (1.0 - share) * (after - before);
             row[pulse + 1..].iter_mut().for_each(|v| *v += after - before);
             if share > 0.0 {
-                own.push(PulseJump { pulse, share, before, after });
+                own.push(PulseJump { pulse, fraction: share, before, after });
             }
             before = after;
         }
@@ -81,7 +81,7 @@ fn a_recording_gives_its_jumps_within_pulses() -> Result<(), Error> {
     run.has_friction = true;
     let places = |m| -> Result<Vec<(f64, f64, f64)>, Error> {
         let jumps = run.pulses(m, false)?.jumps.swap_remove(1);
-        Ok(jumps.iter().map(|jump| (jump.pulse as f64 + jump.share, jump.before, jump.after)).collect())
+        Ok(jumps.iter().map(|jump| (jump.pulse as f64 + jump.fraction, jump.before, jump.after)).collect())
     };
     for (m, every) in [(4, 1.0), (8, 2.0)] {
         let found = places(m)?;
@@ -99,7 +99,7 @@ fn a_recording_gives_its_jumps_within_pulses() -> Result<(), Error> {
 #[test]
 fn jumps_that_are_not_within_pulses_are_refused() -> Result<(), Error> {
     let plain = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 4]; 2]), None)?;
-    let jump = |pulse, share| PulseJump { pulse, share, before: 0.0, after: 1.0 };
+    let jump = |pulse, share| PulseJump { pulse, fraction: share, before: 0.0, after: 1.0 };
     for wrong in [
         vec![jump(4, 0.5)],
         vec![jump(1, 0.0)],
@@ -176,13 +176,13 @@ fn sensitivities_are_those_of_differences() -> Result<(), Error> {
         run.has_friction = true;
         let experiment: Experiment = run.experiment(Sampling::default())?;
         assert!(experiment.point_values[bodies].is_zero_order_hold);
-        let start = Start {
+        let start = InitialGuess {
             orders: vec![],
             coefficients: vec![0.8, 1.5, 0.9],
             inputs: if law == InputLaw::Delay { vec![0.07, 0.083][..bodies].to_vec() } else { vec![2.0] },
             states: vec![],
         };
-        let at = |start: &Start| {
+        let at = |start: &InitialGuess| {
             fit(&model(bodies, stribeck, law), std::slice::from_ref(&experiment), start, settings, &Stop::default())
         };
         let here = at(&start)?;

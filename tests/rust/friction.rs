@@ -8,7 +8,7 @@ use ftlm::friction::contact::{is_p_matrix, FrictionProblem};
 use ftlm::friction::law::{Phase, PulseDerivatives};
 use ftlm::friction::FrictionLaw;
 use ftlm::nonlinear::convolution::{ConvolutionKernel, OnlineConvolution};
-use ftlm::nonlinear::{fit, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
+use ftlm::nonlinear::{fit, FreeFrictionLaw, InitialGuess, NonlinearModel, NonlinearSystem};
 use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::PulseMeans;
@@ -186,7 +186,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     };
     let frictions = vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))];
     let model = NonlinearModel { model: linear, derived: vec![], frictions, filtered: vec![] };
-    let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
+    let start = InitialGuess { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
     let found = fit(
         &model,
         std::slice::from_ref(&experiment),

@@ -7,7 +7,7 @@ use ftlm::estimation::output_error::{
     ParameterPoint, PointValues,
 };
 use ftlm::friction::FrictionLaw;
-use ftlm::nonlinear::{self, FreeFrictionLaw, NonlinearModel, NonlinearSystem, Start};
+use ftlm::nonlinear::{self, FreeFrictionLaw, InitialGuess, NonlinearModel, NonlinearSystem};
 use ftlm::parallel::Stop;
 use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::{point_samples, PulseMeans};
@@ -112,8 +112,12 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
         }
         experiment.point_values.clear();
         let here = |value: f64| {
-            let start =
-                Start { orders: vec![1.7], coefficients: vec![0.8, 1.4, 0.3], inputs: vec![value], states: vec![] };
+            let start = InitialGuess {
+                orders: vec![1.7],
+                coefficients: vec![0.8, 1.4, 0.3],
+                inputs: vec![value],
+                states: vec![],
+            };
             nonlinear::fit(&rubbing(law), std::slice::from_ref(&experiment), &start, settings, &Stop::default())
         };
         let (at, up, down) = (here(1.0)?, here(1.000_001)?, here(0.999_999)?);
@@ -131,7 +135,8 @@ fn a_limit_is_found_with_the_rest() -> Result<(), Error> {
             output_error::fit(&linear(law), &[run(law, limit, 0.0, 5)?], &start, MinimizationSettings::default())?;
         assert!((found.point.inputs[0] - limit).abs() < 1e-6, "{law:?} {:?}", found.point);
         assert!((found.point.orders[0] - 1.8).abs() < 1e-6, "{law:?} {:?}", found.point);
-        let start = Start { orders: vec![1.9], coefficients: vec![0.7, 1.2, 0.3], inputs: vec![0.9], states: vec![] };
+        let start =
+            InitialGuess { orders: vec![1.9], coefficients: vec![0.7, 1.2, 0.3], inputs: vec![0.9], states: vec![] };
         let settings = MinimizationSettings { evaluations: 300, tolerance: 1e-14 };
         let found = nonlinear::fit(&rubbing(law), &[run(law, limit, 0.5, 7)?], &start, settings, &Stop::default())?;
         assert!((found.inputs[0] - limit).abs() < 1e-4, "{law:?} {:?} {:?}", found.inputs, found.coefficients);

@@ -85,7 +85,7 @@ fn one_step_is_that_of_dense_algebra() {
     let goal = Kernel::new(noisy.signal(0));
     let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
     let source = InstrumentSource {
-        own: (0..4).map(|k| (signals[k] == 0).then(|| (kernels[k].as_slice(), &spectra[k]))).collect(),
+        output_terms: (0..4).map(|k| (signals[k] == 0).then(|| (kernels[k].as_slice(), &spectra[k]))).collect(),
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
         initial: Vec::new(),
@@ -227,7 +227,7 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
     let goal = Kernel::new(noisy.signal(0));
     let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
     let source = InstrumentSource {
-        own: vec![Some((&kernels[0][..], &spectra[0])), Some((&kernels[1][..], &spectra[1])), None, None],
+        output_terms: vec![Some((&kernels[0][..], &spectra[0])), Some((&kernels[1][..], &spectra[1])), None, None],
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
         initial: Vec::new(),
@@ -242,7 +242,7 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
     check("one equation refined", relative_distance(&found, &whole), 1e-6);
     let stop = Stop::default();
     stop.set();
-    let told = refine(&[source], &FREE, &[], &start, settings, &mut Scratch::until(&stop));
+    let told = refine(&[source], &FREE, &[], &start, settings, &mut Scratch::with_stop(&stop));
     assert!(matches!(told, Err(Error::Interrupted)), "{told:?}");
 }
 
@@ -503,7 +503,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
         let (measured, clean, goal) = (spectra(&noisy), spectra(&tidy), Kernel::new(noisy.signal(0)));
         let own: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
         let source = InstrumentSource {
-            own: vec![Some((&kernels[0][..], &own[0])), Some((&kernels[1][..], &own[1])), None],
+            output_terms: vec![Some((&kernels[0][..], &own[0])), Some((&kernels[1][..], &own[1])), None],
             measured: measured.iter().collect(),
             clean: clean.iter().collect(),
             initial: Vec::new(),

@@ -3,9 +3,7 @@
 use ftlm::equation::{Equation, Initial};
 use ftlm::order_search::batches::search;
 use ftlm::order_search::control::Control;
-use ftlm::order_search::dual_bound::{
-    excluded_by, excluded_by_linearized_vector, excluded_in_turn, has_unstable_zeros,
-};
+use ftlm::order_search::dual_bound::{excluded_by, excluded_by_linearized_vector, exclusion_flags, has_unstable_zeros};
 use ftlm::order_search::grid::{OrderGrid, TermAxis};
 use ftlm::order_search::options::{Norm, Options};
 use ftlm::regressors::Record;
@@ -163,7 +161,7 @@ fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
         let exact: Vec<f64> = equations.iter().map(|equation| score(&record, equation, norm)).collect();
         for limit in exact.iter().filter(|exact| exact.is_finite()).step_by(8) {
             let limit = limit * (1.0 + 1e-9);
-            let excluded = excluded_in_turn(&record, &made_for, &equations, norm, limit).unwrap();
+            let excluded = exclusion_flags(&record, &made_for, &equations, norm, limit).unwrap();
             for ((equation, &exact), &excluded) in equations.iter().zip(&exact).zip(&excluded) {
                 assert!(!(excluded && exact <= limit), "case {case}: {exact:e} at {limit:e}");
                 asked += 1;

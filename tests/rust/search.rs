@@ -885,7 +885,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                     if stopped == 1 {
                         // One of another visiting order is of no use: neither a candidate missed nor one met twice.
                         let mut other = checkpoint.clone();
-                        other.place.order ^= 1;
+                        other.position.order ^= 1;
                         let control = Control::default();
                         control.saving.store(true, Relaxed);
                         assert_eq!(run(&ready, Some(other), &control).unwrap(), whole);

@@ -152,7 +152,7 @@ fn rounds_refuse_what_belongs_to_another_search() {
     refused(0, 1, &[(lattice.count(), 1.0)], None);
     refused(0, 1, &[(0, f64::NAN)], None);
     refused(0, 1, &[(0, -1.0)], None);
-    let at = |place| Some(Checkpoint { place, replaces_previous: false, part: Part::default() });
+    let at = |place| Some(Checkpoint { position: place, replaces_previous: false, part: Part::default() });
     for place in [
         BatchPosition { batch: 2, ..place },
         BatchPosition { evaluated_count: 1, ..place },
@@ -164,7 +164,7 @@ fn rounds_refuse_what_belongs_to_another_search() {
         refused(0, 1, &[], at(place));
     }
     let row = |index, score, width| Row { index, score, coefficients: vec![0.0; width], initial: vec![vec![]] };
-    let with = |part| Some(Checkpoint { place, replaces_previous: false, part });
+    let with = |part| Some(Checkpoint { position: place, replaces_previous: false, part });
     for row in [row(lattice.count(), 1.0, 2), row(0, 1.0, 3), row(0, f64::NAN, 2)] {
         refused(0, 1, &[], with(Part { rows: vec![row], ..Part::default() }));
     }

@@ -388,7 +388,7 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
                     division.add(0, start, &n[start..end]);
                     division.solve_block(&inverse, series);
                     assert!(distance(division.quotient(0), &whole[..end]) <= 1e-13 * largest(&whole[..end]));
-                    division.join(series);
+                    division.subtract_contributions(series);
                 }
                 assert_eq!(division.solved_terms(), end);
             }

@@ -93,7 +93,7 @@ def output_error_landscape(
     minimum, x, y, costs = _core.cost_surface(
         problem.core,
         [recording(run, problem.structure) for run in task.runs],
-        {**fit_state(joint, problem), "steady": False},
+        {**fit_state(joint, problem), "requires_stability": False},
         (problem.names.index(first), problem.names.index(second)),
         (HALF_WIDTH_ERRORS * errors[first], HALF_WIDTH_ERRORS * errors[second]),
         POINTS_PER_AXIS,

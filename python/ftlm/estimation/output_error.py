@@ -352,7 +352,7 @@ def fit_output_error(
         raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {reason}")
     orders, coefficients, inputs = problem.split(result["estimate"])
     priors = structure.priors or {}
-    residuals = [dict(zip(outputs, run_residuals, strict=True)) for run_residuals in result["left"]]
+    residuals = [dict(zip(outputs, run_residuals, strict=True)) for run_residuals in result["residuals"]]
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
@@ -362,18 +362,18 @@ def fit_output_error(
         residuals=residuals,
         noise=dict(zip(outputs, result["noise"], strict=True)),
         robust=None if result["robust"] is None else RobustLossSummary(*result["robust"]),
-        robust_weights=result["shares"],
+        robust_weights=result["robust_weights"],
         finest_grid_values=result["on_grid"],
         cost=result["cost"],
         samples=sum(drop_missing(e).size for run_residuals in residuals for e in run_residuals.values()),
-        refinement=result["every"],
-        step_converged=result["settled"],
+        refinement=result["pulses_per_sample"],
+        step_converged=result["step_converged"],
         converged=result["status"] == "converged",
         starts=result["starts"],
         survivors=result["survivors"],
         initial=structure.initial,
         initial_terms=result["initial_terms"] + level_count(runs, structure),
-        unstable_optimum=None if result["growth"] is None else UnstableOptimum(*result["growth"]),
+        unstable_optimum=None if result["unstable_optimum"] is None else UnstableOptimum(*result["unstable_optimum"]),
         prior_fractions=dict(zip((n for n in problem.names if n in priors), result["prior_fractions"], strict=True)),
     )
 
@@ -391,10 +391,10 @@ def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
         "estimate": joint.values,
         "on_grid": joint.finest_grid_values,
         "weights": [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs],
-        "shares": joint.robust_weights,
-        "every": joint.refinement,
-        "settled": joint.step_converged,
-        "steady": prefers_stable,
+        "robust_weights": joint.robust_weights,
+        "pulses_per_sample": joint.refinement,
+        "step_converged": joint.step_converged,
+        "requires_stability": prefers_stable,
     }
 
 

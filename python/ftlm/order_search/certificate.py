@@ -146,7 +146,7 @@ def certify_orders(
     orders = {o.names[0]: v for o, v in zip(single_equation.orders, values, strict=False) if o.names}
     nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
     return OrderCertificate(
-        result["at_least"],
+        result["lower_bound"],
         result["best"],
         orders,
         relative_tolerance,

@@ -10,7 +10,7 @@
 
 use super::prefilter::is_unstable;
 use super::solution::{
-    add_long_run_covariance, dot, equations, has_converged, initial_terms, orthonormalize_instruments, Dropped,
+    add_long_run_covariance, dot, equations, has_converged, initial_terms, orthonormalize_instruments, ExcludedTerms,
     InstrumentalSettings, RecordInstruments, Solution,
 };
 use crate::equation::Structure;
@@ -41,7 +41,7 @@ pub struct CoupledProblem<'a> {
     /// Per equation: exponents of the initial terms (powers of time).
     pub exponents: &'a [Vec<f64>],
     /// Per equation: the excluded initial terms, as pairs of record index and exponent index.
-    pub dropped: &'a [Dropped],
+    pub excluded_terms: &'a [ExcludedTerms],
 }
 
 /// Coefficients of all equations from a joint refinement.
@@ -100,20 +100,20 @@ impl CoupledProblem<'_> {
                 .zip(&next)
                 .zip(self.structures)
                 .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
-            let mut share = 1.0;
+            let mut step_fraction = 1.0;
             let mut is_accepted = false;
             for _ in 0..MAX_STEP_HALVINGS {
                 let candidates: Vec<Solution> = solutions
                     .iter()
                     .zip(&next)
-                    .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect())
+                    .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + step_fraction * (b - a)).collect())
                     .collect();
                 match self.evaluate(&candidates)? {
                     Some(candidate) if candidate.cost <= point.cost + COST_TOLERANCE => {
                         (solutions, point, is_accepted) = (candidates, candidate, true);
                         break;
                     }
-                    _ => share *= 0.5,
+                    _ => step_fraction *= 0.5,
                 }
             }
             if !is_accepted {
@@ -130,7 +130,7 @@ impl CoupledProblem<'_> {
         for (i, fixed) in self.fixed.iter().enumerate() {
             out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| FreeCoefficient::Term(i, k)));
             for r in 0..self.records.len() {
-                let indices = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
+                let indices = (0..self.exponents[i].len()).filter(|&e| !self.excluded_terms[i].contains(&(r, e)));
                 out.extend(indices.map(|e| FreeCoefficient::Initial(i, r, e)));
             }
         }
@@ -151,8 +151,8 @@ impl CoupledProblem<'_> {
             let outputs = System::new(&equations, record)?.respond(&initial)?;
             for ((response, equation), sum) in outputs.iter().zip(&equations).zip(&mut sums) {
                 let measured = self.records[r].signal(equation.structure.output);
-                let size = measured.iter().fold(f64::MIN_POSITIVE, |a, v| a.max(v.abs()));
-                if response.iter().any(|v| !v.is_finite() || v.abs() > 10.0 * size) {
+                let amplitude = measured.iter().fold(f64::MIN_POSITIVE, |a, v| a.max(v.abs()));
+                if response.iter().any(|v| !v.is_finite() || v.abs() > 10.0 * amplitude) {
                     return Ok(None);
                 }
                 *sum += measured.iter().zip(response).map(|(y, v)| (y - v) * (y - v)).sum::<f64>();
@@ -179,7 +179,7 @@ impl CoupledProblem<'_> {
     ) -> Result<Option<StepResult>> {
         let (n, k) = (self.structures.len(), unknowns.len());
         let equations = equations(self.structures, solutions);
-        let mut parts = Vec::with_capacity(self.records.len());
+        let mut regressions = Vec::with_capacity(self.records.len());
         let mut instruments = Vec::with_capacity(self.records.len());
         for (r, record) in self.records.iter().enumerate() {
             let m = record.m();
@@ -197,59 +197,59 @@ impl CoupledProblem<'_> {
             let mut buffers = Buffers::default();
             // Equation error `signal` of equation i, filtered to the errors of all n outputs, each in its noise
             // standard deviation.
-            let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {
+            let mut filter_error = |i: usize, signal: &[f64]| -> Vec<f64> {
                 let spectrum = Kernel::new(signal);
                 let mut out = vec![0.0; n * m];
-                for (j, part) in out.chunks_exact_mut(m).enumerate() {
-                    filters[j][i].times(&spectrum, part, &mut buffers);
+                for (j, block_of_output) in out.chunks_exact_mut(m).enumerate() {
+                    filters[j][i].times(&spectrum, block_of_output, &mut buffers);
                     let scale = point.weights[j].sqrt();
-                    part.iter_mut().for_each(|v| *v *= scale);
+                    block_of_output.iter_mut().for_each(|v| *v *= scale);
                 }
                 out
             };
             let mut target = vec![0.0; n * m];
-            let (mut phi, mut psi, mut places) = (Vec::new(), Vec::new(), Vec::new());
+            let (mut phi, mut psi, mut unknown_indices) = (Vec::new(), Vec::new(), Vec::new());
             for (i, structure) in self.structures.iter().enumerate() {
-                let whole = through(i, record.signal(structure.output));
-                target.iter_mut().zip(whole).for_each(|(t, v)| *t += v);
+                let filtered_output = filter_error(i, record.signal(structure.output));
+                target.iter_mut().zip(filtered_output).for_each(|(t, v)| *t += v);
                 for (term, value) in self.fixed[i].iter().enumerate() {
                     let (signal, eta) = (structure.terms[term].signal, structure.integration(term));
-                    let column = through(i, &record.integral(signal, eta));
+                    let column = filter_error(i, &record.integral(signal, eta));
                     match value {
                         Some(c) => target.iter_mut().zip(&column).for_each(|(t, v)| *t -= c * v),
                         None => {
-                            psi.push(through(i, &simulated.integral(signal, eta)));
+                            psi.push(filter_error(i, &simulated.integral(signal, eta)));
                             phi.push(column);
                         }
                     }
                 }
                 for (e, &exponent) in self.exponents[i].iter().enumerate() {
                     if unknowns.contains(&FreeCoefficient::Initial(i, r, e)) {
-                        let column = through(i, &record.initial_term(exponent));
+                        let column = filter_error(i, &record.initial_term(exponent));
                         psi.push(column.clone());
                         phi.push(column);
                     }
                 }
-                places.extend((0..k).filter(|&a| match unknowns[a] {
+                unknown_indices.extend((0..k).filter(|&a| match unknowns[a] {
                     FreeCoefficient::Term(equation, _) => equation == i,
                     FreeCoefficient::Initial(equation, run, _) => equation == i && run == r,
                 }));
             }
-            parts.push((phi, target));
-            instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
+            regressions.push((phi, target));
+            instruments.push(RecordInstruments { columns: psi, unknown_indices });
         }
         orthonormalize_instruments(&mut instruments, k)?;
         let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-        for ((phi, target), RecordInstruments { columns, unknown_indices: places }) in parts.iter().zip(&instruments) {
-            for (instrument, &a) in columns.iter().zip(places) {
+        for ((phi, target), RecordInstruments { columns, unknown_indices }) in regressions.iter().zip(&instruments) {
+            for (instrument, &a) in columns.iter().zip(unknown_indices) {
                 rhs[a] += dot(instrument, target);
-                for (regressor, &b) in phi.iter().zip(places) {
+                for (regressor, &b) in phi.iter().zip(unknown_indices) {
                     cross[a * k + b] += dot(instrument, regressor);
                 }
             }
         }
-        let solved = EquilibratedLu::new(&cross, k)?;
-        let x = solved.solve(&rhs);
+        let factorization = EquilibratedLu::new(&cross, k)?;
+        let x = factorization.solve(&rhs);
         let mut next: Vec<Solution> = solutions.to_vec();
         for (&unknown, &value) in unknowns.iter().zip(&x) {
             match unknown {
@@ -261,28 +261,29 @@ impl CoupledProblem<'_> {
         }
         let mut covariances = Vec::new();
         if with_covariance {
-            let (mut score_covariance, inverse) = (vec![0.0; k * k], solved.inverse());
-            for (((phi, target), run_instruments), record) in parts.iter().zip(&instruments).zip(self.records) {
-                let RecordInstruments { columns: psi, unknown_indices: places } = run_instruments;
-                let mut rest = target.clone();
-                for (column, &place) in phi.iter().zip(places) {
-                    rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
+            let (mut score_covariance, inverse) = (vec![0.0; k * k], factorization.inverse());
+            for (((phi, target), run_instruments), record) in regressions.iter().zip(&instruments).zip(self.records) {
+                let RecordInstruments { columns: psi, unknown_indices } = run_instruments;
+                let mut residuals = target.clone();
+                for (column, &index) in phi.iter().zip(unknown_indices) {
+                    residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x[index] * v);
                 }
                 let m = record.m();
                 let scores: Vec<Vec<f64>> = psi
                     .iter()
-                    .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * rest[j * m + t]).sum()).collect())
+                    .map(|p| (0..m).map(|t| (0..n).map(|j| p[j * m + t] * residuals[j * m + t]).sum()).collect())
                     .collect();
-                add_long_run_covariance(&scores, places, &mut score_covariance, k);
+                add_long_run_covariance(&scores, unknown_indices, &mut score_covariance, k);
             }
-            let half =
+            let half_product =
                 |i: usize, j: usize| -> f64 { (0..k).map(|b| score_covariance[i * k + b] * inverse[j * k + b]).sum() };
             for i in 0..n {
-                let own: Vec<usize> = (0..k)
+                let equation_unknowns: Vec<usize> = (0..k)
                     .filter(|&a| matches!(unknowns[a], FreeCoefficient::Term(equation, _) if equation == i))
                     .collect();
-                let block = own.iter().flat_map(|&a| own.iter().map(move |&b| (a, b)));
-                covariances.push(block.map(|(a, b)| (0..k).map(|c| inverse[a * k + c] * half(c, b)).sum()).collect());
+                let block = equation_unknowns.iter().flat_map(|&a| equation_unknowns.iter().map(move |&b| (a, b)));
+                covariances
+                    .push(block.map(|(a, b)| (0..k).map(|c| inverse[a * k + c] * half_product(c, b)).sum()).collect());
             }
         }
         Ok(Some((next, covariances)))

@@ -6,7 +6,7 @@
 use super::coupled;
 use super::prefilter::{damped_inverse, power_frequency, state_variable_filter};
 use super::single::{divisor, step, EquationSpectra, InstrumentSource, Scratch};
-use super::solution::{dot, equations, has_converged, initial_terms, Dropped, InstrumentalSettings, Solution};
+use super::solution::{dot, equations, has_converged, initial_terms, ExcludedTerms, InstrumentalSettings, Solution};
 use crate::equation::{Initial, Structure};
 use crate::error::{check_length, Error, Result};
 use crate::estimation::least_squares;
@@ -108,63 +108,72 @@ pub fn fit(
     let clean: Vec<Record> = records.iter().map(Record::clean_record).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
     let problem = CoupledProblem::new(records, &clean, structures, (fixed, initial), &exponents)?;
-    let mut ends: Vec<(Vec<Solution>, RefinementResult)> = Vec::new();
+    let mut refinements: Vec<(Vec<Solution>, RefinementResult)> = Vec::new();
     let mut failure = None;
     for ratio in FILTER_POLE_RATIOS {
         // An initial guess that fails does not affect the others.
         match problem.start(ratio).and_then(|start| Ok((start.clone(), problem.iterate(start, settings)?))) {
-            Ok(end) => ends.push(end),
+            Ok(result) => refinements.push(result),
             Err(error) => failure = failure.or(Some(error)),
         }
     }
     // Best refinement of all equations together. Whether the separate estimates are stable depends on the initial
     // guess.
-    let mut together: Option<coupled::CoupledEstimate> = None;
+    let mut joint_refinement: Option<coupled::CoupledEstimate> = None;
     let mut refined: Vec<&[Solution]> = Vec::new();
-    for (start, ended) in ends.iter().filter(|_| structures.len() > 1) {
+    for (start, refinement) in refinements.iter().filter(|_| structures.len() > 1) {
         // Most initial guesses end at the same estimates, which have one refinement.
-        if refined.iter().any(|earlier| problem.has_converged_to(earlier, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
+        if refined
+            .iter()
+            .any(|previous| problem.has_converged_to(previous, &refinement.solutions, SAME_SOLUTION_TOLERANCE))
+        {
             continue;
         }
-        refined.push(&ended.solutions);
-        for from in [&ended.solutions, start] {
-            let Some(candidate) = problem.refine_together(from, settings)? else { continue };
-            if together.as_ref().is_none_or(|t| candidate.cost < t.cost) {
-                together = Some(candidate);
+        refined.push(&refinement.solutions);
+        for guess in [&refinement.solutions, start] {
+            let Some(candidate) = problem.refine_together(guess, settings)? else { continue };
+            if joint_refinement.as_ref().is_none_or(|t| candidate.cost < t.cost) {
+                joint_refinement = Some(candidate);
             }
             break;
         }
     }
-    let best = ends.into_iter().map(|(_, ended)| ended).min_by(|a, b| a.error.total_cmp(&b.error));
-    let Some(mut ended) = best else {
+    let best = refinements.into_iter().map(|(_, refinement)| refinement).min_by(|a, b| a.error.total_cmp(&b.error));
+    let Some(mut refinement) = best else {
         return Err(
             failure.unwrap_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })
         );
     };
-    if let Some(candidate) = together {
-        ended = RefinementResult {
-            error: ended.error,
+    if let Some(candidate) = joint_refinement {
+        refinement = RefinementResult {
+            error: refinement.error,
             solutions: candidate.solutions,
             covariances: candidate.covariances,
-            iterations: ended.iterations + candidate.iterations,
+            iterations: refinement.iterations + candidate.iterations,
             converged: candidate.converged,
             damped: false,
         };
     }
-    let estimates = ended
+    let estimates = refinement
         .solutions
         .into_iter()
         .zip(structures)
         .zip(exponents)
-        .zip(ended.covariances)
+        .zip(refinement.covariances)
         .map(|(((solution, structure), exponents), covariance)| {
-            let (coefficients, rest) = solution.split_at(structure.terms.len());
+            let (coefficients, initial_coefficients) = solution.split_at(structure.terms.len());
             let width = exponents.len();
-            let initial = (0..records.len()).map(|r| rest[r * width..(r + 1) * width].to_vec()).collect();
+            let initial =
+                (0..records.len()).map(|r| initial_coefficients[r * width..(r + 1) * width].to_vec()).collect();
             InstrumentalEstimate { coefficients: coefficients.to_vec(), initial, exponents, covariance }
         })
         .collect();
-    Ok(InstrumentalFit { estimates, iterations: ended.iterations, converged: ended.converged, damped: ended.damped })
+    Ok(InstrumentalFit {
+        estimates,
+        iterations: refinement.iterations,
+        converged: refinement.converged,
+        damped: refinement.damped,
+    })
 }
 
 struct CoupledProblem<'a> {
@@ -174,7 +183,7 @@ struct CoupledProblem<'a> {
     fixed: &'a [Vec<Option<f64>>],
     exponents: &'a [Vec<f64>],
     /// The excluded initial terms, per equation.
-    dropped: Vec<Dropped>,
+    excluded_terms: Vec<ExcludedTerms>,
     /// Spectra that do not change between iterations, indexed by equation and record.
     spectra: Vec<Vec<EquationSpectra<'a>>>,
     /// Spectra of terms with noise-free signals, indexed by equation, record and term; None if the measured signal is
@@ -200,19 +209,20 @@ impl<'a> CoupledProblem<'a> {
         (fixed, initial): (&'a [Vec<Option<f64>>], &Initial),
         exponents: &'a [Vec<f64>],
     ) -> Result<Self> {
-        let plain = |(structure, fixed): (&Structure, &Vec<Option<f64>>)| {
-            Ok(least_squares::fit(records, structure, fixed, initial)?.dropped)
+        let excluded_terms = |(structure, fixed): (&Structure, &Vec<Option<f64>>)| {
+            Ok(least_squares::fit(records, structure, fixed, initial)?.excluded_terms)
         };
-        let dropped = structures.iter().zip(fixed).map(plain).collect::<Result<Vec<Dropped>>>()?;
-        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<EquationSpectra<'a>> {
+        let excluded_terms =
+            structures.iter().zip(fixed).map(excluded_terms).collect::<Result<Vec<ExcludedTerms>>>()?;
+        let equation_spectra = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<EquationSpectra<'a>> {
             records.iter().map(|record| EquationSpectra::new(record, structure, exponents)).collect()
         };
-        let spectra: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
-        let substituted = |spectra: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
+        let spectra: Vec<Vec<EquationSpectra<'a>>> = structures.iter().zip(exponents).map(equation_spectra).collect();
+        let substitutes_of_equation = |spectra: &Vec<EquationSpectra<'a>>| -> Vec<Vec<Option<Kernel>>> {
             spectra.iter().zip(clean).map(|(spectra, clean)| spectra.substitute_spectra(clean, |_| true)).collect()
         };
-        let substitutes = spectra.iter().map(substituted).collect();
-        Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra, substitutes })
+        let substitutes = spectra.iter().map(substitutes_of_equation).collect();
+        Ok(Self { records, clean, structures, fixed, exponents, excluded_terms, spectra, substitutes })
     }
 
     /// Return the two-stage least-squares estimate of every equation: one step with noise-free signals as instruments.
@@ -230,8 +240,8 @@ impl<'a> CoupledProblem<'a> {
                 state_variable_filter(ratio * power_frequency(r.signal(structure.output), r.step()), structure.order, r)
             };
             let filters = self.records.iter().map(|r| Ok(Kernel::new(&filter(r)?))).collect::<Result<Vec<Kernel>>>()?;
-            let own: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
-            solutions.push(step(&sources, &filters, &own, fixed, &self.dropped[i], false, &mut scratch)?.0);
+            let outputs: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
+            solutions.push(step(&sources, &filters, &outputs, fixed, &self.excluded_terms[i], false, &mut scratch)?.0);
         }
         Ok(solutions)
     }
@@ -239,21 +249,21 @@ impl<'a> CoupledProblem<'a> {
     fn iterate(&self, mut solutions: Vec<Solution>, settings: InstrumentalSettings) -> Result<RefinementResult> {
         let mut scratch = Scratch::default();
         let mut best = (f64::INFINITY, solutions.clone());
-        let (mut iterations, mut converged, mut shortened) = (0, false, 0);
+        let (mut iterations, mut converged, mut halvings) = (0, false, 0);
         loop {
             let (responses, damped) = simulate_coupled(self.clean, self.structures, self.exponents, &solutions)?;
             let error = output_error(self.records, self.structures, &responses);
             if error < best.0 {
                 best = (error, solutions.clone());
-                shortened = 0;
+                halvings = 0;
             }
             let last = converged || iterations == settings.iterations;
-            if !last && shortened < MAX_STEP_HALVINGS && (error.is_nan() || error > MAX_ERROR_RATIO * best.0) {
+            if !last && halvings < MAX_STEP_HALVINGS && (error.is_nan() || error > MAX_ERROR_RATIO * best.0) {
                 // The step is too long: move half-way back to the best iterate.
                 for (x, y) in solutions.iter_mut().flatten().zip(best.1.iter().flatten()) {
                     *x = 0.5 * (*x + y);
                 }
-                shortened += 1;
+                halvings += 1;
                 iterations += 1;
                 continue;
             }
@@ -293,7 +303,7 @@ impl<'a> CoupledProblem<'a> {
             structures: self.structures,
             fixed: self.fixed,
             exponents: self.exponents,
-            dropped: &self.dropped,
+            excluded_terms: &self.excluded_terms,
         };
         match problem.refine(start, settings) {
             Err(Error::Singular { .. }) => Ok(None),
@@ -316,34 +326,39 @@ impl<'a> CoupledProblem<'a> {
             .iter()
             .zip(responses)
             .map(|(record, outputs)| {
-                let replaced = (0..record.len()).map(|s| match self.structures.iter().position(|e| e.output == s) {
+                let signals = (0..record.len()).map(|s| match self.structures.iter().position(|e| e.output == s) {
                     Some(i) => outputs[i].clone(),
                     None => record.signal(s).to_vec(),
                 });
-                Record::from_rows(record.step(), replaced.collect(), None)
+                Record::from_rows(record.step(), signals.collect(), None)
             })
             .collect::<Result<Vec<_>>>()?;
         let mut out = (Vec::new(), Vec::new());
         for (i, fixed) in self.fixed.iter().enumerate() {
-            let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
+            let is_simulated = |signal: usize| self.structures.iter().any(|e| e.output == signal);
             let pairs = self.spectra[i].iter().zip(&simulated);
             let kernels: Vec<Vec<Option<Kernel>>> =
-                pairs.map(|(spectra, record)| spectra.substitute_spectra(record, driven)).collect();
+                pairs.map(|(spectra, record)| spectra.substitute_spectra(record, is_simulated)).collect();
             let terms = &self.structures[i].terms;
             let sources: Vec<InstrumentSource<'_>> = (0..kernels.len())
                 .map(|r| {
-                    let of =
-                        |k: usize| if driven(terms[k].signal) { &kernels[r][k] } else { &self.substitutes[i][r][k] };
-                    self.spectra[i][r].source(|k| of(k).as_ref())
+                    let substitute = |k: usize| {
+                        if is_simulated(terms[k].signal) {
+                            &kernels[r][k]
+                        } else {
+                            &self.substitutes[i][r][k]
+                        }
+                    };
+                    self.spectra[i][r].source(|k| substitute(k).as_ref())
                 })
                 .collect();
             let filters = sources
                 .iter()
                 .map(|s| Ok(Kernel::new(&damped_inverse(&divisor(s, &solutions[i]))?.0)))
                 .collect::<Result<Vec<_>>>()?;
-            let own: Vec<Vec<f64>> = responses.iter().map(|outputs| outputs[i].clone()).collect();
+            let simulated_outputs: Vec<Vec<f64>> = responses.iter().map(|outputs| outputs[i].clone()).collect();
             let (solution, covariance) =
-                step(&sources, &filters, &own, fixed, &self.dropped[i], with_covariance, scratch)?;
+                step(&sources, &filters, &simulated_outputs, fixed, &self.excluded_terms[i], with_covariance, scratch)?;
             out.0.push(solution);
             out.1.push(covariance);
         }
@@ -357,8 +372,8 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
     for (record, outputs) in records.iter().zip(responses) {
         for (structure, response) in structures.iter().zip(outputs) {
             let y = record.signal(structure.output);
-            let missed: f64 = y.iter().zip(response).map(|(y, v)| (y - v) * (y - v)).sum();
-            total += missed / dot(y, y).max(f64::MIN_POSITIVE);
+            let residual_square_sum: f64 = y.iter().zip(response).map(|(y, v)| (y - v) * (y - v)).sum();
+            total += residual_square_sum / dot(y, y).max(f64::MIN_POSITIVE);
         }
     }
     total
@@ -380,14 +395,14 @@ fn simulate_coupled(
         let initial = initial_terms(r, structures, exponents, solutions);
         // Growth with the input is no instability. A response above ten times the measured amplitude counts as
         // unstable.
-        let bounded = |outputs: &[Vec<f64>]| {
+        let is_bounded = |outputs: &[Vec<f64>]| {
             outputs.iter().zip(structures).all(|(response, s)| {
                 let measured = record.signal(s.output).iter().fold(0.0_f64, |a, v| a.max(v.abs()));
                 response.iter().all(|v| v.abs() <= 10.0 * measured.max(f64::MIN_POSITIVE))
             })
         };
-        let (outputs, grown) = System::new(&equations, record)?.respond_stabilized(&initial, bounded)?;
-        damped |= grown;
+        let (outputs, is_damped) = System::new(&equations, record)?.respond_stabilized(&initial, is_bounded)?;
+        damped |= is_damped;
         out.push(outputs);
     }
     Ok((out, damped))

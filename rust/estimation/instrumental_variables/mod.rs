@@ -14,4 +14,4 @@ pub mod solution;
 pub use fit::{fit, InstrumentalEstimate, InstrumentalFit};
 pub use prefilter::{damped_inverse, low_pass, power_frequency, project, with_projections};
 pub use single::{refine, step, InstrumentSource, Scratch};
-pub use solution::{Dropped, InstrumentalSettings, Solution};
+pub use solution::{ExcludedTerms, InstrumentalSettings, Solution};

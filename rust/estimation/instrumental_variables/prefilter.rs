@@ -25,18 +25,21 @@ const INSTABILITY_PEAK_RATIO: f64 = 2.0;
 #[allow(clippy::cast_precision_loss)]
 pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     let m = divisor.len();
-    let one = unit(m);
-    let quotient = series::divide(&one, divisor)?;
+    let unit_series = unit(m);
+    let quotient = series::divide(&unit_series, divisor)?;
     if !is_unstable(&quotient) {
         return Ok((quotient, false));
     }
-    let finite = quotient.iter().all(|q| q.is_finite());
+    let is_finite = quotient.iter().all(|q| q.is_finite());
     let mut gamma = 4.0;
     loop {
         let rho = libm::exp(-gamma / m as f64);
         // 1/D(ρz) is the series of 1/D at ρz, unless that series overflows.
-        let damped =
-            if finite { scale_argument(rho, &quotient) } else { series::divide(&one, &scale_argument(rho, divisor))? };
+        let damped = if is_finite {
+            scale_argument(rho, &quotient)
+        } else {
+            series::divide(&unit_series, &scale_argument(rho, divisor))?
+        };
         // At γ = 64 m only the first term of D remains.
         if !is_unstable(&damped) || gamma > 64.0 * m as f64 {
             return Ok((damped, true));
@@ -81,13 +84,13 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
     }));
     let total: f64 = power.iter().sum();
     let mut sum = 0.0;
-    let at = power.iter().position(|p| {
+    let bin = power.iter().position(|p| {
         sum += p;
         sum >= 0.9 * total
     });
     // The bins are equally spaced from zero to the Nyquist frequency, which is the last bin.
     let bins = power.len().saturating_sub(1).max(1) as f64;
-    std::f64::consts::PI / step * at.unwrap_or(0).max(1) as f64 / bins
+    std::f64::consts::PI / step * bin.unwrap_or(0).max(1) as f64 / bins
 }
 
 /// Return the series of a second-order low-pass filter on the pulses of a record.
@@ -181,8 +184,8 @@ pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) 
 fn project_on_basis(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; signal.len()];
     for direction in basis {
-        let along = dot(direction, signal);
-        out.iter_mut().zip(direction).for_each(|(o, v)| *o += along * v);
+        let component = dot(direction, signal);
+        out.iter_mut().zip(direction).for_each(|(o, v)| *o += component * v);
     }
     out
 }
@@ -208,13 +211,13 @@ fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: 
     if !at_rest {
         columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
     }
-    let [once, twice] = [1.0, 2.0].map(|eta| block_pulse_kernel(eta, m, h));
+    let [first_kernel, second_kernel] = [1.0, 2.0].map(|eta| block_pulse_kernel(eta, m, h));
     let mut buffers = Buffers::default();
     for &input in inputs {
-        let driver = Kernel::new(record.signal(input));
-        let integrals = [&once, &twice].map(|kernel| {
+        let input_spectrum = Kernel::new(record.signal(input));
+        let integrals = [&first_kernel, &second_kernel].map(|kernel| {
             let mut integral = vec![0.0; m];
-            driver.apply(kernel, &mut integral, &mut buffers);
+            input_spectrum.apply(kernel, &mut integral, &mut buffers);
             integral
         });
         let spectra = [&integrals[0], &integrals[1]].map(|integral| Kernel::new(integral));
@@ -224,14 +227,16 @@ fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: 
             // Resonators with denominator s² + 2ζωs + ω² and numerators s and 1. With I = 1/s, their responses to u are
             // I u and I² u, both divided by 1 + 2ζωI + ω²I².
             let omega = low * libm::pow(10.0, decades * i as f64 / (count - 1) as f64);
-            let resonator =
-                once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
+            let resonator = first_kernel
+                .iter()
+                .zip(&second_kernel)
+                .map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
             let mut resonator: Vec<f64> = resonator.collect();
             resonator[0] += 1.0;
-            let answer = Kernel::with_buffers(&reciprocal(&resonator), &mut buffers);
+            let response = Kernel::with_buffers(&reciprocal(&resonator), &mut buffers);
             columns.extend(spectra.each_ref().map(|integral| {
                 let mut column = vec![0.0; m];
-                answer.times(integral, &mut column, &mut buffers);
+                response.times(integral, &mut column, &mut buffers);
                 column
             }));
         }

@@ -20,7 +20,7 @@ use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
 /// Signals of one record for one equation, with spectra that are padded for products of two series of m pulses.
 pub struct InstrumentSource<'a> {
     /// Per term of the output itself: the kernel of integration of order η, and its spectrum. None for other terms.
-    pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
+    pub output_terms: Vec<Option<(&'a [f64], &'a Kernel)>>,
     /// Per term: spectrum of its measured signal, integrated with order η.
     pub measured: Vec<&'a Kernel>,
     /// Per term: spectrum of its noise-free signal, integrated with order η.
@@ -90,17 +90,21 @@ impl<'a> EquationSpectra<'a> {
         substitute: &Record,
         is_selected: impl Fn(usize) -> bool,
     ) -> Vec<Option<Kernel>> {
-        let other = |s: usize| s != self.output && is_selected(s) && substitute.signal(s) != self.record.signal(s);
-        self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
+        let is_substituted =
+            |s: usize| s != self.output && is_selected(s) && substitute.signal(s) != self.record.signal(s);
+        self.terms
+            .iter()
+            .map(|t| is_substituted(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal))))
+            .collect()
     }
 
     /// Return the data of one step. `clean` returns the substitute spectrum of a term; if it returns None, the measured
     /// spectrum is used.
     pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> InstrumentSource<'b> {
-        let own = |t: &TermSpectra| t.signal == self.output;
+        let is_output_term = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();
         InstrumentSource {
-            own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
+            output_terms: terms().map(|t| is_output_term(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
             measured: terms().map(|t| &t.measured).collect(),
             clean: terms().enumerate().map(|(k, t)| clean(k).unwrap_or(&t.measured)).collect(),
             initial: self.initial.iter().collect(),
@@ -113,7 +117,7 @@ impl<'a> EquationSpectra<'a> {
 /// Divisor D = 1 − Σ c I^η over the terms of the output itself, as a series; I^η is integration of order η.
 pub(super) fn divisor(source: &InstrumentSource<'_>, coefficients: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; source.output.len()];
-    for (kernel, c) in source.own.iter().zip(coefficients) {
+    for (kernel, c) in source.output_terms.iter().zip(coefficients) {
         if let Some((kernel, _)) = kernel {
             out.iter_mut().zip(*kernel).for_each(|(d, v)| *d -= c * v);
         }
@@ -133,7 +137,7 @@ impl Scratch {
     /// Return work buffers for steps that end with [`Interrupted`](crate::error::Error::Interrupted) after a stop
     /// request.
     #[must_use]
-    pub fn until(stop: &Stop) -> Self {
+    pub fn with_stop(stop: &Stop) -> Self {
         Self { buffers: Buffers::default(), stop: stop.clone() }
     }
 }
@@ -141,9 +145,9 @@ impl Scratch {
 /// Compute new coefficients of one equation by one step of instrumental variables.
 ///
 /// `filters` are the prefilters 1/D̂ ([`damped_inverse`]) and `responses` the simulated outputs, one each per record.
-/// `fixed` has one entry per term: the value of a fixed coefficient, None for a free one. `dropped` lists (record
-/// index, exponent index) of excluded initial terms. Return the solution and the row-major covariance matrix of the
-/// free coefficients, which is empty if not requested.
+/// `fixed` has one entry per term: the value of a fixed coefficient, None for a free one. `excluded_terms` lists
+/// (record index, exponent index) of excluded initial terms. Return the solution and the row-major covariance matrix of
+/// the free coefficients, which is empty if not requested.
 ///
 /// # Errors
 /// [`Singular`](crate::error::Error::Singular) if the instruments do not identify the coefficients,
@@ -154,7 +158,7 @@ pub fn step(
     filters: &[Kernel],
     responses: &[Vec<f64>],
     fixed: &[Option<f64>],
-    dropped: &[(usize, usize)],
+    excluded_terms: &[(usize, usize)],
     with_covariance: bool,
     scratch: &mut Scratch,
 ) -> Result<(Solution, Vec<f64>)> {
@@ -162,7 +166,7 @@ pub fn step(
     let width = sources.first().map_or(0, |s| s.initial.len());
     let pairs: Vec<(usize, usize)> = (0..sources.len())
         .flat_map(|r| (0..width).map(move |i| (r, i)))
-        .filter(|place| !dropped.contains(place))
+        .filter(|position| !excluded_terms.contains(position))
         .collect();
     let k = free.len() + pairs.len();
     let (mut filtered, mut instruments) = (Vec::with_capacity(sources.len()), Vec::with_capacity(sources.len()));
@@ -180,37 +184,37 @@ pub fn step(
         }
         let simulated = Kernel::new(&product(filter, &Kernel::new(&responses[r]), m, scratch)?);
         let mut psi: Vec<Vec<f64>> = Vec::with_capacity(k);
-        for (place, &j) in free.iter().enumerate() {
-            psi.push(match source.own[j] {
-                None if std::ptr::eq(source.clean[j], source.measured[j]) => phi[place].clone(),
+        for (position, &j) in free.iter().enumerate() {
+            psi.push(match source.output_terms[j] {
+                None if std::ptr::eq(source.clean[j], source.measured[j]) => phi[position].clone(),
                 None => product(filter, source.clean[j], m, scratch)?,
                 Some((_, spectrum)) => product(&simulated, spectrum, m, scratch)?,
             });
         }
-        let mut places: Vec<usize> = (0..free.len()).collect();
-        for (place, &(_, i)) in pairs.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
+        let mut unknown_indices: Vec<usize> = (0..free.len()).collect();
+        for (position, &(_, i)) in pairs.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
             let column = product(filter, source.initial[i], m, scratch)?;
             psi.push(column.clone());
             phi.push(column);
-            places.push(free.len() + place);
+            unknown_indices.push(free.len() + position);
         }
         filtered.push(FilteredRegression { phi, target });
-        instruments.push(RecordInstruments { columns: psi, unknown_indices: places });
+        instruments.push(RecordInstruments { columns: psi, unknown_indices });
     }
     orthonormalize_instruments(&mut instruments, k)?;
     let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-    for (FilteredRegression { phi, target }, RecordInstruments { columns, unknown_indices: places }) in
+    for (FilteredRegression { phi, target }, RecordInstruments { columns, unknown_indices }) in
         filtered.iter().zip(&instruments)
     {
-        for (instrument, &a) in columns.iter().zip(places) {
+        for (instrument, &a) in columns.iter().zip(unknown_indices) {
             rhs[a] += dot(instrument, target);
-            for (regressor, &b) in phi.iter().zip(places) {
+            for (regressor, &b) in phi.iter().zip(unknown_indices) {
                 cross[a * k + b] += dot(instrument, regressor);
             }
         }
     }
-    let solved = EquilibratedLu::new(&cross, k)?;
-    let x = solved.solve(&rhs);
+    let factorization = EquilibratedLu::new(&cross, k)?;
+    let x = factorization.solve(&rhs);
     let mut solution: Solution = fixed.iter().map(|f| f.unwrap_or(0.0)).collect();
     for (&j, &value) in free.iter().zip(&x) {
         solution[j] = value;
@@ -230,7 +234,7 @@ pub fn step(
                 k,
             );
         }
-        let (n, inverse) = (free.len(), solved.inverse());
+        let (n, inverse) = (free.len(), factorization.inverse());
         covariance = vec![0.0; n * n];
         for a in 0..n {
             for b in 0..n {
@@ -256,11 +260,11 @@ struct FilteredRegression {
 impl FilteredRegression {
     /// Return the samplewise product of each instrument with the residuals at the coefficients `x`, one row each.
     fn scores(&self, instruments: &RecordInstruments, x: &[f64]) -> Vec<Vec<f64>> {
-        let mut rest = self.target.clone();
-        for (column, &place) in self.phi.iter().zip(&instruments.unknown_indices) {
-            rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
+        let mut residuals = self.target.clone();
+        for (column, &index) in self.phi.iter().zip(&instruments.unknown_indices) {
+            residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x[index] * v);
         }
-        instruments.columns.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
+        instruments.columns.iter().map(|p| p.iter().zip(&residuals).map(|(p, e)| p * e).collect()).collect()
     }
 }
 
@@ -285,7 +289,7 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Ve
 pub fn refine(
     sources: &[InstrumentSource<'_>],
     fixed: &[Option<f64>],
-    dropped: &[(usize, usize)],
+    excluded_terms: &[(usize, usize)],
     start: &[f64],
     settings: InstrumentalSettings,
     scratch: &mut Scratch,
@@ -300,8 +304,8 @@ pub fn refine(
             let (filter, _) = damped_inverse(&divisor(source, &solution))?;
             let mut sum = SumOfProducts::new(m);
             let spectrum = Kernel::new(&filter);
-            for (j, own) in source.own.iter().enumerate() {
-                if own.is_none() {
+            for (j, own_term) in source.output_terms.iter().enumerate() {
+                if own_term.is_none() {
                     sum.add(solution[j], source.clean[j], &spectrum);
                 }
             }
@@ -313,7 +317,7 @@ pub fn refine(
             filters.push(spectrum);
             responses.push(response);
         }
-        let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
+        let (next, _) = step(sources, &filters, &responses, fixed, excluded_terms, false, scratch)?;
         let converged = has_converged(&solution, &next, fixed.len(), settings.tolerance);
         solution = next;
         if converged {

@@ -39,18 +39,23 @@ impl InstrumentalSettings {
     /// assert!(InstrumentalSettings { iterations: 1 << 20, ..InstrumentalSettings::default() }.check().is_err());
     /// ```
     pub fn check(&self) -> Result<()> {
-        let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
+        let out_of_range = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
         if self.iterations > MAX_ITERATIONS {
             #[allow(clippy::cast_precision_loss)]
             let steps = self.iterations as f64;
             let remedy = "use fewer iterations; estimates that have not converged by then oscillate";
-            return refuse("iterations of instrumental variables", steps, &format!("[0, {MAX_ITERATIONS}]"), remedy);
+            return out_of_range(
+                "iterations of instrumental variables",
+                steps,
+                &format!("[0, {MAX_ITERATIONS}]"),
+                remedy,
+            );
         }
         if !(self.tolerance >= 0.0 && self.tolerance.is_finite()) {
             let remedy = "give the relative change at which the iterations stop";
-            return refuse("tolerance of instrumental variables", self.tolerance, "[0, ∞)", remedy);
+            return out_of_range("tolerance of instrumental variables", self.tolerance, "[0, ∞)", remedy);
         }
         Ok(())
     }
@@ -60,7 +65,7 @@ impl InstrumentalSettings {
 pub type Solution = Vec<f64>;
 
 /// The excluded initial terms of one equation, as pairs of record index and exponent index.
-pub type Dropped = Vec<(usize, usize)>;
+pub type ExcludedTerms = Vec<(usize, usize)>;
 
 /// Return the equations with the given structures and the term coefficients of the solutions.
 pub(super) fn equations(structures: &[Structure], solutions: &[Solution]) -> Vec<Equation> {
@@ -112,8 +117,8 @@ pub(super) struct RecordInstruments {
 }
 
 impl RecordInstruments {
-    fn column_of(&self, place: usize) -> Option<&Vec<f64>> {
-        self.unknown_indices.iter().position(|p| *p == place).map(|at| &self.columns[at])
+    fn column_of(&self, unknown: usize) -> Option<&Vec<f64>> {
+        self.unknown_indices.iter().position(|p| *p == unknown).map(|index| &self.columns[index])
     }
 }
 
@@ -134,106 +139,111 @@ const RANK_TOLERANCE: f64 = 1e-13;
 /// [`Error::Singular`] if an instrument depends linearly on the previous ones.
 pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: usize) -> Result<()> {
     let mut counts = vec![0; k];
-    records.iter().flat_map(|r| &r.unknown_indices).for_each(|&place| counts[place] += 1);
-    let singular = |place| Error::Singular { index: place, count: k };
+    records.iter().flat_map(|r| &r.unknown_indices).for_each(|&unknown| counts[unknown] += 1);
+    let singular = |unknown| Error::Singular { index: unknown, count: k };
     // Coefficients of a single record come first. Their columns in different records are orthogonal without
     // computation.
     for record in &mut *records {
-        for at in (0..record.unknown_indices.len()).filter(|&at| counts[record.unknown_indices[at]] == 1) {
-            let mut column = [std::mem::take(&mut record.columns[at])];
-            let spanned = orthonormalize_column(&mut column, |column| {
-                for before in (0..at).filter(|&before| counts[record.unknown_indices[before]] == 1) {
-                    subtract_projection(&mut column[0], &record.columns[before], None);
+        for index in (0..record.unknown_indices.len()).filter(|&index| counts[record.unknown_indices[index]] == 1) {
+            let mut column = [std::mem::take(&mut record.columns[index])];
+            let is_independent = orthonormalize_column(&mut column, |column| {
+                for previous in (0..index).filter(|&previous| counts[record.unknown_indices[previous]] == 1) {
+                    subtract_projection(&mut column[0], &record.columns[previous], None);
                 }
             });
-            if !spanned {
-                return Err(singular(record.unknown_indices[at]));
+            if !is_independent {
+                return Err(singular(record.unknown_indices[index]));
             }
-            [record.columns[at]] = column;
+            [record.columns[index]] = column;
         }
     }
-    let shared: Vec<usize> = (0..k).filter(|&place| counts[place] > 1).collect();
-    for (n, &place) in shared.iter().enumerate() {
+    let shared_unknowns: Vec<usize> = (0..k).filter(|&unknown| counts[unknown] > 1).collect();
+    for (n, &unknown) in shared_unknowns.iter().enumerate() {
         // The column of a coefficient is empty in records without it.
-        let mut pieces: Vec<Vec<f64>> =
-            records.iter().map(|r| r.column_of(place).cloned().unwrap_or_default()).collect();
-        let spanned = orthonormalize_column(&mut pieces, |pieces| {
-            for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
+        let mut parts: Vec<Vec<f64>> =
+            records.iter().map(|r| r.column_of(unknown).cloned().unwrap_or_default()).collect();
+        let is_independent = orthonormalize_column(&mut parts, |parts| {
+            for (part, record) in parts.iter_mut().zip(&*records).filter(|(part, _)| !part.is_empty()) {
                 for (column, _) in record.columns.iter().zip(&record.unknown_indices).filter(|(_, p)| counts[**p] == 1)
                 {
-                    subtract_projection(piece, column, None);
+                    subtract_projection(part, column, None);
                 }
             }
-            for &before in &shared[..n] {
-                let pairs = records.iter().map(|r| r.column_of(before)).zip(&*pieces);
-                let along =
-                    pairs.map(|(q, piece)| q.filter(|_| !piece.is_empty()).map_or(0.0, |q| dot(q, piece))).sum();
-                for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
-                    if let Some(q) = record.column_of(before) {
-                        subtract_projection(piece, q, Some(along));
+            for &previous in &shared_unknowns[..n] {
+                let pairs = records.iter().map(|r| r.column_of(previous)).zip(&*parts);
+                let component =
+                    pairs.map(|(q, part)| q.filter(|_| !part.is_empty()).map_or(0.0, |q| dot(q, part))).sum();
+                for (part, record) in parts.iter_mut().zip(&*records).filter(|(part, _)| !part.is_empty()) {
+                    if let Some(q) = record.column_of(previous) {
+                        subtract_projection(part, q, Some(component));
                     }
                 }
             }
         });
-        if !spanned {
-            return Err(singular(place));
+        if !is_independent {
+            return Err(singular(unknown));
         }
-        for (record, piece) in records.iter_mut().zip(pieces) {
-            if let Some(at) = record.unknown_indices.iter().position(|p| *p == place) {
-                record.columns[at] = piece;
+        for (record, part) in records.iter_mut().zip(parts) {
+            if let Some(index) = record.unknown_indices.iter().position(|p| *p == unknown) {
+                record.columns[index] = part;
             }
         }
     }
     Ok(())
 }
 
-/// Subtract `along` times a unit direction from a column. If `along` is None, it is the dot product of the two.
-fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>) {
-    let along = along.unwrap_or_else(|| dot(direction, column));
-    column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+/// Subtract `component` times a unit direction from a column. If `component` is None, it is the dot product of the two.
+fn subtract_projection(column: &mut [f64], direction: &[f64], component: Option<f64>) {
+    let component = component.unwrap_or_else(|| dot(direction, column));
+    column.iter_mut().zip(direction).for_each(|(v, q)| *v -= component * q);
 }
 
-/// Orthogonalize a column with the function `clear`, and normalize it. The orthogonalization is repeated once if it has
-/// at least halved the norm.
+/// Orthogonalize a column with the function `orthogonalize`, and normalize it. The orthogonalization is repeated once
+/// if it has at least halved the norm.
 ///
 /// The column is given as one part per record. Return false if the orthogonalized column is at rounding level.
-fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
-    let whole = stacked_norm(pieces);
-    let (mut before, mut remainder) = (whole, whole);
+fn orthonormalize_column(parts: &mut [Vec<f64>], orthogonalize: impl Fn(&mut [Vec<f64>])) -> bool {
+    let initial_norm = stacked_norm(parts);
+    let (mut previous_norm, mut norm) = (initial_norm, initial_norm);
     for _ in 0..2 {
-        clear(pieces);
-        remainder = stacked_norm(pieces);
+        orthogonalize(parts);
+        norm = stacked_norm(parts);
         // Rounding errors along the previous columns grow by the factor by which the norm has decreased.
-        if remainder > 0.5 * before {
+        if norm > 0.5 * previous_norm {
             break;
         }
-        before = remainder;
+        previous_norm = norm;
     }
-    let scale = 1.0 / remainder;
-    pieces.iter_mut().flatten().for_each(|v| *v *= scale);
-    remainder > RANK_TOLERANCE * whole && scale.is_finite() && remainder.is_finite()
+    let scale = 1.0 / norm;
+    parts.iter_mut().flatten().for_each(|v| *v *= scale);
+    norm > RANK_TOLERANCE * initial_norm && scale.is_finite() && norm.is_finite()
 }
 
-fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {
-    pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
+fn stacked_norm(parts: &[Vec<f64>]) -> f64 {
+    parts.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
 /// Add the long-run covariance of the summed scores to the k × k row-major matrix `score_covariance`.
 ///
-/// `scores` has one row of samples per instrument, and `places` contains the index of each instrument in the matrix.
-/// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610), because filtered residuals are not white if other
-/// measured outputs enter the equation.
+/// `scores` has one row of samples per instrument, and `unknown_indices` contains the index of each instrument in the
+/// matrix. Lags have Bartlett weights (Newey and West, doi:10.2307/1913610), because filtered residuals are not white
+/// if other measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], score_covariance: &mut [f64], k: usize) {
+pub(super) fn add_long_run_covariance(
+    scores: &[Vec<f64>],
+    unknown_indices: &[usize],
+    score_covariance: &mut [f64],
+    k: usize,
+) {
     let m = scores.first().map_or(0, Vec::len);
     let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m.saturating_sub(1));
-    for (left, &a) in scores.iter().zip(places) {
-        for (right, &b) in scores.iter().zip(places) {
+    for (left, &a) in scores.iter().zip(unknown_indices) {
+        for (right, &b) in scores.iter().zip(unknown_indices) {
             score_covariance[a * k + b] += dot(left, right);
             for lag in 1..=lags {
                 let weight = 1.0 - lag as f64 / (lags + 1) as f64;
-                let both = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
-                score_covariance[a * k + b] += weight * both;
+                let lag_products = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
+                score_covariance[a * k + b] += weight * lag_products;
             }
         }
     }

@@ -9,7 +9,7 @@ use crate::estimation::output_error::{
 };
 use crate::expression::DerivedSignal;
 use crate::linalg::dense;
-use crate::nonlinear::{self, FreeFrictionLaw, NonlinearModel, Start};
+use crate::nonlinear::{self, FreeFrictionLaw, InitialGuess, NonlinearModel};
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
@@ -156,7 +156,7 @@ impl Problem {
         }
         let filtered = nonlinear::filtered_outputs(experiments);
         let Iterate { point: ParameterPoint { orders, coefficients, inputs }, states } = start.clone();
-        let start = Start { orders, coefficients, inputs, states };
+        let start = InitialGuess { orders, coefficients, inputs, states };
         let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
         let model = NonlinearModel { model, derived, frictions, filtered };
         let optimum = nonlinear::fit(&model, experiments, &start, settings, stop)?;

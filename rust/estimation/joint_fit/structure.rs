@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::equation::{alpha_fits, missing_signal_error, tidy, AffineOrder, Initial};
+use crate::equation::{alpha_fits, missing_signal_error, round_order, AffineOrder, Initial};
 use crate::error::{Error, Result};
 use crate::estimation::output_error::FreeInput;
 use crate::expression::DerivedSignal;
-use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
+use crate::fractional::kernels::{MAX_ORDER_EXCESS, MIN_INPUT_ORDER};
 
 /// Difference below which two orders count as equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
@@ -147,7 +147,7 @@ impl ParametricEquation {
             let fits = if term.signal == self.output {
                 (0.0..alpha).contains(&order)
             } else {
-                order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - ORDER_TOLERANCE
+                order >= MIN_INPUT_ORDER && order < alpha + MAX_ORDER_EXCESS - ORDER_TOLERANCE
             };
             if !fits {
                 let what = format!("order {order} of signal {} with order alpha = {alpha} of the output", term.signal);
@@ -415,7 +415,7 @@ impl Order {
     #[must_use]
     pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         let weighted = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
-        let constant = tidy(self.constant + weighted.sum::<f64>());
+        let constant = round_order(self.constant + weighted.sum::<f64>());
         let weights = self.weights.iter().filter(|(name, _)| !values.contains_key(name)).cloned().collect();
         Self { constant, weights }
     }

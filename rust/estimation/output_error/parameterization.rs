@@ -426,7 +426,7 @@ impl InputLaw {
 
     /// Return the jumps of a zero-order hold within pulses after the nonlinearity, each with its derivatives.
     ///
-    /// The second of each pair contains the derivatives of `share`, `before` and `after` with respect to the parameter.
+    /// The second of each pair contains the derivatives of `fraction`, `before` and `after` by the parameter.
     /// Saturation and dead zone act on both values of each of `jumps`. A delay ignores `jumps`: the input is assumed to
     /// jump at pulse edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
     ///
@@ -448,9 +448,9 @@ impl InputLaw {
                 return Ok(Vec::new());
             }
             let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
-            let slope = |pulse| PulseJump { pulse, share: 1.0 / step, before: 0.0, after: 0.0 };
+            let slope = |pulse| PulseJump { pulse, fraction: 1.0 / step, before: 0.0, after: 0.0 };
             let pairs = far.into_iter().zip(near).enumerate().filter(|(_, (before, after))| before != after);
-            let jump = |(pulse, (before, after))| (PulseJump { pulse, share, before, after }, slope(pulse));
+            let jump = |(pulse, (before, after))| (PulseJump { pulse, fraction: share, before, after }, slope(pulse));
             return Ok(pairs.map(jump).collect());
         }
         let ends: Vec<f64> = jumps.iter().flat_map(|jump| [jump.before, jump.after]).collect();
@@ -458,7 +458,7 @@ impl InputLaw {
         let jump = |(jump, (ends, slopes)): (&PulseJump, (&[f64], &[f64]))| {
             (
                 PulseJump { before: ends[0], after: ends[1], ..*jump },
-                PulseJump { pulse: jump.pulse, share: 0.0, before: slopes[0], after: slopes[1] },
+                PulseJump { pulse: jump.pulse, fraction: 0.0, before: slopes[0], after: slopes[1] },
             )
         };
         Ok(jumps.iter().zip(ends.chunks(2).zip(slopes.chunks(2))).map(jump).collect())

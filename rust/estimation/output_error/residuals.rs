@@ -17,7 +17,7 @@ use super::system_inverse::{Operator, PulseMeans, SystemInverse};
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimation::least_squares;
-use crate::fractional::kernels::MAX_EXCESS;
+use crate::fractional::kernels::MAX_ORDER_EXCESS;
 use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
@@ -198,7 +198,7 @@ impl FreeModel {
                     // The derivative of a jump is infinite.
                     0.0
                 } else {
-                    MIN_INTEGRATION_ORDER - MAX_EXCESS
+                    MIN_INTEGRATION_ORDER - MAX_ORDER_EXCESS
                 };
                 if eta < least {
                     // This is reported as divergence, so that the optimization shortens its step.

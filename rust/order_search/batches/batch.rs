@@ -79,16 +79,16 @@ impl<'a> BatchEvaluation<'a> {
     }
 
     /// Screen the candidates in the index range `bounds` and simulate those that no bound excludes, starting at the
-    /// position `place`. Return false if the position belongs to another evaluation sequence, which may occur on
+    /// position `position`. Return false if the position belongs to another evaluation sequence, which may occur on
     /// another kind of processor.
     pub(super) fn evaluate_batch(
         &mut self,
         bounds: (u64, u64),
         top_rows: &mut TopRows,
-        mut place: BatchPosition,
+        mut position: BatchPosition,
     ) -> Result<bool> {
         let (start, end) = bounds;
-        let (limit, resumed) = (top_rows.limit, place.end > 0);
+        let (limit, is_resumed) = (top_rows.limit, position.end > 0);
         let (candidate_index, control) = (self.candidate_index, self.control);
         let parts: Vec<(Vec<OpenCandidate>, Vec<u64>, u64)> = self.pool.install(|| {
             self.chunks(start, end, limit)
@@ -106,9 +106,9 @@ impl<'a> BatchEvaluation<'a> {
                             let (open, singular) = screen(candidate_index, lo, hi, limit);
                             (open, singular, 0)
                         });
-                    let closed = hi - lo - (boxes_outcome.0.len() + boxes_outcome.1.len()) as u64;
-                    if !resumed {
-                        control.count(closed + boxes_outcome.1.len() as u64, closed);
+                    let excluded_count = hi - lo - (boxes_outcome.0.len() + boxes_outcome.1.len()) as u64;
+                    if !is_resumed {
+                        control.count(excluded_count + boxes_outcome.1.len() as u64, excluded_count);
                     }
                     boxes_outcome
                 })
@@ -117,28 +117,28 @@ impl<'a> BatchEvaluation<'a> {
         self.check_stop()?;
         let mut open: Vec<OpenCandidate> = Vec::new();
         let mut singular: Vec<u64> = Vec::new();
-        let mut boxed = 0;
-        for (boxes_outcome, failed, excluded) in parts {
+        let mut excluded_by_box = 0;
+        for (boxes_outcome, failed, excluded_in_part) in parts {
             open.extend(boxes_outcome);
             singular.extend(failed);
-            boxed += excluded;
+            excluded_by_box += excluded_in_part;
         }
         sort_by_guess(&mut open);
         let order = digest(&open);
-        if !place.fits(open.len() as u64, order) {
+        if !position.is_compatible(open.len() as u64, order) {
             return Ok(false);
         }
-        place.order = order;
-        if !resumed {
+        position.order = order;
+        if !is_resumed {
             let failed = singular.len() as u64;
             self.result.counts.singular += failed;
             self.result.counts.excluded_by_bound += end - start - open.len() as u64 - failed;
-            self.result.counts.excluded_by_box += boxed;
+            self.result.counts.excluded_by_box += excluded_by_box;
             self.result
                 .failures
                 .extend(singular.into_iter().take(MAX_LISTED_FAILURES).map(|index| (index, Failure::Singular)));
         }
-        self.simulate_open(&open, top_rows, place, true).map(|()| true)
+        self.simulate_open(&open, top_rows, position, true).map(|()| true)
     }
 
     /// Return true if boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates of trial slices, at a
@@ -147,22 +147,22 @@ impl<'a> BatchEvaluation<'a> {
         let Some(boxes) = self.boxes else { return Ok(false) };
         let (candidate_index, control) = (self.candidate_index, self.control);
         let order = low_discrepancy_order(candidate_index.grid.count());
-        let places: Vec<u64> = (0..TRIAL_SLICES.min(candidate_index.grid.count())).map(order).collect();
+        let trial_indices: Vec<u64> = (0..TRIAL_SLICES.min(candidate_index.grid.count())).map(order).collect();
         let counts: Vec<(u64, u64)> = self.pool.install(|| {
-            places
+            trial_indices
                 .into_par_iter()
                 .with_max_len(1)
-                .filter_map(|at| {
-                    let slice = candidate_index.grid.slice_at(at).filter(|_| !control.is_stopped())?;
+                .filter_map(|index| {
+                    let slice = candidate_index.grid.slice_at(index).filter(|_| !control.is_stopped())?;
                     let end = slice.hi.min(slice.lo + MIN_SLICE_CANDIDATES);
-                    let (.., boxed) = screen_slice(candidate_index, boxes, &slice, (slice.lo, end), limit)?;
-                    Some((end - slice.lo, boxed))
+                    let (.., excluded) = screen_slice(candidate_index, boxes, &slice, (slice.lo, end), limit)?;
+                    Some((end - slice.lo, excluded))
                 })
                 .collect()
         });
         self.check_stop()?;
-        let (all, boxed) = counts.iter().fold((0, 0), |sums, counts| (sums.0 + counts.0, sums.1 + counts.1));
-        Ok(boxed * MAX_CANDIDATES_PER_EXCLUSION > all)
+        let (all, excluded) = counts.iter().fold((0, 0), |sums, counts| (sums.0 + counts.0, sums.1 + counts.1));
+        Ok(excluded * MAX_CANDIDATES_PER_EXCLUSION > all)
     }
 
     /// Split the candidates `start … end − 1` of a batch into chunks, one per parallel task: (first candidate,
@@ -171,59 +171,60 @@ impl<'a> BatchEvaluation<'a> {
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<GridSlice>)> {
         let mut chunks = Vec::new();
         // With boxes, a chunk must not extend far into the next slice.
-        let plain = self.candidate_index.problem.residual_sums.is_some() && self.boxes.is_none();
-        let chunk = if plain { GRAM_CHUNK_CANDIDATES } else { BOUND_CHUNK_CANDIDATES };
-        let mut at = start;
-        while at < end {
-            let boxed =
-                self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.candidate_index.grid.slice_at(at));
-            if let Some(slice) = boxed {
-                let to = end.min(slice.hi);
-                if to - at >= MIN_SLICE_CANDIDATES {
-                    chunks.push((at, to, Some(slice)));
-                    at = to;
+        let is_screened_by_gram = self.candidate_index.problem.residual_sums.is_some() && self.boxes.is_none();
+        let chunk = if is_screened_by_gram { GRAM_CHUNK_CANDIDATES } else { BOUND_CHUNK_CANDIDATES };
+        let mut first = start;
+        while first < end {
+            let box_slice =
+                self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.candidate_index.grid.slice_at(first));
+            if let Some(slice) = box_slice {
+                let chunk_end = end.min(slice.hi);
+                if chunk_end - first >= MIN_SLICE_CANDIDATES {
+                    chunks.push((first, chunk_end, Some(slice)));
+                    first = chunk_end;
                     continue;
                 }
             }
-            let to = end.min(at + chunk);
-            chunks.push((at, to, None));
-            at = to;
+            let chunk_end = end.min(first + chunk);
+            chunks.push((first, chunk_end, None));
+            first = chunk_end;
         }
         chunks
     }
 
-    /// Simulate the candidates `open` in the given sequence, starting at the position `place`, and add their rows to
-    /// `top_rows`. If `counted` is true, counts and checkpoints are updated.
+    /// Simulate the candidates `open` in the given sequence, starting at the position `position`, and add their rows to
+    /// `top_rows`. If `counts_outcomes` is true, counts and checkpoints are updated.
     pub(super) fn simulate_open(
         &mut self,
         open: &[OpenCandidate],
         top_rows: &mut TopRows,
-        mut place: BatchPosition,
-        counted: bool,
+        mut position: BatchPosition,
+        counts_outcomes: bool,
     ) -> Result<()> {
         if open.is_empty() {
             return Ok(());
         }
         let CandidateIndex { problem, options, .. } = self.candidate_index;
-        let saving = counted && self.control.saving.load(Ordering::Relaxed);
+        let saving = counts_outcomes && self.control.saving.load(Ordering::Relaxed);
         // A refinement costs about ten times a simulation.
         let pulses = if problem.refines() { CHECKPOINT_PULSES / 8 } else { CHECKPOINT_PULSES };
-        let piece = if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
-        let (first, largest) = if problem.refines() { REFINEMENT_CHUNK_RANGE } else { SIMULATION_CHUNK_RANGE };
-        let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
-        if place.end == 0 {
-            place.size = first;
-            place.end = batch(place.size) as u64;
-            place.limit = top_rows.limit;
+        let max_chunk =
+            if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
+        let (initial_size, max_size) = if problem.refines() { REFINEMENT_CHUNK_RANGE } else { SIMULATION_CHUNK_RANGE };
+        let to_index = |count: u64| usize::try_from(count).unwrap_or(usize::MAX).min(open.len());
+        if position.end == 0 {
+            position.size = initial_size;
+            position.end = to_index(position.size) as u64;
+            position.limit = top_rows.limit;
         }
         loop {
-            let limit = place.limit;
+            let limit = position.limit;
             top_rows.limit = limit;
-            while place.evaluated_count < place.end {
-                let (start, end) = (batch(place.evaluated_count), batch(place.end));
-                let end = end.min(start.saturating_add(piece));
-                let rows = self.simulate_chunk(&open[start..end], limit, counted)?;
-                place.evaluated_count = end as u64;
+            while position.evaluated_count < position.end {
+                let (start, end) = (to_index(position.evaluated_count), to_index(position.end));
+                let end = end.min(start.saturating_add(max_chunk));
+                let rows = self.simulate_chunk(&open[start..end], limit, counts_outcomes)?;
+                position.evaluated_count = end as u64;
                 if saving {
                     top_rows.insert_rows(rows.iter().cloned());
                     self.result.failures.sort_unstable();
@@ -231,27 +232,27 @@ impl<'a> BatchEvaluation<'a> {
                     let rows = rows.into_iter().filter(|row| top_rows.contains(row)).collect();
                     let part = Part { rows, counts: self.result.counts, failures: self.result.failures.clone() };
                     let replaces_previous = std::mem::take(&mut self.replaces_previous);
-                    self.control.save(Checkpoint { place, replaces_previous, part });
+                    self.control.save(Checkpoint { position, replaces_previous, part });
                 } else {
                     top_rows.insert_rows(rows.into_iter());
                 }
             }
             top_rows.lower_limit(options.pruning);
-            if batch(place.end) == open.len() {
+            if to_index(position.end) == open.len() {
                 return Ok(());
             }
-            place.size = place.size.saturating_mul(2).min(largest);
-            place.end = batch(place.end.saturating_add(place.size)) as u64;
-            place.limit = top_rows.limit;
+            position.size = position.size.saturating_mul(2).min(max_size);
+            position.end = to_index(position.end.saturating_add(position.size)) as u64;
+            position.limit = top_rows.limit;
         }
     }
 
     /// Simulate these candidates up to a limit of the raw score (Σ|e| or Σe²). Return the rows of candidates whose
-    /// score is at most the limit. If `counted` is true, counts are updated.
-    fn simulate_chunk(&mut self, open: &[OpenCandidate], limit: f64, counted: bool) -> Result<Vec<Row>> {
+    /// score is at most the limit. If `counts_outcomes` is true, counts are updated.
+    fn simulate_chunk(&mut self, open: &[OpenCandidate], limit: f64, counts_outcomes: bool) -> Result<Vec<Row>> {
         let (candidate_index, control, scratches) = (self.candidate_index, self.control, &self.scratches);
         let problem = &candidate_index.problem;
-        let visit = |candidate: &OpenCandidate| {
+        let evaluate = |candidate: &OpenCandidate| {
             if control.is_stopped() {
                 return None;
             }
@@ -276,18 +277,18 @@ impl<'a> BatchEvaluation<'a> {
                 scratch.positions = positions;
                 scratch.initial = initial;
                 // [`Self::count_verdict`] counts candidates that a bound excludes as processed.
-                if counted && !matches!(verdict, Verdict::Bounded(_)) {
+                if counts_outcomes && !matches!(verdict, Verdict::Bounded(_)) {
                     control.count(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
                 }
                 Some((candidate.index, verdict, row))
             })
         };
-        let least = if problem.refines() { 1 } else { 4 };
-        let results: Vec<_> = self.pool.install(|| open.par_iter().with_min_len(least).map(visit).collect());
+        let min_items = if problem.refines() { 1 } else { 4 };
+        let results: Vec<_> = self.pool.install(|| open.par_iter().with_min_len(min_items).map(evaluate).collect());
         self.check_stop()?;
         let mut rows = Vec::new();
         for (index, verdict, row) in results.into_iter().flatten() {
-            if counted {
+            if counts_outcomes {
                 self.count_verdict(index, verdict);
             }
             rows.extend(row);
@@ -319,9 +320,9 @@ impl<'a> BatchEvaluation<'a> {
 /// their indices without the last bit.
 fn digest(open: &[OpenCandidate]) -> u64 {
     let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
-    let whole =
+    let hash_value =
         bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
-    (whole >> 1).max(1)
+    (hash_value >> 1).max(1)
 }
 
 #[cfg(test)]

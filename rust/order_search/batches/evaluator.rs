@@ -107,14 +107,15 @@ impl<'a> BatchEvaluator<'a> {
         control.check_stop()?;
         let problem = &candidate_index.problem;
         // An initial sample of few refined candidates would cost as much as the search.
-        let few = problem.refines() && count <= MAX_UNSAMPLED_CANDIDATES;
-        if few || (problem.bound.is_none() && problem.residual_sums.is_none()) {
+        let is_small = problem.refines() && count <= MAX_UNSAMPLED_CANDIDATES;
+        if is_small || (problem.bound.is_none() && problem.residual_sums.is_none()) {
             return Ok(Self { candidate_index, boxes: None, limit: f64::INFINITY });
         }
         let uses_boxes = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&candidate_index);
-        let closely = uses_close_bounds(count, options);
+        let may_use_close_bounds = uses_close_bounds(count, options);
         let InitialIncumbent { mut top_rows, mut evaluated, needs_close_bounds, selected_vectors: selected } =
-            BatchEvaluation::new(&candidate_index, None, pool, control).find_incumbent(uses_boxes, closely)?;
+            BatchEvaluation::new(&candidate_index, None, pool, control)
+                .find_incumbent(uses_boxes, may_use_close_bounds)?;
         if let Some(selected) = selected {
             let problem = &mut candidate_index.problem;
             problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&selected));
@@ -125,7 +126,7 @@ impl<'a> BatchEvaluator<'a> {
             candidate_index.problem.tailored_vectors = Some(tailored);
             for pass in 0.. {
                 let best = top_rows.rows.first().map(|row| row.index);
-                let GeneratedVectors { vectors, open: candidates, is_worth_repeating: again } =
+                let GeneratedVectors { vectors, open: candidates, is_worth_repeating: repeats } =
                     BatchEvaluation::new(&candidate_index, None, pool, control).generate_tailored_vectors(
                         top_rows.limit,
                         pass,
@@ -142,20 +143,21 @@ impl<'a> BatchEvaluator<'a> {
                     &mut top_rows,
                     &mut evaluated,
                 )?;
-                if !again {
+                if !repeats {
                     break;
                 }
             }
         }
         let limit = top_rows.limit;
         if needs_close_bounds {
-            let spare = candidate_index.spare_bytes;
-            candidate_index.spare_bytes -= pool.install(|| candidate_index.problem.add_unstable_zeros(spare));
-            let along =
+            let spare_bytes = candidate_index.spare_bytes;
+            candidate_index.spare_bytes -= pool.install(|| candidate_index.problem.add_unstable_zeros(spare_bytes));
+            let linearized_vectors =
                 BatchEvaluation::new(&candidate_index, None, pool, control).generate_linearized_vectors(limit)?;
-            if let Some(along) = along {
-                candidate_index.spare_bytes = candidate_index.spare_bytes.saturating_sub(along.memory_bytes());
-                candidate_index.problem.linearized_vectors = Some(along);
+            if let Some(linearized_vectors) = linearized_vectors {
+                candidate_index.spare_bytes =
+                    candidate_index.spare_bytes.saturating_sub(linearized_vectors.memory_bytes());
+                candidate_index.problem.linearized_vectors = Some(linearized_vectors);
             }
         }
         let mut boxes = pool.install(|| if uses_boxes { BranchAndBound::new(&candidate_index) } else { None });
@@ -175,10 +177,10 @@ impl<'a> BatchEvaluator<'a> {
     /// Evaluate batches `first … last − 1`, and return their counts and best rows. The batches must belong to one
     /// generation ([`generation_ends`]).
     ///
-    /// `seed` lists index and raw score (Σ|e| or Σe²) of the best rows found before the generation. `from` resumes a
-    /// checkpoint of the same range and seed. The checkpoint must contain all rows found since the start of the range.
-    /// The range is restarted if the checkpoint belongs to another evaluation sequence, which may occur on another kind
-    /// of processor.
+    /// `seed` lists index and raw score (Σ|e| or Σe²) of the best rows found before the generation. `start_checkpoint`
+    /// resumes a checkpoint of the same range and seed. The checkpoint must contain all rows found since the start of
+    /// the range. The range is restarted if the checkpoint belongs to another evaluation sequence, which may occur on
+    /// another kind of processor.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`] after a stop request. [`crate::error::Error::Structure`] for batches, a
@@ -215,67 +217,68 @@ impl<'a> BatchEvaluator<'a> {
         first: u64,
         last: u64,
         seed: &[(u64, f64)],
-        from: Option<Checkpoint>,
+        start_checkpoint: Option<Checkpoint>,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Part> {
         let CandidateIndex { grid, options, .. } = &self.candidate_index;
         let count = grid.count();
         let (all, length) = (batch_count(count, options), batch_size(count, options));
-        let is_first = from.is_none();
-        let from = from.unwrap_or_else(|| Checkpoint {
-            place: BatchPosition::start(first),
+        let is_first = start_checkpoint.is_none();
+        let start_checkpoint = start_checkpoint.unwrap_or_else(|| Checkpoint {
+            position: BatchPosition::start(first),
             replaces_previous: true,
             part: Part::default(),
         });
-        if !(first <= from.place.batch && from.place.batch <= last && last <= all) {
-            let what = format!("batches {first} to {last} from {} on are not among {all}", from.place.batch);
+        if !(first <= start_checkpoint.position.batch && start_checkpoint.position.batch <= last && last <= all) {
+            let what =
+                format!("batches {first} to {last} from {} on are not among {all}", start_checkpoint.position.batch);
             return Err(mismatch_error(what));
         }
-        if !from.place.is_valid() {
-            let BatchPosition { evaluated_count: followed, end, size, limit, .. } = from.place;
+        if !start_checkpoint.position.is_valid() {
+            let BatchPosition { evaluated_count: evaluated, end, size, limit, .. } = start_checkpoint.position;
             return Err(mismatch_error(format!(
-                "a checkpoint stands at {followed} of {end} ({size} at a time, limit {limit})"
+                "a checkpoint stands at {evaluated} of {end} ({size} at a time, limit {limit})"
             )));
         }
         if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || is_invalid_score(*score)) {
             return Err(mismatch_error(format!("a row of score {score} has index {index} among {count} candidates")));
         }
-        self.check(&from.part)?;
+        self.check(&start_checkpoint.part)?;
         // Batches are distributed over the grid. Early generations therefore sample all of it, and later ones start
         // with a low limit.
         let order = low_discrepancy_order(all);
         let mut evaluation = BatchEvaluation::new(&self.candidate_index, self.boxes.as_ref(), pool, control);
-        let Checkpoint { mut place, part, .. } = from;
+        let Checkpoint { mut position, part, .. } = start_checkpoint;
         control.total.store(count, Ordering::Relaxed);
         let processed = part.counts.processed_count();
         control.count(processed, 0);
         evaluation.result = part;
         evaluation.replaces_previous = is_first;
-        while place.batch < last {
-            let start = order(place.batch) * length;
+        while position.batch < last {
+            let start = order(position.batch) * length;
             let bounds = (start, count.min(start + length));
-            let own = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
+            let is_in_batch = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
             let mut top_rows = TopRows::new(options.top, self.limit);
             let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
             top_rows.insert_rows(seeds);
             top_rows.lower_limit(options.pruning);
-            top_rows.insert_rows(evaluation.result.rows.iter().filter(|row| own(row)).cloned());
-            evaluation.result.rows.retain(|row| !own(row));
-            if !evaluation.evaluate_batch(bounds, &mut top_rows, place)? {
+            top_rows.insert_rows(evaluation.result.rows.iter().filter(|row| is_in_batch(row)).cloned());
+            evaluation.result.rows.retain(|row| !is_in_batch(row));
+            if !evaluation.evaluate_batch(bounds, &mut top_rows, position)? {
                 // Some candidates would be evaluated twice or never, so the result of the checkpoint is discarded.
                 control.finished_count.fetch_sub(processed, Ordering::Relaxed);
-                (evaluation.result, evaluation.replaces_previous, place) =
+                (evaluation.result, evaluation.replaces_previous, position) =
                     (Part::default(), true, BatchPosition::start(first));
                 continue;
             }
             let part = Part {
-                rows: top_rows.rows.into_iter().filter(own).collect(),
+                rows: top_rows.rows.into_iter().filter(is_in_batch).collect(),
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
                 failures: Vec::new(),
             };
             evaluation.result.merge(part, options.top);
-            place = BatchPosition::start(place.batch + 1);
+            position = BatchPosition::start(position.batch + 1);
         }
         Ok(evaluation.result)
     }

@@ -47,16 +47,21 @@ pub(super) struct InitialIncumbent {
 impl BatchEvaluation<'_> {
     /// Find an initial incumbent, and select the test vectors of the lower bounds that save time.
     ///
-    /// If `thorough` is true, the neighbors of the best candidates are also evaluated. If `closely` is true, also decide
-    /// whether the expensive bounds (by unstable zeros and by linearized test vectors) save time.
-    pub(super) fn find_incumbent(&mut self, thorough: bool, closely: bool) -> Result<InitialIncumbent> {
+    /// If `searches_neighbors` is true, the neighbors of the best candidates are also evaluated. If
+    /// `may_use_close_bounds` is true, also decide whether the expensive bounds (by unstable zeros and by linearized
+    /// test vectors) save time.
+    pub(super) fn find_incumbent(
+        &mut self,
+        searches_neighbors: bool,
+        may_use_close_bounds: bool,
+    ) -> Result<InitialIncumbent> {
         let candidate_index = self.candidate_index;
         let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
         let count = grid.count();
         let order = low_discrepancy_order(count);
-        let refined = problem.refines();
+        let refines = problem.refines();
         let indices: Vec<u64> =
-            (0..count.min(if refined { RANKED_CANDIDATES } else { INITIAL_SAMPLE_CANDIDATES })).map(order).collect();
+            (0..count.min(if refines { RANKED_CANDIDATES } else { INITIAL_SAMPLE_CANDIDATES })).map(order).collect();
         let candidates: Vec<Option<(OpenCandidate, Vec<f64>)>> = self.pool.install(|| {
             indices
                 .par_iter()
@@ -78,72 +83,75 @@ impl BatchEvaluation<'_> {
                         let e = initial.len();
                         (&positions[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
                     };
-                    let (mut each, mut guess) = (Vec::new(), 0.0);
+                    let (mut vector_bounds, mut guess) = (Vec::new(), 0.0);
                     if let Some(bound) = &problem.bound {
-                        if !refined {
-                            each = vec![0.0; bound.len()];
-                            bound.bound_per_vector(columns, &mut each);
+                        if !refines {
+                            vector_bounds = vec![0.0; bound.len()];
+                            bound.bound_per_vector(columns, &mut vector_bounds);
                         }
                         guess = bound.evaluate(f64::INFINITY, columns).1;
                     } else if let Some(squares) = &problem.residual_sums {
                         guess = squares.error(&sources, &solve.coefficients).1[0];
                     }
-                    Some((OpenCandidate { index, bound: 0.0, guess }, each))
+                    Some((OpenCandidate { index, bound: 0.0, guess }, vector_bounds))
                 })
                 .collect()
         });
         self.check_stop()?;
         let candidates: Vec<(OpenCandidate, Vec<f64>)> = candidates.into_iter().flatten().collect();
-        let mut likely: Vec<OpenCandidate> = candidates.iter().map(|(open, _)| *open).collect();
-        sort_by_guess(&mut likely);
+        let mut best_candidates: Vec<OpenCandidate> = candidates.iter().map(|(open, _)| *open).collect();
+        sort_by_guess(&mut best_candidates);
         let top = candidate_index.options.top;
-        likely.truncate(top.max(16).saturating_mul(4));
+        best_candidates.truncate(top.max(16).saturating_mul(4));
         let mut top_rows = TopRows::new(top, f64::INFINITY);
-        self.simulate_open(&likely, &mut top_rows, BatchPosition::start(0), false)?;
-        let mut evaluated: HashSet<u64> = likely.iter().map(|open| open.index).collect();
-        let many = |limit: f64| {
-            let waiting = candidates.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
-            waiting * HARD_SEARCH_OPEN_RATIO >= candidates.len()
+        self.simulate_open(&best_candidates, &mut top_rows, BatchPosition::start(0), false)?;
+        let mut evaluated: HashSet<u64> = best_candidates.iter().map(|open| open.index).collect();
+        let leaves_many_open = |limit: f64| {
+            let open_count = candidates
+                .iter()
+                .filter(|(_, vector_bounds)| !vector_bounds.iter().any(|bound| *bound > limit))
+                .count();
+            open_count * HARD_SEARCH_OPEN_RATIO >= candidates.len()
         };
         let mut needs_close_bounds = false;
-        if thorough {
+        if searches_neighbors {
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            needs_close_bounds = closely && many(top_rows.limit);
-        } else if closely && top_rows.rows.first().is_some_and(|best| many(best.score)) {
+            needs_close_bounds = may_use_close_bounds && leaves_many_open(top_rows.limit);
+        } else if may_use_close_bounds && top_rows.rows.first().is_some_and(|best| leaves_many_open(best.score)) {
             // In a small sample the best score is near the final limit. The score of the worst row of the table is far
             // above it.
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            needs_close_bounds = many(top_rows.limit);
+            needs_close_bounds = leaves_many_open(top_rows.limit);
         }
         let limit = top_rows.limit;
         // Without initial coefficients, all test vectors are used.
-        let selected_vectors = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
-            let each: Vec<Vec<f64>> = candidates.into_iter().map(|(_, each)| each).collect();
-            select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
+        let selected_vectors = problem.bound.as_ref().filter(|_| !refines).map(|bound| {
+            let vector_bounds: Vec<Vec<f64>> = candidates.into_iter().map(|(_, vector_bounds)| vector_bounds).collect();
+            select_test_vectors(&vector_bounds, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
         Ok(InitialIncumbent { top_rows, evaluated, needs_close_bounds, selected_vectors })
     }
 }
 
-/// Select at most `most` test vectors by a greedy algorithm, so that together they exclude as many candidates of a
-/// sample as possible. `each` gives the bound of each test vector for each candidate. Return the indices of the
-/// selected vectors.
-fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize> {
-    let mut open: Vec<bool> = vec![true; each.len()];
+/// Select at most `max_count` test vectors by a greedy algorithm, so that together they exclude as many candidates of a
+/// sample as possible. `vector_bounds` gives the bound of each test vector for each candidate. Return the indices of
+/// the selected vectors.
+fn select_test_vectors(vector_bounds: &[Vec<f64>], max_count: usize, limit: f64) -> Vec<usize> {
+    let mut open: Vec<bool> = vec![true; vector_bounds.len()];
     let mut selection: Vec<usize> = Vec::new();
     // Among vectors with equal exclusions, the one with the larger bounds is preferred.
     let gain = |j: usize, open: &[bool]| -> (usize, f64) {
-        let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
+        let values = vector_bounds.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
         values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
     };
-    let count = each.first().map_or(0, Vec::len);
-    while selection.len() < most.min(count) {
+    let count = vector_bounds.first().map_or(0, Vec::len);
+    while selection.len() < max_count.min(count) {
         let best = (0..count)
             .filter(|j| !selection.contains(j))
             .map(|j| (gain(j, &open), j))
             .max_by(|a, b| a.0 .0.cmp(&b.0 .0).then(a.0 .1.total_cmp(&b.0 .1)).then(b.1.cmp(&a.1)));
         let Some((_, j)) = best else { break };
-        each.iter().zip(&mut open).filter(|(e, _)| e[j] > limit).for_each(|(_, open)| *open = false);
+        vector_bounds.iter().zip(&mut open).filter(|(e, _)| e[j] > limit).for_each(|(_, open)| *open = false);
         selection.push(j);
     }
     selection
@@ -187,21 +195,22 @@ impl BatchEvaluation<'_> {
     /// improves the best rows. The search ends at distance 1 or after [`MAX_NEIGHBOR_EVALUATIONS`] evaluations.
     pub(super) fn search_neighbors(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
         let grid = &*self.candidate_index.grid;
-        let longest = grid.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
-        let longest = longest.chain([grid.blocks().len()]).max().unwrap_or(1);
-        let mut stride = (longest / 8).max(1).next_power_of_two();
+        let max_length = grid.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
+        let max_length = max_length.chain([grid.blocks().len()]).max().unwrap_or(1);
+        let mut stride = (max_length / 8).max(1).next_power_of_two();
         let first = evaluated.len();
         while stride > 0 {
             let best = |top_rows: &TopRows| {
                 top_rows.rows.iter().take(LOCAL_SEARCH_ROWS).map(|row| row.index).collect::<Vec<u64>>()
             };
-            let before = best(top_rows);
-            let mut around: Vec<u64> = before.iter().flat_map(|&index| self.grid_neighbors(index, stride)).collect();
-            around.retain(|&index| evaluated.insert(index));
+            let previous = best(top_rows);
+            let mut neighbors: Vec<u64> =
+                previous.iter().flat_map(|&index| self.grid_neighbors(index, stride)).collect();
+            neighbors.retain(|&index| evaluated.insert(index));
             let open: Vec<OpenCandidate> =
-                around.iter().map(|&index| OpenCandidate { index, bound: 0.0, guess: 0.0 }).collect();
+                neighbors.iter().map(|&index| OpenCandidate { index, bound: 0.0, guess: 0.0 }).collect();
             self.simulate_open(&open, top_rows, BatchPosition::start(0), false)?;
-            if best(top_rows) == before {
+            if best(top_rows) == previous {
                 stride /= 2;
             }
             if evaluated.len() - first > MAX_NEIGHBOR_EVALUATIONS {
@@ -216,7 +225,7 @@ impl BatchEvaluation<'_> {
         let grid = &*self.candidate_index.grid;
         let cursor = Cursor::at(grid, index);
         let mut digits = vec![0; grid.width()];
-        cursor.each(0, |term, digit| digits[term] = digit);
+        cursor.for_each_term(0, |term, digit| digits[term] = digit);
         let mut lengths = vec![0; grid.width()];
         for group in grid.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
@@ -224,36 +233,38 @@ impl BatchEvaluation<'_> {
         // The order α of the equation comes last.
         digits.push(cursor.block());
         lengths.push(grid.blocks().len());
-        let vary: Vec<usize> = (0..digits.len()).filter(|&i| lengths[i] > 1).collect();
-        let whole = u32::try_from(vary.len())
+        let varying: Vec<usize> = (0..digits.len()).filter(|&i| lengths[i] > 1).collect();
+        let direction_count = u32::try_from(varying.len())
             .ok()
             .and_then(|n| 3_usize.checked_pow(n))
             .filter(|n| *n <= MAX_NEIGHBOR_DIRECTIONS);
-        let moves: Vec<Vec<(usize, usize)>> = match whole {
+        let moves: Vec<Vec<(usize, usize)>> = match direction_count {
             Some(count) => (1..count)
                 .map(|number| {
-                    let digit = |place: usize| number / 3_usize.pow(u32::try_from(place).unwrap_or(0)) % 3;
-                    vary.iter().enumerate().map(|(place, &i)| (i, digit(place))).collect()
+                    let digit = |axis: usize| number / 3_usize.pow(u32::try_from(axis).unwrap_or(0)) % 3;
+                    varying.iter().enumerate().map(|(axis, &i)| (i, digit(axis))).collect()
                 })
                 .collect(),
-            None => vary
+            None => varying
                 .iter()
                 .enumerate()
-                .flat_map(|(n, &i)| vary[n..].iter().map(move |&j| (i, j)))
-                .flat_map(|(i, j)| (0..9).map(move |way| vec![(i, way % 3), (j, if i == j { 0 } else { way / 3 })]))
+                .flat_map(|(n, &i)| varying[n..].iter().map(move |&j| (i, j)))
+                .flat_map(|(i, j)| {
+                    (0..9).map(move |direction| vec![(i, direction % 3), (j, if i == j { 0 } else { direction / 3 })])
+                })
                 .collect(),
         };
         let neighbor = |moves: Vec<(usize, usize)>| {
-            let mut place = digits.clone();
-            for (i, way) in moves {
-                place[i] = match way {
-                    0 => place[i],
-                    1 => place[i].checked_add(stride).filter(|&digit| digit < lengths[i])?,
-                    _ => place[i].checked_sub(stride)?,
+            let mut neighbor_digits = digits.clone();
+            for (i, direction) in moves {
+                neighbor_digits[i] = match direction {
+                    0 => neighbor_digits[i],
+                    1 => neighbor_digits[i].checked_add(stride).filter(|&digit| digit < lengths[i])?,
+                    _ => neighbor_digits[i].checked_sub(stride)?,
                 };
             }
-            let block = place.pop()?;
-            Cursor::find(grid, block, &place)
+            let block = neighbor_digits.pop()?;
+            Cursor::find(grid, block, &neighbor_digits)
         };
         moves.into_iter().filter_map(neighbor).collect()
     }
@@ -270,7 +281,7 @@ impl BatchEvaluation<'_> {
         let mut unexcluded: Vec<OpenCandidate> = self.pool.install(|| {
             starts
                 .par_iter()
-                .flat_map(|&at| screen(candidate_index, at, count.min(at + length), top_rows.limit).0)
+                .flat_map(|&start| screen(candidate_index, start, count.min(start + length), top_rows.limit).0)
                 .collect()
         });
         self.check_stop()?;

@@ -63,27 +63,29 @@ impl BatchEvaluation<'_> {
         let candidate_index = self.candidate_index;
         let count = candidate_index.grid.count();
         let block_count = count.div_ceil(TAILORED_SAMPLE_BLOCK);
-        let share = if pass == 0 { 0 } else { count / TAILORED_SAMPLE_RATIO };
-        let most = MIN_TAILORED_SAMPLE.max(share).div_ceil(TAILORED_SAMPLE_BLOCK).min(block_count);
+        let sample_size = if pass == 0 { 0 } else { count / TAILORED_SAMPLE_RATIO };
+        let max_blocks = MIN_TAILORED_SAMPLE.max(sample_size).div_ceil(TAILORED_SAMPLE_BLOCK).min(block_count);
         let order = low_discrepancy_order(block_count);
         let (mut open, mut position, mut candidates) = (Vec::new(), 0, 0);
-        while position < most && open.len() < OPEN_SAMPLE_CANDIDATES {
-            let next = most.min(position + BLOCKS_PER_SCREENING);
-            let starts: Vec<u64> =
-                (position..next).map(|i| order((pass * most + i) % block_count) * TAILORED_SAMPLE_BLOCK).collect();
-            candidates += starts.iter().map(|&at| count.min(at + TAILORED_SAMPLE_BLOCK) - at).sum::<u64>();
-            let screened = |&at: &u64| screen(candidate_index, at, count.min(at + TAILORED_SAMPLE_BLOCK), limit).0;
-            open.extend(self.pool.install(|| starts.par_iter().flat_map(screened).collect::<Vec<OpenCandidate>>()));
+        while position < max_blocks && open.len() < OPEN_SAMPLE_CANDIDATES {
+            let next = max_blocks.min(position + BLOCKS_PER_SCREENING);
+            let starts: Vec<u64> = (position..next)
+                .map(|i| order((pass * max_blocks + i) % block_count) * TAILORED_SAMPLE_BLOCK)
+                .collect();
+            candidates += starts.iter().map(|&start| count.min(start + TAILORED_SAMPLE_BLOCK) - start).sum::<u64>();
+            let screen_block =
+                |&start: &u64| screen(candidate_index, start, count.min(start + TAILORED_SAMPLE_BLOCK), limit).0;
+            open.extend(self.pool.install(|| starts.par_iter().flat_map(screen_block).collect::<Vec<OpenCandidate>>()));
             self.check_stop()?;
             position = next;
         }
         sort_by_guess(&mut open);
         #[allow(clippy::cast_precision_loss)]
-        let each = count as f64 / candidates.max(1) as f64 * open.len() as f64;
+        let weight = count as f64 / candidates.max(1) as f64 * open.len() as f64;
         let open = subsample(&open, OPEN_SAMPLE_CANDIDATES);
         #[allow(clippy::cast_precision_loss)]
-        let each = each / open.len().max(1) as f64;
-        Ok((open, each))
+        let weight = weight / open.len().max(1) as f64;
+        Ok((open, weight))
     }
 
     /// Generate tailored test vectors that together exclude as many as possible of the candidates not yet excluded at
@@ -97,7 +99,7 @@ impl BatchEvaluation<'_> {
     ) -> Result<GeneratedVectors> {
         let candidate_index = self.candidate_index;
         let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
-        let (mut one, bytes) = problem.empty_tailored_vectors();
+        let (mut trial_vectors, bytes) = problem.empty_tailored_vectors();
         let vector_count = problem.tailored_vectors.as_ref().map_or(0, |tailored| tailored.vectors.len() as u64);
         let room =
             candidate_index.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(vector_count * bytes)) / bytes.max(1);
@@ -105,11 +107,11 @@ impl BatchEvaluation<'_> {
         if room == 0 {
             return Ok(GeneratedVectors::default());
         }
-        let (open, each) = self.sample_open(limit, pass)?;
+        let (open, weight) = self.sample_open(limit, pass)?;
         #[allow(clippy::cast_precision_loss)]
-        let all = |count: usize| count as f64 * each;
+        let total = |count: usize| count as f64 * weight;
         let best = best.filter(|_| pass == 0);
-        if best.is_none() && all(open.len()) < MIN_OPEN_CANDIDATES {
+        if best.is_none() && total(open.len()) < MIN_OPEN_CANDIDATES {
             return Ok(GeneratedVectors { open, ..GeneratedVectors::default() });
         }
         let columns = |index: u64| {
@@ -117,50 +119,53 @@ impl BatchEvaluation<'_> {
             candidate_index.positions(&Cursor::at(grid, index), &mut positions);
             positions
         };
-        let some = subsample(&open, room);
-        let indices = best.into_iter().chain(some.iter().map(|open| open.index)).take(room);
-        let places: Vec<Vec<usize>> = open.iter().map(|open| columns(open.index)).collect();
-        let mut excluded: Vec<(TailoredVector, Vec<bool>)> = Vec::new();
+        let sample = subsample(&open, room);
+        let indices = best.into_iter().chain(sample.iter().map(|open| open.index)).take(room);
+        let candidate_columns: Vec<Vec<usize>> = open.iter().map(|open| columns(open.index)).collect();
+        let mut exclusions: Vec<(TailoredVector, Vec<bool>)> = Vec::new();
         for index in indices {
-            one.vectors.extend(self.pool.install(|| problem.tailor_vector(&one, &columns(index))));
-            let out = self.pool.install(|| {
-                places.par_iter().map(|columns| problem.excluded_by_tailored(&one, columns, limit)).collect()
+            trial_vectors.vectors.extend(self.pool.install(|| problem.tailor_vector(&trial_vectors, &columns(index))));
+            let flags = self.pool.install(|| {
+                candidate_columns
+                    .par_iter()
+                    .map(|columns| problem.excluded_by_tailored(&trial_vectors, columns, limit))
+                    .collect()
             });
-            excluded.extend(one.vectors.pop().map(|vector| (vector, out)));
+            exclusions.extend(trial_vectors.vectors.pop().map(|vector| (vector, flags)));
             self.check_stop()?;
         }
         let (mut is_open, mut new_vectors) = (vec![true; open.len()], Vec::new());
-        let gain = |out: &[bool], is_open: &[bool]| {
-            out.iter().zip(is_open).filter(|(out, is_open)| **out && **is_open).count()
+        let gain = |flags: &[bool], is_open: &[bool]| {
+            flags.iter().zip(is_open).filter(|(flag, is_open)| **flag && **is_open).count()
         };
         let mut next = best.map(|_| 0);
         while new_vectors.len() < MAX_SELECTED_VECTORS {
-            let gains = excluded.iter().map(|(_, out)| gain(out, &is_open)).enumerate();
-            let most = gains.max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0)));
-            let candidate = next.take().filter(|_| !excluded.is_empty());
-            let Some(candidate) =
-                candidate.or(most.filter(|(_, most)| all(*most) >= MIN_VECTOR_EXCLUSIONS).map(|(at, _)| at))
+            let gains = exclusions.iter().map(|(_, flags)| gain(flags, &is_open)).enumerate();
+            let largest_gain = gains.max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0)));
+            let candidate = next.take().filter(|_| !exclusions.is_empty());
+            let Some(candidate) = candidate
+                .or(largest_gain.filter(|(_, gain)| total(*gain) >= MIN_VECTOR_EXCLUSIONS).map(|(index, _)| index))
             else {
                 break;
             };
-            let (vector, out) = excluded.swap_remove(candidate);
+            let (vector, flags) = exclusions.swap_remove(candidate);
             new_vectors.push(vector);
-            is_open.iter_mut().zip(&out).for_each(|(is_open, out)| *is_open &= !out);
+            is_open.iter_mut().zip(&flags).for_each(|(is_open, flag)| *is_open &= !flag);
         }
         let is_open: Vec<OpenCandidate> =
             open.into_iter().zip(is_open).filter_map(|(open, is_open)| is_open.then_some(open)).collect();
         // The vectors were selected on this sample, so they exclude a smaller fraction of other candidates.
-        let again = pass + 1 < MAX_GENERATION_PASSES
+        let is_worth_repeating = pass + 1 < MAX_GENERATION_PASSES
             && !new_vectors.is_empty()
-            && all(SELECTION_BIAS_FACTOR * is_open.len()) >= MIN_OPEN_CANDIDATES;
-        Ok(GeneratedVectors { vectors: new_vectors, open: is_open, is_worth_repeating: again })
+            && total(SELECTION_BIAS_FACTOR * is_open.len()) >= MIN_OPEN_CANDIDATES;
+        Ok(GeneratedVectors { vectors: new_vectors, open: is_open, is_worth_repeating })
     }
 }
 
-/// Return at most `most` of the candidates, evenly spaced in the list.
-pub(super) fn subsample(all: &[OpenCandidate], most: usize) -> Vec<OpenCandidate> {
-    let count = all.len().min(most);
-    (0..count).map(|i| all[i * all.len() / count]).collect()
+/// Return at most `max_count` of the candidates, evenly spaced in the list.
+pub(super) fn subsample(candidates: &[OpenCandidate], max_count: usize) -> Vec<OpenCandidate> {
+    let count = candidates.len().min(max_count);
+    (0..count).map(|i| candidates[i * candidates.len() / count]).collect()
 }
 
 /// Maximum number of candidates in the sample for linearized test vectors. One in eight candidates of a small grid is
@@ -198,10 +203,12 @@ impl BatchEvaluation<'_> {
             groups.entry(linearized_vectors.own_columns(&columns)).or_default().push((columns, coefficients));
         }
         #[allow(clippy::cast_precision_loss)]
-        groups.retain(|own, open| {
-            (1..=MAX_OWN_TERMS).contains(&own.len()) && open.len() as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS
+        groups.retain(|output_columns, open| {
+            (1..=MAX_OWN_TERMS).contains(&output_columns.len())
+                && open.len() as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS
         });
-        let bytes = groups.keys().map(|own| linearized_vectors.bytes(own.len())).max().unwrap_or(1);
+        let bytes =
+            groups.keys().map(|output_columns| linearized_vectors.bytes(output_columns.len())).max().unwrap_or(1);
         let room = self.candidate_index.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
         let room = usize::try_from(room).unwrap_or(MAX_LINEARIZED_VECTORS).min(MAX_LINEARIZED_VECTORS);
         let new_vectors: Vec<(Vec<usize>, Vec<LinearizedVector>)> = self.pool.install(|| {
@@ -210,20 +217,20 @@ impl BatchEvaluation<'_> {
                 .collect::<Vec<_>>()
                 .into_par_iter()
                 .with_max_len(1)
-                .map(|(own, open)| {
+                .map(|(output_columns, open)| {
                     let new_vectors = if self.is_stopped() {
                         Vec::new()
                     } else {
-                        self.generate_for_own_columns(&linearized_vectors, &own, open, weight, limit, room)
+                        self.generate_for_own_columns(&linearized_vectors, &output_columns, open, weight, limit, room)
                     };
-                    (own, new_vectors)
+                    (output_columns, new_vectors)
                 })
                 .collect()
         });
         self.check_stop()?;
-        for (own, new_vectors) in new_vectors {
+        for (output_columns, new_vectors) in new_vectors {
             if !new_vectors.is_empty() {
-                linearized_vectors.add(own, new_vectors);
+                linearized_vectors.add(output_columns, new_vectors);
             }
         }
         Ok((linearized_vectors.len() > 0).then_some(linearized_vectors))
@@ -246,11 +253,11 @@ impl BatchEvaluation<'_> {
             (0..sample_count)
                 .into_par_iter()
                 .flat_map_iter(|i| {
-                    let at = order(i) * LINEARIZED_SAMPLE_BLOCK;
+                    let start = order(i) * LINEARIZED_SAMPLE_BLOCK;
                     let open = if self.is_stopped() {
                         Vec::new()
                     } else {
-                        screen(candidate_index, at, count.min(at + LINEARIZED_SAMPLE_BLOCK), limit).0
+                        screen(candidate_index, start, count.min(start + LINEARIZED_SAMPLE_BLOCK), limit).0
                     };
                     open.into_iter().filter_map(|open| {
                         let mut columns = vec![0; grid.width()];
@@ -265,44 +272,46 @@ impl BatchEvaluation<'_> {
         Ok((open, count as f64 / (sample_count * LINEARIZED_SAMPLE_BLOCK) as f64))
     }
 
-    /// Generate linearized test vectors for candidates with the same output columns `own`. The first vector is built
-    /// for the candidate at the median of the first output coefficient. The remaining candidates on each side of the
-    /// median are then processed in the same way. `weight` is the number of candidates of the grid per sampled
+    /// Generate linearized test vectors for candidates with the same output columns `output_columns`. The first vector
+    /// is built for the candidate at the median of the first output coefficient. The remaining candidates on each side
+    /// of the median are then processed in the same way. `weight` is the number of candidates of the grid per sampled
     /// candidate, `room` the maximum number of vectors.
     fn generate_for_own_columns(
         &self,
         linearized_vectors: &LinearizedVectors,
-        own: &[usize],
+        output_columns: &[usize],
         mut open: Vec<SolvedCandidate>,
         weight: f64,
         limit: f64,
         room: usize,
     ) -> Vec<LinearizedVector> {
         let problem = &self.candidate_index.problem;
-        let first = |solved: &SolvedCandidate| solved.0.iter().position(|p| *p == own[0]).map_or(0.0, |i| solved.1[i]);
+        let first = |candidate: &SolvedCandidate| {
+            candidate.0.iter().position(|p| *p == output_columns[0]).map_or(0.0, |i| candidate.1[i])
+        };
         open.sort_by(|a, b| first(a).total_cmp(&first(b)).then_with(|| a.0.cmp(&b.0)));
         let (mut new_vectors, mut failure_count) = (Vec::new(), 0);
         let mut parts = vec![open];
         #[allow(clippy::cast_precision_loss)]
-        let many = |count: usize| count as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS;
+        let is_worthwhile = |count: usize| count as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS;
         while let Some(mut part) = parts.pop() {
-            if !many(part.len()) || new_vectors.len() >= room || failure_count >= MAX_FAILED_VECTORS {
+            if !is_worthwhile(part.len()) || new_vectors.len() >= room || failure_count >= MAX_FAILED_VECTORS {
                 continue;
             }
             let middle = part.remove(part.len() / 2);
-            let at = first(&middle);
-            let mut gained = false;
+            let median = first(&middle);
+            let mut is_useful = false;
             if let Some(linearized_vector) = problem.linearize_vector(linearized_vectors, &middle.0, &middle.1, limit) {
                 let remaining: Vec<SolvedCandidate> =
                     problem.not_excluded_by(linearized_vectors, &linearized_vector, &part, limit);
-                gained = many(part.len() + 1 - remaining.len());
-                if gained {
+                is_useful = is_worthwhile(part.len() + 1 - remaining.len());
+                if is_useful {
                     new_vectors.push(linearized_vector);
                     part = remaining;
                 }
             }
-            failure_count += usize::from(!gained);
-            let above = part.split_off(part.partition_point(|solved| first(solved) < at));
+            failure_count += usize::from(!is_useful);
+            let above = part.split_off(part.partition_point(|candidate| first(candidate) < median));
             parts.push(above);
             parts.push(part);
         }

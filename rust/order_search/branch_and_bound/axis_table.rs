@@ -84,8 +84,8 @@ impl RemainingColumns<'_> {
         let test_vectors = &self.test_vectors[record];
         let (mut distance, row) = (ZERO_LANES, test_vectors.rows[column]);
         if let Some(own_fixed_column) = self.own_fixed_column.filter(|_| row != NO_INDEX) {
-            let at = |row: usize| &test_vectors.effects[row * test_vectors.groups + group][3];
-            let (a, b) = (at(row), at(test_vectors.rows[self.columns[own_fixed_column]]));
+            let effect = |row: usize| &test_vectors.effects[row * test_vectors.groups + group][3];
+            let (a, b) = (effect(row), effect(test_vectors.rows[self.columns[own_fixed_column]]));
             for n in 0..LANE_COUNT {
                 distance[n] = (a[n] - b[n]).abs();
             }
@@ -101,7 +101,7 @@ impl RemainingColumns<'_> {
         let inverse = self.normal.inverse()[column];
         let [re, im] = &test_vectors.products[column * test_vectors.groups + group];
         let row = test_vectors.rows[column];
-        let (mut products, mut rest) = ([ZERO_LANES; 4], ZERO_LANES);
+        let (mut products, mut orthogonal_norm) = ([ZERO_LANES; 4], ZERO_LANES);
         for n in 0..LANE_COUNT {
             products[0][n] = re[n] * inverse;
             products[1][n] = im[n] * inverse;
@@ -111,10 +111,10 @@ impl RemainingColumns<'_> {
             for n in 0..LANE_COUNT {
                 products[2][n] = a[n] * inverse;
                 products[3][n] = b[n] * inverse;
-                rest[n] = c[n] * inverse;
+                orthogonal_norm[n] = c[n] * inverse;
             }
         }
-        (products, rest)
+        (products, orthogonal_norm)
     }
 }
 
@@ -131,7 +131,7 @@ pub(super) struct AxisTable {
     pub(super) target: Vec<f64>,
     /// Products of the regressor column (of unit norm) with the fixed-order columns, by grid value, then by fixed-order
     /// column.
-    pub(super) shared: Vec<f64>,
+    pub(super) fixed_products: Vec<f64>,
     /// Coefficients, with the opposite sign, of the normalized column (orthogonal to the fixed-order columns, of unit
     /// norm) on the fixed-order columns. The entries are sorted by grid value, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
@@ -151,86 +151,91 @@ impl AxisTable {
     /// Build the tables for these columns. `None` if a column is nearly a linear combination of the fixed-order
     /// columns, or if a product is not finite.
     #[inline(always)]
-    pub(super) fn new(others: &RemainingColumns<'_>, columns: Vec<usize>) -> Option<Self> {
-        let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
-        let (mut scale, mut target, mut shared) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
+    pub(super) fn new(remaining: &RemainingColumns<'_>, columns: Vec<usize>) -> Option<Self> {
+        let (k, n, normal) = (remaining.columns.len(), columns.len(), remaining.normal);
+        let (mut scale, mut target, mut fixed_products) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
         let (mut fixed_coefficients, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
         for (i, &column) in columns.iter().enumerate() {
-            let (shared, raw) = (&mut shared[i * k..(i + 1) * k], &mut raw[i * k..(i + 1) * k]);
-            for (g, &s) in shared.iter_mut().zip(others.columns) {
+            let (fixed_products, raw) = (&mut fixed_products[i * k..(i + 1) * k], &mut raw[i * k..(i + 1) * k]);
+            for (g, &s) in fixed_products.iter_mut().zip(remaining.columns) {
                 *g = normal.product(s, column);
             }
-            others.solve(shared, raw);
-            let remainder = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
+            remaining.solve(fixed_products, raw);
+            let remainder = 1.0 - fixed_products.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
             let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
             // This also rejects NaN.
-            if remainder.is_nan() || remainder <= 1e3 * others.rounding * others.trace * sum * sum {
+            if remainder.is_nan() || remainder <= 1e3 * remaining.rounding * remaining.trace * sum * sum {
                 return None;
             }
             scale[i] = 1.0 / remainder.sqrt();
-            let along: f64 = raw.iter().zip(others.columns).map(|(a, &s)| a * normal.rhs()[s]).sum();
-            target[i] = (normal.rhs()[column] - along) * scale[i];
+            let fixed_part: f64 = raw.iter().zip(remaining.columns).map(|(a, &s)| a * normal.rhs()[s]).sum();
+            target[i] = (normal.rhs()[column] - fixed_part) * scale[i];
             for (m, a) in fixed_coefficients[i * k..(i + 1) * k].iter_mut().zip(raw.iter()) {
                 *m = a * scale[i];
             }
         }
-        let groups: usize = others.test_vectors.iter().map(|p| p.groups).sum();
+        let groups: usize = remaining.test_vectors.iter().map(|p| p.groups).sum();
         let mut responses = Vec::with_capacity(n * groups);
         let mut rests = Vec::with_capacity(n * groups);
-        let mut sound = ZERO_LANES;
+        let mut finite_check = ZERO_LANES;
         let mut joint_coefficients = Vec::new();
-        if let Some(own_fixed_column) = others.own_fixed_column {
+        if let Some(own_fixed_column) = remaining.own_fixed_column {
             let inverse = normal.inverse();
-            let own = others
+            let are_output_columns = remaining
                 .test_vectors
                 .first()
                 .is_some_and(|test_vectors| columns.iter().all(|&p| test_vectors.rows[p] != NO_INDEX));
             joint_coefficients.extend(columns.iter().enumerate().map(|(i, &p)| {
-                let own_coefficient =
-                    if own { scale[i] * inverse[p] / inverse[others.columns[own_fixed_column]] } else { 0.0 };
+                let own_coefficient = if are_output_columns {
+                    scale[i] * inverse[p] / inverse[remaining.columns[own_fixed_column]]
+                } else {
+                    0.0
+                };
                 fixed_coefficients[i * k + own_fixed_column] - own_coefficient
             }));
         }
-        let along: Vec<Vec<VectorProducts>> = others
+        let fixed_part: Vec<Vec<VectorProducts>> = remaining
             .columns
             .iter()
-            .map(|&s| vector_groups(others.test_vectors).map(|(r, g)| others.vector_products(r, g, s).0).collect())
+            .map(|&s| {
+                vector_groups(remaining.test_vectors).map(|(r, g)| remaining.vector_products(r, g, s).0).collect()
+            })
             .collect();
         for (i, &column) in columns.iter().enumerate() {
-            for (at, (r, g)) in vector_groups(others.test_vectors).enumerate() {
-                let (mut column_products, mut rest) = others.vector_products(r, g, column);
-                for (s, along) in along.iter().enumerate() {
+            for (index, (r, g)) in vector_groups(remaining.test_vectors).enumerate() {
+                let (mut column_products, mut orthogonal_norm) = remaining.vector_products(r, g, column);
+                for (s, fixed_part) in fixed_part.iter().enumerate() {
                     let a = raw[i * k + s];
-                    for (column_products, along) in column_products.iter_mut().zip(&along[at]) {
+                    for (column_products, fixed_part) in column_products.iter_mut().zip(&fixed_part[index]) {
                         for n in 0..LANE_COUNT {
-                            column_products[n] -= a * along[n];
+                            column_products[n] -= a * fixed_part[n];
                         }
                     }
                 }
                 for column_products in &mut column_products {
                     column_products.iter_mut().for_each(|v| *v *= scale[i]);
                 }
-                let mut distance = others.distance_to_own_fixed_column(r, g, column);
-                rest.iter_mut().for_each(|v| *v *= scale[i]);
+                let mut distance = remaining.distance_to_own_fixed_column(r, g, column);
+                orthogonal_norm.iter_mut().for_each(|v| *v *= scale[i]);
                 distance.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
-                for values in column_products.iter().chain([&rest, &distance]) {
+                for values in column_products.iter().chain([&orthogonal_norm, &distance]) {
                     for n in 0..LANE_COUNT {
-                        sound[n] += 0.0 * values[n];
+                        finite_check[n] += 0.0 * values[n];
                     }
                 }
                 responses.push(column_products);
-                rests.push([rest, distance]);
+                rests.push([orthogonal_norm, distance]);
             }
         }
         // Reject NaN and infinity: their product with 0 is NaN.
-        if sound.iter().any(|v| v.is_nan()) {
+        if finite_check.iter().any(|v| v.is_nan()) {
             return None;
         }
         let mut side = Self {
             columns,
             scale,
             target,
-            shared,
+            fixed_products,
             fixed_coefficients,
             joint_coefficients,
             vector_products: responses,
@@ -240,16 +245,16 @@ impl AxisTable {
         Some(side)
     }
 
-    /// Compute the maxima over intervals of 1, 2, 4, … grid values, for `k` fixed-order columns. `rests` contains the
-    /// norms of [`Node`] that are not second differences, by grid value, then by group of test vectors.
+    /// Compute the maxima over intervals of 1, 2, 4, … grid values, for `k` fixed-order columns. `orthogonal_norms`
+    /// contains the norms of [`Node`] that are not second differences, by grid value, then by group of test vectors.
     #[inline(always)]
-    fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
+    fn build(&mut self, k: usize, groups: usize, orthogonal_norms: &[[Wide; 2]]) {
         let n = self.columns.len();
-        let apart = |values: &[f64], stride: usize, at: usize, i: usize| -> f64 {
-            let v = |i: usize| values[i * stride + at];
+        let second_difference = |values: &[f64], stride: usize, offset: usize, i: usize| -> f64 {
+            let v = |i: usize| values[i * stride + offset];
             ((v(i - 1) - v(i)) + (v(i + 1) - v(i))).abs()
         };
-        let bent = |i: usize, g: usize| -> [Wide; 2] {
+        let vector_differences = |i: usize, g: usize| -> [Wide; 2] {
             let (a, b, c) = (
                 &self.vector_products[(i - 1) * groups + g],
                 &self.vector_products[i * groups + g],
@@ -274,9 +279,11 @@ impl AxisTable {
                 })
                 .collect(),
             fixed_coefficients: vec![0.0; n * k],
-            nodes: rests
+            nodes: orthogonal_norms
                 .iter()
-                .map(|&[rest, distance]| Node { second_differences: [ZERO_LANES, ZERO_LANES, rest, distance] })
+                .map(|&[orthogonal_norm, distance]| Node {
+                    second_differences: [ZERO_LANES, ZERO_LANES, orthogonal_norm, distance],
+                })
                 .collect(),
         }];
         let mut length = 1;
@@ -291,39 +298,39 @@ impl AxisTable {
             };
             for node in 0..count {
                 let (left, right) = (2 * node, 2 * node + 1);
-                let mut all = below.coefficient_sums[left];
+                let mut coefficient_sum = below.coefficient_sums[left];
                 let start = level.fixed_coefficients.len();
                 level.fixed_coefficients.extend_from_slice(&below.fixed_coefficients[left * k..(left + 1) * k]);
                 if right < halves {
                     // The last value of the left half and the first value of the right half become interior values,
                     // except at the end.
-                    let joint = right * length;
-                    let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
-                    all.sum = all.sum.max(below.coefficient_sums[right].sum);
+                    let boundary = right * length;
+                    let is_interior = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
+                    coefficient_sum.sum = coefficient_sum.sum.max(below.coefficient_sums[right].sum);
                     for s in 0..k {
                         let mut value =
                             level.fixed_coefficients[start + s].max(below.fixed_coefficients[right * k + s]);
-                        for i in [joint - 1, joint] {
-                            if inner(i) {
-                                value = value.max(apart(&self.fixed_coefficients, k, s, i));
+                        for i in [boundary - 1, boundary] {
+                            if is_interior(i) {
+                                value = value.max(second_difference(&self.fixed_coefficients, k, s, i));
                             }
                         }
                         level.fixed_coefficients[start + s] = value;
                     }
                     for g in 0..groups {
                         let mut node = below.nodes[left * groups + g];
-                        let mut most = |part: usize, with: &Wide| {
-                            for (most, with) in node.second_differences[part].iter_mut().zip(with) {
-                                *most = most.max(*with);
+                        let mut include_maximum = |part: usize, values: &Wide| {
+                            for (maximum, value) in node.second_differences[part].iter_mut().zip(values) {
+                                *maximum = maximum.max(*value);
                             }
                         };
                         let other = &below.nodes[right * groups + g];
-                        (0..4).for_each(|part| most(part, &other.second_differences[part]));
-                        for i in [joint - 1, joint] {
-                            if inner(i) {
-                                let [a, b] = bent(i, g);
-                                most(0, &a);
-                                most(1, &b);
+                        (0..4).for_each(|part| include_maximum(part, &other.second_differences[part]));
+                        for i in [boundary - 1, boundary] {
+                            if is_interior(i) {
+                                let [a, b] = vector_differences(i, g);
+                                include_maximum(0, &a);
+                                include_maximum(1, &b);
                             }
                         }
                         level.nodes.push(node);
@@ -331,7 +338,7 @@ impl AxisTable {
                 } else {
                     level.nodes.extend_from_slice(&below.nodes[left * groups..(left + 1) * groups]);
                 }
-                level.coefficient_sums.push(all);
+                level.coefficient_sums.push(coefficient_sum);
             }
             levels.push(level);
             length *= 2;

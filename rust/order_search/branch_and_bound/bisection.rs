@@ -61,7 +61,7 @@ impl BranchAndBound {
         #[allow(clippy::cast_precision_loss)]
         let (samples, weights) = (problem.samples() as f64, candidate_index.options.weights() as f64);
         let rounding = f64::EPSILON * samples * weights;
-        let others = RemainingColumns {
+        let remaining = RemainingColumns {
             normal,
             test_vectors,
             columns: &[],
@@ -71,7 +71,7 @@ impl BranchAndBound {
             own_fixed_column: None,
         };
         let (norm, ranks_equation_error) = (candidate_index.options.norm, problem.residual_sums.is_some());
-        let common = SearchConstants::new(&others, norm, ranks_equation_error, problem.size(), weights.sqrt());
+        let common = SearchConstants::new(&remaining, norm, ranks_equation_error, problem.size(), weights.sqrt());
         Some(Self { common, rounding })
     }
 
@@ -141,20 +141,26 @@ impl simd::SimdKernel for SliceScreening<'_> {
         #[allow(clippy::cast_possible_truncation)]
         let rows = ((lo - slice.lo) / len) as usize..((hi - slice.lo).div_ceil(len)) as usize;
         let columns = first_columns(candidate_index, slice);
-        let (others, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
-        let others = boxes.remaining_columns(candidate_index, &others, &inverse)?;
-        let tables = build_slice_tables(candidate_index, boxes, slice, &others, rows.clone())?;
+        let (remaining, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
+        let remaining = boxes.remaining_columns(candidate_index, &remaining, &inverse)?;
+        let tables = build_slice_tables(candidate_index, boxes, slice, &remaining, rows.clone())?;
         let start = slice.lo + rows.start as u64 * len;
         let mut screen = Screen::<LANE_COUNT>::new(columns.len());
-        let (mut screened, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
-        let (mut count, mut boxed) = (0, hi - lo);
+        let (mut outcome, mut pending) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
+        let (mut count, mut excluded) = (0, hi - lo);
         let lengths = [rows.len(), slice.len];
         let coarse = lengths.map(|n| INITIAL_BOX_LEVEL.min(n.next_power_of_two().trailing_zeros() as usize));
         let (mut stack, mut row_coefficients) = (Vec::new(), RowCoefficients::default());
-        for at in 0..lengths[0].div_ceil(1 << coarse[0]) {
-            tables.compute_coefficients(&mut row_coefficients, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
-            for by in 0..lengths[1].div_ceil(1 << coarse[1]) {
-                stack.push([Interval { level: coarse[0], at }, Interval { level: coarse[1], at: by }]);
+        for outer_position in 0..lengths[0].div_ceil(1 << coarse[0]) {
+            tables.compute_coefficients(
+                &mut row_coefficients,
+                outer_position << coarse[0]..lengths[0].min((outer_position + 1) << coarse[0]),
+            );
+            for inner_position in 0..lengths[1].div_ceil(1 << coarse[1]) {
+                stack.push([
+                    Interval { level: coarse[0], position: outer_position },
+                    Interval { level: coarse[1], position: inner_position },
+                ]);
                 while let Some([u, v]) = stack.pop() {
                     if let Some(cell) = tables.box_quantities(&row_coefficients, [u, v])
                         && tables.bound([u, v], &cell, limit) > limit
@@ -163,11 +169,11 @@ impl simd::SimdKernel for SliceScreening<'_> {
                     }
                     if u.level + v.level > SCREENING_LEVEL_SUM {
                         let part = usize::from(v.level > u.level);
-                        let halved = [u, v][part];
-                        for at in [2 * halved.at + 1, 2 * halved.at] {
-                            if at << (halved.level - 1) < lengths[part] {
+                        let interval = [u, v][part];
+                        for position in [2 * interval.position + 1, 2 * interval.position] {
+                            if position << (interval.level - 1) < lengths[part] {
                                 let mut next = [u, v];
-                                next[part] = Interval { level: halved.level - 1, at };
+                                next[part] = Interval { level: interval.level - 1, position };
                                 stack.push(next);
                             }
                         }
@@ -180,17 +186,17 @@ impl simd::SimdKernel for SliceScreening<'_> {
                             if index < lo || index >= hi {
                                 continue;
                             }
-                            boxed -= 1;
-                            waiting[count] = (index, tables.sides[0].columns[row], tables.sides[1].columns[value]);
+                            excluded -= 1;
+                            pending[count] = (index, tables.sides[0].columns[row], tables.sides[1].columns[value]);
                             count += 1;
                             if count == LANE_COUNT {
                                 screen.screen_slice_candidates(
                                     candidate_index,
                                     slice,
                                     &columns,
-                                    &waiting[..count],
+                                    &pending[..count],
                                     limit,
-                                    &mut screened,
+                                    &mut outcome,
                                 );
                                 count = 0;
                             }
@@ -200,10 +206,10 @@ impl simd::SimdKernel for SliceScreening<'_> {
             }
         }
         if count > 0 {
-            screen.screen_slice_candidates(candidate_index, slice, &columns, &waiting[..count], limit, &mut screened);
+            screen.screen_slice_candidates(candidate_index, slice, &columns, &pending[..count], limit, &mut outcome);
         }
-        let (open, singular) = screened;
-        Some((open, singular, boxed))
+        let (open, singular) = outcome;
+        Some((open, singular, excluded))
     }
 }
 
@@ -221,11 +227,11 @@ fn factor_remaining_columns(
     slice: &traversal::GridSlice,
     columns: &[usize],
 ) -> Option<(Vec<usize>, Vec<f64>)> {
-    let others: Vec<usize> =
+    let remaining: Vec<usize> =
         (0..columns.len()).filter(|&t| t != slice.outer && t != slice.inner).map(|t| columns[t]).collect();
     let normal = candidate_index.problem.box_equations()?;
-    let inverse = inverse_correlation(&others, |a, b| normal.product(a, b)).ok()?;
-    Some((others, inverse))
+    let inverse = inverse_correlation(&remaining, |a, b| normal.product(a, b)).ok()?;
+    Some((remaining, inverse))
 }
 
 /// Build the tables of some rows of a slice of the order grid. `None` if a varying column is nearly a combination of
@@ -235,14 +241,14 @@ fn build_slice_tables<'a>(
     candidate_index: &CandidateIndex<'_>,
     boxes: &'a BranchAndBound,
     slice: &traversal::GridSlice,
-    others: &'a RemainingColumns<'a>,
+    remaining: &'a RemainingColumns<'a>,
     rows: Range<usize>,
 ) -> Option<SliceTables<'a>> {
     let columns_of = |term: usize| candidate_index.columns(slice.block, term);
     let outer = slice.rows[rows].iter().map(|&digit| columns_of(slice.outer)[digit]).collect();
     let inner = columns_of(slice.inner)[slice.first..slice.first + slice.len].to_vec();
-    let sides = [AxisTable::new(others, outer)?, AxisTable::new(others, inner)?];
-    Some(SliceTables::new(others, &boxes.common, sides))
+    let sides = [AxisTable::new(remaining, outer)?, AxisTable::new(remaining, inner)?];
+    Some(SliceTables::new(remaining, &boxes.common, sides))
 }
 
 /// Return the inverse of the correlation matrix of some columns, row-major. `product` returns the correlation of two
@@ -302,17 +308,20 @@ pub struct BoxBound {
 pub fn box_bounds(records: &[Record], grid: &OrderGrid, options: &Options, index: u64) -> Result<Vec<BoxBound>> {
     with_slice(records, grid, options, index, |candidate_index, boxes, slice| {
         let columns = first_columns(candidate_index, slice);
-        let (others, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
-        let others = boxes.remaining_columns(candidate_index, &others, &inverse)?;
-        let tables = build_slice_tables(candidate_index, boxes, slice, &others, 0..slice.rows.len())?;
+        let (remaining, inverse) = factor_remaining_columns(candidate_index, slice, &columns)?;
+        let remaining = boxes.remaining_columns(candidate_index, &remaining, &inverse)?;
+        let tables = build_slice_tables(candidate_index, boxes, slice, &remaining, 0..slice.rows.len())?;
         let mut row_coefficients = RowCoefficients::default();
         tables.compute_coefficients(&mut row_coefficients, 0..slice.rows.len());
         let mut bounds = Vec::new();
         let levels = [0, 1].map(|side: usize| tables.sides[side].levels.len());
         for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
-            for at in 0..tables.sides[0].levels[a].coefficient_sums.len() {
-                for by in 0..tables.sides[1].levels[b].coefficient_sums.len() {
-                    let intervals = [Interval { level: a, at }, Interval { level: b, at: by }];
+            for outer_position in 0..tables.sides[0].levels[a].coefficient_sums.len() {
+                for inner_position in 0..tables.sides[1].levels[b].coefficient_sums.len() {
+                    let intervals = [
+                        Interval { level: a, position: outer_position },
+                        Interval { level: b, position: inner_position },
+                    ];
                     let ((u0, u1), (v0, v1)) = (intervals[0].ends(slice.rows.len()), intervals[1].ends(slice.len));
                     let cell = tables.box_quantities(&row_coefficients, intervals);
                     let bound = cell.map_or(0.0, |cell| tables.bound(intervals, &cell, f64::INFINITY));
@@ -371,9 +380,9 @@ where
     candidate_index.problem = pool.install(|| candidate_index.problem.with_bound(u64::MAX >> 8, &Stop::default()));
     if options.criterion == Criterion::OutputError {
         let mut tailored = candidate_index.problem.empty_tailored_vectors().0;
-        for made_for in [index, 0, grid.count() / 2, grid.count() - 1] {
+        for vector_index in [index, 0, grid.count() / 2, grid.count() - 1] {
             let mut positions = vec![0; grid.width()];
-            candidate_index.positions(&Cursor::at(grid, made_for), &mut positions);
+            candidate_index.positions(&Cursor::at(grid, vector_index), &mut positions);
             tailored.vectors.extend(pool.install(|| candidate_index.problem.tailor_vector(&tailored, &positions)));
         }
         candidate_index.problem.tailored_vectors = Some(tailored);
@@ -463,7 +472,7 @@ mod tests {
                         for (at, by) in (0..tables.sides[0].levels[a].coefficient_sums.len()).flat_map(|at| {
                             (0..tables.sides[1].levels[b].coefficient_sums.len()).map(move |by| (at, by))
                         }) {
-                            let intervals = [Interval { level: a, at }, Interval { level: b, at: by }];
+                            let intervals = [Interval { level: a, position: at }, Interval { level: b, position: by }];
                             let ends = [intervals[0].ends(slice.rows.len()), intervals[1].ends(slice.len)];
                             let Some(cell) = tables.box_quantities(&row_coefficients, intervals) else { continue };
                             for group in (0..groups).filter(|_| a + b > 0) {
@@ -472,7 +481,8 @@ mod tests {
                                 for (i, j) in
                                     (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
                                 {
-                                    let alone = [Interval { level: 0, at: i }, Interval { level: 0, at: j }];
+                                    let alone =
+                                        [Interval { level: 0, position: i }, Interval { level: 0, position: j }];
                                     let Some(cell) = tables.box_quantities(&row_coefficients, alone) else { continue };
                                     let (one, _) = deviation_bound(alone, &cell, group, Some(joint_column));
                                     let place = |x: usize, (from, to): (usize, usize)| {

@@ -56,39 +56,39 @@ impl SearchConstants {
     /// Compute the constants. `size` is the Euclidean norm of the output over all records, and `weight` the square root
     /// of the largest row weight of the normal equations.
     pub(super) fn new(
-        others: &RemainingColumns<'_>,
+        remaining: &RemainingColumns<'_>,
         norm: Norm,
         ranks_equation_error: bool,
         size: f64,
         weight: f64,
     ) -> Self {
-        let width = others.normal.inverse().len();
-        let max_moduli = vector_groups(others.test_vectors)
+        let width = remaining.normal.inverse().len();
+        let max_moduli = vector_groups(remaining.test_vectors)
             .map(|(r, g)| {
-                let mut tops = [ZERO_LANES; 2];
+                let mut peaks = [ZERO_LANES; 2];
                 for p in 0..width {
-                    let (products, _) = others.vector_products(r, g, p);
+                    let (products, _) = remaining.vector_products(r, g, p);
                     for half in 0..2 {
                         for n in 0..LANE_COUNT {
-                            tops[half][n] = tops[half][n].max(products[2 * half][n].hypot(products[2 * half + 1][n]));
+                            peaks[half][n] = peaks[half][n].max(products[2 * half][n].hypot(products[2 * half + 1][n]));
                         }
                     }
                 }
-                tops
+                peaks
             })
             .collect();
-        let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
+        let sizes = || remaining.normal.inverse().iter().copied().filter(|&i| i > 0.0);
         // In a sum of two coefficients, the error of one is scaled by the ratio of column norms. The term 1 is for the
         // other.
         let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
-        let most = |rounding: &[f64]| -> f64 {
-            rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
+        let max_scaled = |rounding: &[f64]| -> f64 {
+            rounding.iter().zip(remaining.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
         };
         Self {
             norm,
             ranks_equation_error,
             max_moduli,
-            rounding: others.test_vectors.iter().map(|p| most(&p.rounding)).collect(),
+            rounding: remaining.test_vectors.iter().map(|p| max_scaled(&p.rounding)).collect(),
             size,
             weighted_size: size * weight,
             ratio,
@@ -97,18 +97,18 @@ impl SearchConstants {
 }
 
 /// Interval of consecutive grid values of one order. It has at most 2^`level` values and starts at value number
-/// `at`·2^`level`.
+/// `position`·2^`level`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Interval {
     pub(super) level: usize,
-    pub(super) at: usize,
+    pub(super) position: usize,
 }
 
 impl Interval {
     /// Return the indices of the first and the last value of the interval, for an order with `n` grid values.
     #[inline(always)]
     pub(super) fn ends(self, n: usize) -> (usize, usize) {
-        (self.at << self.level, n.min((self.at + 1) << self.level) - 1)
+        (self.position << self.level, n.min((self.position + 1) << self.level) - 1)
     }
 }
 
@@ -140,7 +140,7 @@ fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
 /// made orthogonal to the fixed-order columns and scaled to unit norm.
 pub(super) struct BoxQuantities {
     /// Row of the slice of the order grid and index within the row, for each of the four corners.
-    pub(super) at: [(usize, usize); 4],
+    pub(super) corners: [(usize, usize); 4],
     /// One eighth of the squared length of each side, with the length in grid increments.
     pub(super) interpolation_factors: [f64; 2],
     /// Coefficient p of the first varying column at the four corners.
@@ -160,7 +160,7 @@ pub(super) struct BoxQuantities {
     pub(super) mixed_slopes: [f64; 2],
     /// Upper bound over the box of the part of the squared output norm that the two varying columns explain. It is 0
     /// unless candidates are ranked by equation error.
-    pub(super) explained: f64,
+    pub(super) explained_square: f64,
     /// Upper bound of the sum of the weighted output norm and the moduli of all coefficients.
     pub(super) modulus_sum: f64,
     /// Rounding-error bound of one coefficient of a candidate.
@@ -188,7 +188,7 @@ impl BoxQuantities {
 /// of the coefficients from bilinear functions.
 pub(super) struct Moduli {
     /// Modulus of the coefficient of each fixed-order column at the four corners.
-    others: [[f64; 4]; MAX_REMAINING_COLUMNS],
+    fixed_columns: [[f64; 4]; MAX_REMAINING_COLUMNS],
     /// For each fixed-order column, an upper bound of how far its coefficient deviates from a bilinear function within
     /// the box of orders. The bound includes rounding errors.
     deviation_bounds: [f64; MAX_REMAINING_COLUMNS],
@@ -219,17 +219,17 @@ pub(super) struct CornerValues {
 
 /// Tables of one slice of the order grid, from which the bounds of its boxes of orders are computed.
 pub(super) struct SliceTables<'a> {
-    pub(super) others: &'a RemainingColumns<'a>,
+    pub(super) remaining: &'a RemainingColumns<'a>,
     pub(super) common: &'a SearchConstants,
     /// Tables of the values of the two varying orders. In the grid of order pairs, the first order determines the row,
     /// the second the column.
     pub(super) sides: [AxisTable; 2],
     /// Index in `sides` of the order that belongs to terms of the output. `None` if neither order does.
-    own: Option<usize>,
+    output_side: Option<usize>,
     /// Coefficients of the projection of the output on the fixed-order columns.
     pub(super) base_coefficients: Vec<f64>,
     /// The squared norm of the residual of the output after projection on the fixed-order columns.
-    unexplained: f64,
+    residual_square: f64,
     /// Product ⟨t, r⟩ and denominator ‖t‖(1 − Σ c g), by group of test vectors t. Here r is the residual of the output
     /// after projection on the fixed-order columns. The sum is over these columns with coefficient c and kernel matrix
     /// F, and g is the projection of Fᵀt on t.
@@ -243,39 +243,39 @@ pub(super) struct SliceTables<'a> {
 impl<'a> SliceTables<'a> {
     /// Build the tables of a slice of the order grid from the tables along its two varying orders.
     #[inline(always)]
-    pub(super) fn new(others: &'a RemainingColumns<'a>, common: &'a SearchConstants, sides: [AxisTable; 2]) -> Self {
-        let k = others.columns.len();
+    pub(super) fn new(remaining: &'a RemainingColumns<'a>, common: &'a SearchConstants, sides: [AxisTable; 2]) -> Self {
+        let k = remaining.columns.len();
         let mut base_coefficients = vec![0.0; k];
-        let rhs: Vec<f64> = others.columns.iter().map(|&s| others.normal.rhs()[s]).collect();
-        others.solve(&rhs, &mut base_coefficients);
+        let rhs: Vec<f64> = remaining.columns.iter().map(|&s| remaining.normal.rhs()[s]).collect();
+        remaining.solve(&rhs, &mut base_coefficients);
         let (mut base, mut orthogonal_norms) = (Vec::new(), Vec::new());
-        for (r, g) in vector_groups(others.test_vectors) {
-            let test_vectors = &others.test_vectors[r];
+        for (r, g) in vector_groups(remaining.test_vectors) {
+            let test_vectors = &remaining.test_vectors[r];
             let mut slice_products =
                 [test_vectors.target[g][0], test_vectors.target[g][1], test_vectors.size[g], ZERO_LANES];
-            for (c, &s) in base_coefficients.iter().zip(others.columns) {
-                let (products, rest) = others.vector_products(r, g, s);
+            for (c, &s) in base_coefficients.iter().zip(remaining.columns) {
+                let (products, orthogonal_norm) = remaining.vector_products(r, g, s);
                 for (slice_products, products) in slice_products.iter_mut().zip(&products) {
                     for n in 0..LANE_COUNT {
                         slice_products[n] -= c * products[n];
                     }
                 }
-                orthogonal_norms.push(rest);
+                orthogonal_norms.push(orthogonal_norm);
             }
             base.push(slice_products);
         }
-        let explained: f64 = base_coefficients.iter().zip(&rhs).map(|(c, g)| c * g).sum();
-        let of = |side: &AxisTable| {
-            others.test_vectors.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NO_INDEX))
+        let explained_square: f64 = base_coefficients.iter().zip(&rhs).map(|(c, g)| c * g).sum();
+        let is_output_side = |side: &AxisTable| {
+            remaining.test_vectors.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NO_INDEX))
         };
-        let own = (0..2).find(|&n| of(&sides[n]));
+        let output_side = (0..2).find(|&n| is_output_side(&sides[n]));
         Self {
-            others,
+            remaining,
             common,
             sides,
-            own,
+            output_side,
             base_coefficients,
-            unexplained: common.size * common.size - explained,
+            residual_square: common.size * common.size - explained_square,
             base,
             orthogonal_norms,
         }
@@ -285,7 +285,7 @@ impl<'a> SliceTables<'a> {
     /// grid, and store them in `row_coefficients`.
     #[inline(always)]
     pub(super) fn compute_coefficients(&self, row_coefficients: &mut RowCoefficients, rows: Range<usize>) {
-        let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
+        let (k, len) = (self.remaining.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
         (row_coefficients.start, row_coefficients.len) = (rows.start, len);
         let RowCoefficients { plus, minus, independence, product, .. } = row_coefficients;
@@ -293,34 +293,35 @@ impl<'a> SliceTables<'a> {
             table.resize(rows.len() * len, 0.0);
         }
         product.resize((k + 1) * len, 0.0);
-        let (product, shared) = product.split_at_mut(len);
-        for (s, shared) in shared.chunks_exact_mut(len).enumerate() {
-            for (j, shared) in shared.iter_mut().enumerate() {
-                *shared = v.shared[j * k + s];
+        let (product, fixed_products) = product.split_at_mut(len);
+        for (s, fixed_products) in fixed_products.chunks_exact_mut(len).enumerate() {
+            for (j, fixed_products) in fixed_products.iter_mut().enumerate() {
+                *fixed_products = v.fixed_products[j * k + s];
             }
         }
-        for (at, row) in rows.enumerate() {
-            let (with, scale, y) = (self.others.normal.products(u.columns[row]), u.scale[row], u.target[row]);
+        for (index, row) in rows.enumerate() {
+            let (products, scale, y) = (self.remaining.normal.products(u.columns[row]), u.scale[row], u.target[row]);
             for (product, &column) in product.iter_mut().zip(&v.columns) {
-                *product = with[column] * scale;
+                *product = products[column] * scale;
             }
-            for (shared, fixed_coefficients) in
-                shared.chunks_exact(len).zip(&u.fixed_coefficients[row * k..(row + 1) * k])
+            for (fixed_products, fixed_coefficients) in
+                fixed_products.chunks_exact(len).zip(&u.fixed_coefficients[row * k..(row + 1) * k])
             {
-                for (product, shared) in product.iter_mut().zip(shared) {
-                    *product -= fixed_coefficients * shared;
+                for (product, fixed_products) in product.iter_mut().zip(fixed_products) {
+                    *product -= fixed_coefficients * fixed_products;
                 }
             }
-            let at = at * len..(at + 1) * len;
-            let (plus, minus, independence) = (&mut plus[at.clone()], &mut minus[at.clone()], &mut independence[at]);
+            let index = index * len..(index + 1) * len;
+            let (plus, minus, independence) =
+                (&mut plus[index.clone()], &mut minus[index.clone()], &mut independence[index]);
             let (scales, targets) = (&v.scale[..len], &v.target[..len]);
             for j in 0..len {
                 let (b, z) = (product[j] * scales[j], targets[j]);
                 let (above, below) = (1.0 + b, 1.0 - b);
-                let independence_at = above * below;
-                let sound = independence_at > COLLINEARITY_TOLERANCE;
-                let half = if sound { 0.5 / independence_at } else { 0.0 };
-                independence[j] = if sound { independence_at } else { 0.0 };
+                let independence_of_pair = above * below;
+                let is_independent = independence_of_pair > COLLINEARITY_TOLERANCE;
+                let half = if is_independent { 0.5 / independence_of_pair } else { 0.0 };
+                independence[j] = if is_independent { independence_of_pair } else { 0.0 };
                 plus[j] = (y + z) * below * half;
                 minus[j] = (y - z) * above * half;
             }
@@ -338,27 +339,28 @@ impl<'a> SliceTables<'a> {
         let [u, v] = &self.sides;
         let ((u0, u1), (v0, v1)) = (su.ends(u.columns.len()), sv.ends(v.columns.len()));
         let (wu, wv) = (eighth_of_square(u1 - u0), eighth_of_square(v1 - v0));
-        let (pu, pv) = (u.levels[su.level].coefficient_sums[su.at], v.levels[sv.level].coefficient_sums[sv.at]);
+        let (pu, pv) =
+            (u.levels[su.level].coefficient_sums[su.position], v.levels[sv.level].coefficient_sums[sv.position]);
         let sums = pu.sum + pv.sum;
-        let at = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
-        let places = at.map(|(i, j)| row_coefficients.at(i, j));
+        let corners = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
+        let indices = corners.map(|(i, j)| row_coefficients.at(i, j));
         let halves =
-            [places.map(|place| row_coefficients.plus[place]), places.map(|place| row_coefficients.minus[place])];
+            [indices.map(|index| row_coefficients.plus[index]), indices.map(|index| row_coefficients.minus[index])];
         let (mut ps, mut qs) = ([0.0; 4], [0.0; 4]);
         for c in 0..4 {
             ps[c] = halves[0][c] + halves[1][c];
             qs[c] = halves[0][c] - halves[1][c];
         }
-        let (bilinear_deviation, independence, explained) = if self.common.ranks_equation_error {
-            let (independence, explained) =
+        let (bilinear_deviation, independence, explained_square) = if self.common.ranks_equation_error {
+            let (independence, explained_square) =
                 row_coefficients.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
-            ([0.0; 2], independence, explained)
+            ([0.0; 2], independence, explained_square)
         } else {
             let (bilinear_deviation, independence) =
                 row_coefficients.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
             (bilinear_deviation, independence, 0.0)
         };
-        let independence = independence - 2.0 * self.others.rounding * self.others.trace * sums * sums;
+        let independence = independence - 2.0 * self.remaining.rounding * self.remaining.trace * sums * sums;
         // NaN proves nothing.
         if independence.is_nan() || independence <= 0.0 {
             return None;
@@ -368,23 +370,23 @@ impl<'a> SliceTables<'a> {
         let (p, q, p_most, q_most) =
             (bilinear(ps), bilinear(qs), largest(&ps) + deviation_sum, largest(&qs) + deviation_sum);
 
-        let trace = self.others.trace + sums * sums / independence;
+        let trace = self.remaining.trace + sums * sums / independence;
         let modulus_sum = self.common.weighted_size
             + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()
             + p_most * pu.sum
             + q_most * pv.sum;
-        let terms = to_f64(self.others.columns.len() + 2);
+        let terms = to_f64(self.remaining.columns.len() + 2);
         let rounding = ELIMINATION_ERROR * terms * terms * trace * modulus_sum;
         let mixed_slopes = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
         Some(BoxQuantities {
-            at,
+            corners,
             interpolation_factors: [wu, wv],
             ps,
             qs,
             coefficient_bounds: [p_most, q_most],
             bilinear_deviation,
             mixed_slopes,
-            explained,
+            explained_square,
             modulus_sum,
             rounding,
         })
@@ -405,10 +407,11 @@ impl<'a> SliceTables<'a> {
     /// is proved.
     #[inline(always)]
     fn equation_error_bound(&self, cell: &BoxQuantities) -> f64 {
-        let rounding = self.others.rounding * cell.modulus_sum + to_f64(self.others.columns.len() + 2) * cell.rounding;
-        let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.modulus_sum;
+        let rounding =
+            self.remaining.rounding * cell.modulus_sum + to_f64(self.remaining.columns.len() + 2) * cell.rounding;
+        let bound = self.residual_square - cell.explained_square - 4.0 * rounding * cell.modulus_sum;
         // Neither NaN nor an overflow proves anything.
-        if bound > 0.0 && bound < f64::MAX && cell.explained > f64::MIN {
+        if bound > 0.0 && bound < f64::MAX && cell.explained_square > f64::MIN {
             bound
         } else {
             0.0
@@ -421,26 +424,26 @@ impl<'a> SliceTables<'a> {
     fn output_error_bound(&self, intervals: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         let moduli = self.moduli(intervals, cell);
         let (mut sum, mut first) = (0.0, 0);
-        for (r, test_vectors) in self.others.test_vectors.iter().enumerate() {
+        for (r, test_vectors) in self.remaining.test_vectors.iter().enumerate() {
             let mut best = 0.0;
             for group in first..first + test_vectors.groups {
                 let joint_column = self.joint_column(intervals, cell, &moduli, group);
                 let CornerValues { values, slack, remainders } =
                     self.corner_values(intervals, cell, &moduli, (r, group), joint_column);
                 // All corner values are projected on the direction of their sum.
-                let mut along = [ZERO_LANES; 2];
+                let mut direction = [ZERO_LANES; 2];
                 for n in 0..LANE_COUNT {
                     let re = values[0][0][n] + values[1][0][n] + values[2][0][n] + values[3][0][n];
                     let im = values[0][1][n] + values[1][1][n] + values[2][1][n] + values[3][1][n];
                     let size = (re * re + im * im).sqrt();
                     let inverse = if size > 0.0 { 1.0 / size } else { 0.0 };
-                    along[0][n] = re * inverse;
-                    along[1][n] = im * inverse;
+                    direction[0][n] = re * inverse;
+                    direction[1][n] = im * inverse;
                 }
                 let mut bounds = [f64::MAX; LANE_COUNT];
                 for (value, slack) in values.iter().zip(&slack) {
                     for n in 0..LANE_COUNT {
-                        let response = value[0][n] * along[0][n] + value[1][n] * along[1][n] - remainders[0][n];
+                        let response = value[0][n] * direction[0][n] + value[1][n] * direction[1][n] - remainders[0][n];
                         let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
                         // Margin for the rounding errors of the divisor and of the score.
                         let bound = response / ((size + slack[n] + remainders[1][n]) * (1.0 + test_vectors.unit));
@@ -468,15 +471,16 @@ impl<'a> SliceTables<'a> {
     /// the deviation of these coefficients from bilinear functions.
     #[inline(always)]
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
-        let k = self.others.columns.len();
+        let k = self.remaining.columns.len();
         let [u, v] = &self.sides;
-        let BoxQuantities { at, interpolation_factors: [wu, wv], ps, qs, rounding, .. } = *cell;
-        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
+        let BoxQuantities { corners, interpolation_factors: [wu, wv], ps, qs, rounding, .. } = *cell;
+        let ((u0, v0), (u1, v1)) = (corners[0], corners[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
-        let (mut others, mut deviation_bounds) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
+        let (mut fixed_columns, mut deviation_bounds) =
+            ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
         for s in 0..k {
-            for (c, (i, j)) in at.into_iter().enumerate() {
-                others[s][c] = (self.base_coefficients[s]
+            for (c, (i, j)) in corners.into_iter().enumerate() {
+                fixed_columns[s][c] = (self.base_coefficients[s]
                     - ps[c] * u.fixed_coefficients[i * k + s]
                     - qs[c] * v.fixed_coefficients[j * k + s])
                     .abs();
@@ -484,18 +488,18 @@ impl<'a> SliceTables<'a> {
             let a = LinearApproximation::new(
                 u.fixed_coefficients[u0 * k + s],
                 u.fixed_coefficients[u1 * k + s],
-                wu * lu.fixed_coefficients[su.at * k + s],
+                wu * lu.fixed_coefficients[su.position * k + s],
             );
             let b = LinearApproximation::new(
                 v.fixed_coefficients[v0 * k + s],
                 v.fixed_coefficients[v1 * k + s],
-                wv * lv.fixed_coefficients[sv.at * k + s],
+                wv * lv.fixed_coefficients[sv.position * k + s],
             );
             deviation_bounds[s] = cell.remainder([a, b]) + rounding;
         }
         let (mut sums, mut sum_deviation_bound) = ([0.0; 4], 0.0);
         if let Some(own_fixed_column) = self.own_fixed_column() {
-            for (c, (i, j)) in at.into_iter().enumerate() {
+            for (c, (i, j)) in corners.into_iter().enumerate() {
                 sums[c] = (self.base_coefficients[own_fixed_column]
                     - ps[c] * u.joint_coefficients[i]
                     - qs[c] * v.joint_coefficients[j])
@@ -518,14 +522,14 @@ impl<'a> SliceTables<'a> {
             );
             sum_deviation_bound = cell.remainder([a, b]) + rounding * self.common.ratio;
         }
-        Moduli { others, deviation_bounds, sums, sum_deviation_bound }
+        Moduli { fixed_columns, deviation_bounds, sums, sum_deviation_bound }
     }
 
     /// Return the index of a fixed-order column of the output if a varying column also belongs to the output. `None`
     /// otherwise. The coefficients of the two columns may cancel.
     #[inline(always)]
     fn own_fixed_column(&self) -> Option<usize> {
-        self.others.own_fixed_column.filter(|_| self.own.is_some())
+        self.remaining.own_fixed_column.filter(|_| self.output_side.is_some())
     }
 
     /// Return the index of the fixed-order output column if a joint bound with the varying output column is tighter for
@@ -539,18 +543,19 @@ impl<'a> SliceTables<'a> {
         group: usize,
     ) -> Option<usize> {
         let own_fixed_column = self.own_fixed_column()?;
-        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let (k, groups) = (self.remaining.columns.len(), self.base.len());
         let [u, v] = &self.sides;
-        let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
-        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
-        let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
-        let rest = &self.orthogonal_norms[group * k + own_fixed_column];
-        let (mut apart, mut joint) = (0.0, 0.0);
+        let bu = &u.levels[su.level].nodes[su.position * groups + group].second_differences;
+        let bv = &v.levels[sv.level].nodes[sv.position * groups + group].second_differences;
+        let output_coefficients = if self.output_side == Some(0) { &cell.ps } else { &cell.qs };
+        let orthogonal_norms = &self.orthogonal_norms[group * k + own_fixed_column];
+        let (mut separate_slack, mut joint_slack) = (0.0, 0.0);
         for n in 0..LANE_COUNT {
-            apart += moduli.others[own_fixed_column][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
-            joint += moduli.sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
+            separate_slack += moduli.fixed_columns[own_fixed_column][0] * orthogonal_norms[n]
+                + output_coefficients[0].abs() * (bu[2][n] + bv[2][n]);
+            joint_slack += moduli.sums[0] * orthogonal_norms[n] + output_coefficients[0].abs() * (bu[3][n] + bv[3][n]);
         }
-        (joint < apart).then_some(own_fixed_column)
+        (joint_slack < separate_slack).then_some(own_fixed_column)
     }
 
     /// Compute inner products and denominators of one group of test vectors on one record, at the corners of a box of
@@ -564,14 +569,14 @@ impl<'a> SliceTables<'a> {
         (record, group): (usize, usize),
         joint_column: Option<usize>,
     ) -> CornerValues {
-        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let (k, groups) = (self.remaining.columns.len(), self.base.len());
         let [u, v] = &self.sides;
         let BoxQuantities {
-            at,
+            corners,
             interpolation_factors: [wu, wv],
             ps,
             qs,
-            coefficient_bounds: [p_most, q_most],
+            coefficient_bounds: [p_bound, q_bound],
             bilinear_deviation,
             mixed_slopes,
             modulus_sum,
@@ -579,12 +584,12 @@ impl<'a> SliceTables<'a> {
             ..
         } = *cell;
         let deviation_sum = bilinear_deviation[0] + bilinear_deviation[1];
-        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
-        let bu = &u.levels[su.level].nodes[su.at * groups + group].second_differences;
-        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].second_differences;
+        let ((u0, v0), (u1, v1)) = (corners[0], corners[3]);
+        let bu = &u.levels[su.level].nodes[su.position * groups + group].second_differences;
+        let bv = &v.levels[sv.level].nodes[sv.position * groups + group].second_differences;
         let (a, b) = (&u.vector_products[u0 * groups + group], &u.vector_products[u1 * groups + group]);
         let (c, d) = (&v.vector_products[v0 * groups + group], &v.vector_products[v1 * groups + group]);
-        let (base, tops) = (&self.base[group], &self.common.max_moduli[group]);
+        let (base, max_moduli) = (&self.base[group], &self.common.max_moduli[group]);
         let mut remainders = [[0.0; LANE_COUNT]; 2];
         for half in 0..2 {
             for n in 0..LANE_COUNT {
@@ -601,12 +606,12 @@ impl<'a> SliceTables<'a> {
                     + bilinear_deviation[0] * sizes[0]
                     + bilinear_deviation[1] * sizes[1]
                     + deviation_sum * (sizes[2] + sizes[3])
-                    + wu * bu[half][n] * p_most
-                    + wv * bv[half][n] * q_most
-                    + rounding_error * tops[half][n];
+                    + wu * bu[half][n] * p_bound
+                    + wv * bv[half][n] * q_bound
+                    + rounding_error * max_moduli[half][n];
             }
         }
-        let rounding = self.others.test_vectors[record].target_rounding
+        let rounding = self.remaining.test_vectors[record].target_rounding
             + (modulus_sum + rounding_error) * self.common.rounding[record];
         remainders[0].iter_mut().for_each(|remainders| *remainders += rounding);
         // Slack of the varying columns, whose scale is at least 1. The slack of the fixed-order columns follows.
@@ -618,18 +623,18 @@ impl<'a> SliceTables<'a> {
                 slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
             }
         }
-        let rest_of = &self.orthogonal_norms[group * k..(group + 1) * k];
-        for (s, rest) in rest_of.iter().enumerate() {
+        let orthogonal_norms = &self.orthogonal_norms[group * k..(group + 1) * k];
+        for (s, orthogonal_norm) in orthogonal_norms.iter().enumerate() {
             let joint_coefficients = joint_column == Some(s);
             let (sizes, norms) = if joint_coefficients {
                 (&moduli.sums, moduli.sum_deviation_bound)
             } else {
-                (&moduli.others[s], moduli.deviation_bounds[s])
+                (&moduli.fixed_columns[s], moduli.deviation_bounds[s])
             };
             for n in 0..LANE_COUNT {
-                remainders[1][n] += norms * rest[n];
+                remainders[1][n] += norms * orthogonal_norm[n];
                 for corner in 0..4 {
-                    slack[corner][n] += sizes[corner] * rest[n];
+                    slack[corner][n] += sizes[corner] * orthogonal_norm[n];
                 }
             }
         }
@@ -705,61 +710,67 @@ impl RowCoefficients {
     ) -> ([f64; 2], f64) {
         let (mut deviations, mut independence) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
-        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / to_f64(b - a) } else { 0.0 });
+        let [row_scale, column_scale] =
+            [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / to_f64(b - a) } else { 0.0 });
         for row in 0..=u1 - u0 {
-            let s = to_f64(row) * down - 1.0;
+            let s = to_f64(row) * row_scale - 1.0;
             let (x, y) = (plus[2] + plus[3] * s, minus[2] + minus[3] * s);
             let (first, second) = (plus[0] + plus[1] * s - x, minus[0] + minus[1] * s - y);
-            let (x, y, start) = (x * across, y * across, self.at(u0 + row, v0));
+            let (x, y, start) = (x * column_scale, y * column_scale, self.at(u0 + row, v0));
             let plus = self.plus[start..start + width].chunks_exact(ROW_LANES);
             let minus = self.minus[start..start + width].chunks_exact(ROW_LANES);
-            let lefts = self.independence[start..start + width].chunks_exact(ROW_LANES);
-            let rest = [plus.remainder(), minus.remainder(), lefts.remainder()];
-            let mut place = LANE_OFFSETS;
-            for ((plus, minus), lefts) in plus.zip(minus).zip(lefts) {
+            let denominators = self.independence[start..start + width].chunks_exact(ROW_LANES);
+            let tail = [plus.remainder(), minus.remainder(), denominators.remainder()];
+            let mut offsets = LANE_OFFSETS;
+            for ((plus, minus), denominators) in plus.zip(minus).zip(denominators) {
                 for n in 0..ROW_LANES {
-                    let a = (plus[n] - (first + x * place[n])).abs();
-                    let b = (minus[n] - (second + y * place[n])).abs();
+                    let a = (plus[n] - (first + x * offsets[n])).abs();
+                    let b = (minus[n] - (second + y * offsets[n])).abs();
                     deviations[0][n] = if a > deviations[0][n] { a } else { deviations[0][n] };
                     deviations[1][n] = if b > deviations[1][n] { b } else { deviations[1][n] };
-                    independence[n] = if lefts[n] < independence[n] { lefts[n] } else { independence[n] };
-                    place[n] += LANE_OFFSETS[ROW_LANES - 1] + 1.0;
+                    independence[n] = if denominators[n] < independence[n] { denominators[n] } else { independence[n] };
+                    offsets[n] += LANE_OFFSETS[ROW_LANES - 1] + 1.0;
                 }
             }
-            for n in 0..rest[0].len() {
-                let a = (rest[0][n] - (first + x * place[n])).abs();
-                let b = (rest[1][n] - (second + y * place[n])).abs();
+            for n in 0..tail[0].len() {
+                let a = (tail[0][n] - (first + x * offsets[n])).abs();
+                let b = (tail[1][n] - (second + y * offsets[n])).abs();
                 deviations[0][n] = if a > deviations[0][n] { a } else { deviations[0][n] };
                 deviations[1][n] = if b > deviations[1][n] { b } else { deviations[1][n] };
-                independence[n] = if rest[2][n] < independence[n] { rest[2][n] } else { independence[n] };
+                independence[n] = if tail[2][n] < independence[n] { tail[2][n] } else { independence[n] };
             }
         }
-        let most = |x: [f64; ROW_LANES]| x.into_iter().fold(0.0_f64, f64::max);
-        ([most(deviations[0]), most(deviations[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
+        let maximum = |x: [f64; ROW_LANES]| x.into_iter().fold(0.0_f64, f64::max);
+        ([maximum(deviations[0]), maximum(deviations[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
     }
 
     /// Return the smallest 1 − B² over a box of orders, and the largest part of the squared output norm that the two
     /// varying columns explain. B is the inner product of these columns after normalization.
     #[inline(always)]
     pub(super) fn max_explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
-        let (mut independence, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);
+        let (mut independence, mut max_square) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
         for row in u0..u1 + 1 {
             let (y, start) = (y[row], self.at(row, v0));
-            let sums = [&self.plus, &self.minus, &self.independence].map(|from| &from[start..start + width]);
+            let sums = [&self.plus, &self.minus, &self.independence].map(|table| &table[start..start + width]);
             let z = &z[v0..v0 + width];
-            let mut at = 0;
-            while at < width {
-                let lanes = ROW_LANES.min(width - at);
+            let mut offset = 0;
+            while offset < width {
+                let lanes = ROW_LANES.min(width - offset);
                 for n in 0..lanes {
-                    let explained = sums[0][at + n] * (y + z[at + n]) + sums[1][at + n] * (y - z[at + n]);
-                    most[n] = if explained > most[n] { explained } else { most[n] };
-                    independence[n] = if sums[2][at + n] < independence[n] { sums[2][at + n] } else { independence[n] };
+                    let explained_square =
+                        sums[0][offset + n] * (y + z[offset + n]) + sums[1][offset + n] * (y - z[offset + n]);
+                    max_square[n] = if explained_square > max_square[n] { explained_square } else { max_square[n] };
+                    independence[n] =
+                        if sums[2][offset + n] < independence[n] { sums[2][offset + n] } else { independence[n] };
                 }
-                at += lanes;
+                offset += lanes;
             }
         }
-        (independence.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
+        (
+            independence.into_iter().fold(f64::INFINITY, f64::min),
+            max_square.into_iter().fold(f64::NEG_INFINITY, f64::max),
+        )
     }
 }
 

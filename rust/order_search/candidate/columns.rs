@@ -49,10 +49,10 @@ impl<'a> RequiredRegressors<'a> {
     }
 
     /// Add the initial terms t^{from + i} for all integers i ≥ 0 below `order`.
-    fn add_powers(&mut self, from: f64, order: f64) {
+    fn add_powers(&mut self, integration: f64, order: f64) {
         let mut i = 0.0;
         while i < order - ORDER_GRAIN {
-            self.index.insert(Key::initial(from + i));
+            self.index.insert(Key::initial(integration + i));
             i += 1.0;
         }
     }
@@ -68,49 +68,49 @@ impl<'a> RequiredRegressors<'a> {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns<const L: usize> {
     /// Regressor column of each candidate.
-    pub(crate) at: [usize; L],
+    pub(crate) indices: [usize; L],
     /// True if all candidates have the same column.
-    same: bool,
+    is_uniform: bool,
     /// True if the columns are consecutive in ascending order.
-    consecutive: bool,
+    is_consecutive: bool,
 }
 
 impl<const L: usize> Columns<L> {
     /// Build the columns of L candidates, which may be arbitrary.
-    pub(crate) fn new(at: [usize; L]) -> Self {
-        Self { at, same: L == 1, consecutive: false }
+    pub(crate) fn new(indices: [usize; L]) -> Self {
+        Self { indices, is_uniform: L == 1, is_consecutive: false }
     }
 
-    /// Build the columns of L candidates that all have the column `at`.
+    /// Build the columns of L candidates that all have the same column.
     #[inline(always)]
-    pub(crate) fn one(at: usize) -> Self {
-        Self { at: [at; L], same: true, consecutive: false }
+    pub(crate) fn uniform(column: usize) -> Self {
+        Self { indices: [column; L], is_uniform: true, is_consecutive: false }
     }
 
     /// Build the columns of L candidates, which must ascend.
     #[inline(always)]
-    pub(super) fn from_ascending(at: [usize; L]) -> Self {
-        Self { at, same: L == 1, consecutive: at[L - 1] - at[0] == L - 1 }
+    pub(super) fn from_ascending(indices: [usize; L]) -> Self {
+        Self { indices, is_uniform: L == 1, is_consecutive: indices[L - 1] - indices[0] == L - 1 }
     }
 
     /// Determine whether the columns are equal or consecutive, because such columns are read faster.
     #[inline(always)]
     pub(crate) fn compare(&mut self) {
-        let first = self.at[0];
-        self.same = self.at.iter().all(|&p| p == first);
-        self.consecutive = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
+        let first = self.indices[0];
+        self.is_uniform = self.indices.iter().all(|&p| p == first);
+        self.is_consecutive = !self.is_uniform && self.indices.iter().enumerate().all(|(n, &p)| p == first + n);
     }
 
     /// Return the elements of a vector at the columns of the L candidates.
     #[inline(always)]
-    pub(super) fn of(&self, vector: &[f64]) -> Lanes<L> {
-        if self.same {
-            [vector[self.at[0]]; L]
-        } else if self.consecutive {
-            part_of(&vector[self.at[0]..])
+    pub(super) fn gather(&self, vector: &[f64]) -> Lanes<L> {
+        if self.is_uniform {
+            [vector[self.indices[0]]; L]
+        } else if self.is_consecutive {
+            part_of(&vector[self.indices[0]..])
         } else {
             let mut out = [0.0; L];
-            out.iter_mut().zip(&self.at).for_each(|(x, &p)| *x = vector[p]);
+            out.iter_mut().zip(&self.indices).for_each(|(x, &p)| *x = vector[p]);
             out
         }
     }
@@ -118,15 +118,15 @@ impl<const L: usize> Columns<L> {
     /// Return the elements of a symmetric matrix (row-major, `stride` values per row) at these columns and the columns
     /// `rows`, one per candidate.
     #[inline(always)]
-    pub(super) fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
-        if rows.same {
-            self.of(&matrix[rows.at[0] * stride..(rows.at[0] + 1) * stride])
-        } else if self.same {
-            rows.of(&matrix[self.at[0] * stride..(self.at[0] + 1) * stride])
+    pub(super) fn gather_pairs(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
+        if rows.is_uniform {
+            self.gather(&matrix[rows.indices[0] * stride..(rows.indices[0] + 1) * stride])
+        } else if self.is_uniform {
+            rows.gather(&matrix[self.indices[0] * stride..(self.indices[0] + 1) * stride])
         } else {
             let mut out = [0.0; L];
             for n in 0..L {
-                out[n] = matrix[rows.at[n] * stride + self.at[n]];
+                out[n] = matrix[rows.indices[n] * stride + self.indices[n]];
             }
             out
         }

@@ -13,7 +13,7 @@ use crate::series::Kernel;
 
 /// Cutoff frequency of the low-pass filter, relative to the bandwidth of the output. Initial coefficients are estimated
 /// from the filtered signals.
-const START_BAND: f64 = 2.0;
+const START_BANDWIDTH_RATIO: f64 = 2.0;
 
 /// Spectra of one record, used for the refinement of all candidates.
 struct RecordSpectra {
@@ -78,7 +78,10 @@ impl Refiner {
             .zip(banks)
             .zip(targets)
             .map(|((spectra, bank), target)| InstrumentSource {
-                own: positions.iter().map(|&p| spectra.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
+                output_terms: positions
+                    .iter()
+                    .map(|&p| spectra.kernels[p].as_ref().map(|k| (bank.kernel(p), k)))
+                    .collect(),
                 measured: positions.iter().map(|&p| &spectra.columns[p]).collect(),
                 clean: positions.iter().map(|&p| &spectra.columns[p]).collect(),
                 initial: initial.iter().map(|&p| &spectra.columns[p]).collect(),
@@ -89,13 +92,13 @@ impl Refiner {
         let start: Vec<f64> = coefficients.iter().chain(weights.iter()).copied().collect();
         // An initial term with coefficient 0 in the initial guess is a linear combination of others.
         let n = initial.len();
-        let dropped: Vec<(usize, usize)> =
+        let excluded_terms: Vec<(usize, usize)> =
             weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
-        match refine(&sources, fixed, &dropped, &start, self.settings, &mut Scratch::until(stop)) {
+        match refine(&sources, fixed, &excluded_terms, &start, self.settings, &mut Scratch::with_stop(stop)) {
             Ok((solution, _, _)) if solution.iter().all(|x| x.is_finite()) => {
-                let (terms, rest) = solution.split_at(coefficients.len());
+                let (terms, initial_coefficients) = solution.split_at(coefficients.len());
                 coefficients.copy_from_slice(terms);
-                weights.copy_from_slice(rest);
+                weights.copy_from_slice(initial_coefficients);
                 Ok(())
             }
             Ok(_) | Err(Error::Diverged { .. }) => Err(Failure::Diverged),
@@ -111,8 +114,8 @@ impl Refiner {
 /// [`Error::Structure`] for a signal that the record lacks, [`Error::Interrupted`] after a stop request
 /// ([`Bank::new_interruptible`]).
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
-    let band = START_BAND * power_frequency(record.signal(output), record.step());
-    let smooth = record.clean_record().with_filter(&low_pass(band, record)?)?;
+    let cutoff = START_BANDWIDTH_RATIO * power_frequency(record.signal(output), record.step());
+    let smooth = record.clean_record().with_filter(&low_pass(cutoff, record)?)?;
     let target = smooth.signal(output).to_vec();
     Ok((Bank::new_interruptible(index, &smooth, output, stop)?, target))
 }

@@ -141,13 +141,13 @@ impl NormalEquations {
         for (a, &ta) in self.free.iter().enumerate() {
             let rows = &positions[ta];
             for (b, &tb) in self.free[..=a].iter().enumerate() {
-                gram[packed_index(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
+                gram[packed_index(a, b)] = rows.gather_pairs(&positions[tb], &normal.correlation, width);
             }
-            rhs[a] = rows.of(&normal.rhs);
+            rhs[a] = rows.gather(&normal.rhs);
             for (columns, fixed) in positions.iter().zip(&self.fixed) {
                 if let Some(value) = *fixed {
                     let (size, correlation) =
-                        (columns.of(&normal.size), rows.with(columns, &normal.correlation, width));
+                        (columns.gather(&normal.size), rows.gather_pairs(columns, &normal.correlation, width));
                     (0..L).for_each(|n| rhs[a][n] -= value * size[n] * correlation[n]);
                 }
             }
@@ -160,7 +160,8 @@ impl NormalEquations {
                     // Product with the column of a term on this record, relative to the norm of the column over all
                     // records.
                     let columns = &positions[tb];
-                    let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
+                    let (c, size, all) =
+                        (columns.gather(row), columns.gather(&part.size), columns.gather(&normal.inverse));
                     gram[packed_index(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
                 }
                 for (j, &f) in initial[..=i].iter().enumerate() {
@@ -169,7 +170,7 @@ impl NormalEquations {
                 rhs[a] = [part.rhs[e]; L];
                 for (columns, fixed) in positions.iter().zip(&self.fixed) {
                     if let Some(value) = *fixed {
-                        let (size, correlation) = (columns.of(&part.size), columns.of(row));
+                        let (size, correlation) = (columns.gather(&part.size), columns.gather(row));
                         (0..L).for_each(|n| rhs[a][n] -= value * size[n] * correlation[n]);
                     }
                 }
@@ -182,7 +183,7 @@ impl NormalEquations {
             coefficients.push(match *fixed {
                 Some(value) => [value; L],
                 None => {
-                    let scale = columns.of(&normal.inverse);
+                    let scale = columns.gather(&normal.inverse);
                     let x = rhs[next];
                     next += 1;
                     let mut out = [0.0; L];
@@ -340,23 +341,23 @@ impl ResidualSumOfSquares {
         let mut sum = [self.gram[target * stride + target]; L];
         let mut size = [self.norms[target]; L];
         for (i, (rows, c)) in positions.iter().zip(coefficients).enumerate() {
-            let norms = rows.of(&self.norms);
+            let norms = rows.gather(&self.norms);
             // c·(c·G_ii + 2 Σ_{j<i} c_j G_ij − 2 b_i)
-            let mut inner = rows.of(&self.gram[target * stride..]);
+            let mut inner = rows.gather(&self.gram[target * stride..]);
             for (columns, d) in positions[..i].iter().zip(coefficients) {
-                let g = rows.with(columns, &self.gram, stride);
+                let g = rows.gather_pairs(columns, &self.gram, stride);
                 (0..L).for_each(|n| inner[n] -= d[n] * g[n]);
             }
-            let diagonal = rows.of(&self.diagonal);
+            let diagonal = rows.gather(&self.diagonal);
             for n in 0..L {
                 sum[n] += c[n] * (c[n] * diagonal[n] - 2.0 * inner[n]);
                 size[n] += c[n].abs() * norms[n];
             }
         }
-        let mut least = [0.0; L];
+        let mut min_error = [0.0; L];
         for n in 0..L {
-            least[n] = sum[n] - self.unit * size[n] * size[n];
+            min_error[n] = sum[n] - self.unit * size[n] * size[n];
         }
-        (least, sum)
+        (min_error, sum)
     }
 }

@@ -198,12 +198,12 @@ impl Problem {
             }
         }
         let width = index.keys().len();
-        let refined = options.refines();
+        let refines = options.refines();
         // If other measured outputs entered as inputs, their noise would be ranked like an error of the equation.
         let banks = records
             .iter()
             .map(|r| {
-                if refined {
+                if refines {
                     Bank::new_interruptible(&index, &r.clean_record(), output, stop)
                 } else {
                     Bank::new_interruptible(&index, r, output, stop)
@@ -216,16 +216,16 @@ impl Problem {
         let mut sum = vec![0.0; elements];
         let mut unweighted = if options.ranks_by_gram_matrix() { vec![0.0; elements] } else { Vec::new() };
         let precisions = |squares: &[f64]| -> Vec<f64> {
-            let precision = |&of: &f64| match options.estimator {
+            let precision = |&squares: &f64| match options.estimator {
                 Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
-                Estimator::MultiInnovation(innovation) => innovation.prior.precision(of),
+                Estimator::MultiInnovation(innovation) => innovation.prior.precision(squares),
             };
             squares.iter().map(precision).collect()
         };
         let mut squares = vec![0.0; width];
         let mut parts = Vec::new();
         for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
-            let mut gram = if refined {
+            let mut gram = if refines {
                 let (bank, target) = start_bank(record, output, &index, stop)?;
                 plain_gram(&bank, &target, stop)
             } else {
@@ -252,7 +252,7 @@ impl Problem {
         };
         // The dual bound uses D e = w with denominator D, output error e and equation error w. It requires integrals of
         // the measured output.
-        let bound_banks = if refined && options.pruning && options.criterion == Criterion::OutputError {
+        let bound_banks = if refines && options.pruning && options.criterion == Criterion::OutputError {
             records
                 .iter()
                 .map(|r| Bank::new_interruptible(&index, &r.clean_record_except(output), output, stop))
@@ -291,11 +291,11 @@ impl Problem {
         };
         if self.options.pruning && self.residual_sums.is_none() && !banks.is_empty() {
             let output_error = self.options.criterion == Criterion::OutputError;
-            let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
+            let output_count = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
             // Each test vector needs two transforms per output column. Its inner products cost about one transform.
-            let each = 2 * own + 4;
+            let effect_count = 2 * output_count + 4;
             #[allow(clippy::cast_possible_truncation)]
-            let groups = (candidates.saturating_mul(transforms) / 4 / (each * LANE_COUNT as u64))
+            let groups = (candidates.saturating_mul(transforms) / 4 / (effect_count * LANE_COUNT as u64))
                 .min((Bound::MAX_TEST_VECTORS / LANE_COUNT) as u64) as usize;
             if groups > 0 {
                 let data = (&banks[..], &self.targets[..]);
@@ -368,11 +368,11 @@ impl Problem {
             .collect()
     }
 
-    /// Build the test for unstable zeros if its tables fit into `spare` bytes. Return the memory used \[bytes\], 0 if
-    /// the test is not built. Runs on the current thread pool.
-    pub(crate) fn add_unstable_zeros(&mut self, spare: u64) -> u64 {
+    /// Build the test for unstable zeros if its tables fit into `spare_bytes` bytes. Return the memory used \[bytes\],
+    /// 0 if the test is not built. Runs on the current thread pool.
+    pub(crate) fn add_unstable_zeros(&mut self, spare_bytes: u64) -> u64 {
         let bytes = UnstableZeros::bytes(&self.banks);
-        if bytes > spare || !UnstableZeros::is_affordable(&self.targets) {
+        if bytes > spare_bytes || !UnstableZeros::is_affordable(&self.targets) {
             return 0;
         }
         self.unstable_zeros = Some(UnstableZeros::new(&self.banks, &self.targets, self.options.norm));
@@ -383,17 +383,17 @@ impl Problem {
     /// equations determine the coefficients of the candidates. Otherwise they minimize the squared equation error.
     /// `None` with fixed coefficients or initial terms.
     pub(crate) fn box_equations(&self) -> Option<&Normal> {
-        let own = self.equations.unconstrained_equations()?;
-        Some(self.least_squares.as_ref().unwrap_or(own))
+        let equations = self.equations.unconstrained_equations()?;
+        Some(self.least_squares.as_ref().unwrap_or(equations))
     }
 
     /// Solve the normal equations for the coefficients of the candidate with these columns, with zero initial
     /// conditions. `None` if the equations are singular.
     pub(crate) fn coefficients(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
-        let mut one = Solve::new();
-        let [singular] = self.equations.solve(&sources, &[], &mut one);
-        (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
+        let mut solve = Solve::new();
+        let [singular] = self.equations.solve(&sources, &[], &mut solve);
+        (!singular).then(|| solve.coefficients.iter().map(|c| c[0]).collect())
     }
 
     /// Return the Euclidean norm of the output over all records.
@@ -469,9 +469,9 @@ impl Problem {
             }
         }
         if let Some(refiner) = &self.refiner {
-            let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
+            let (data, column_indices) = ((&self.banks[..], &self.targets[..]), (positions, initial));
             let fixed = self.equations.fixed_coefficients();
-            if let Err(failure) = refiner.refine(data, places, fixed, coefficients, weights, &control.stop) {
+            if let Err(failure) = refiner.refine(data, column_indices, fixed, coefficients, weights, &control.stop) {
                 // A stop request invalidates the result.
                 return if control.is_stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
             }
@@ -512,9 +512,10 @@ impl Problem {
                     simulation.residuals(target, terms.chain(starts).map(column), norm, raw, limit)
                 }
                 Criterion::OutputError => {
-                    let own = terms.clone().map(|(p, c)| (bank.kernel(p), c)).filter(|(kernel, _)| !kernel.is_empty());
-                    let driven = terms.filter(|&(p, _)| bank.kernel(p).is_empty()).chain(starts).map(column);
-                    simulation.accumulate_error(target, own, driven, norm, raw, limit, control)
+                    let output_terms =
+                        terms.clone().map(|(p, c)| (bank.kernel(p), c)).filter(|(kernel, _)| !kernel.is_empty());
+                    let input_terms = terms.filter(|&(p, _)| bank.kernel(p).is_empty()).chain(starts).map(column);
+                    simulation.accumulate_error(target, output_terms, input_terms, norm, raw, limit, control)
                 }
             };
             match verdict {

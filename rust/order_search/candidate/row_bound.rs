@@ -42,7 +42,7 @@ impl<'a> CommonFactor<'a> {
     pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], varying_term: usize) -> Option<Self> {
         let count = columns.len().checked_sub(1).filter(|count| *count <= MAX_COMMON_TERMS)?;
         let zero = [0.0; MAX_COMMON_TERMS];
-        let mut shared = Self {
+        let mut factor = Self {
             squares,
             count,
             columns: [0; MAX_COMMON_TERMS],
@@ -55,11 +55,11 @@ impl<'a> CommonFactor<'a> {
             trace: 0.0,
         };
         for i in 0..count {
-            shared.columns[i] = columns[i + usize::from(i >= varying_term)];
-            shared.extend(i);
+            factor.columns[i] = columns[i + usize::from(i >= varying_term)];
+            factor.extend(i);
         }
         // This form of the condition also rejects NaN.
-        (shared.trace * squares.min_eigenvalue() <= 1.0).then_some(shared)
+        (factor.trace * squares.min_eigenvalue() <= 1.0).then_some(factor)
     }
 
     /// Add the common term number `i` to the triangular factor and to the regression.
@@ -67,8 +67,8 @@ impl<'a> CommonFactor<'a> {
     #[allow(clippy::needless_range_loop)] // triangular arrays, indexed by row and column
     fn extend(&mut self, i: usize) {
         let (squares, column) = (self.squares, self.columns[i]);
-        let whole = squares.product(column, column);
-        let (mut pivot, mut value) = (whole, squares.product(squares.target(), column));
+        let square = squares.product(column, column);
+        let (mut pivot, mut value) = (square, squares.product(squares.target(), column));
         let mut row = [0.0; MAX_COMMON_TERMS];
         for j in 0..i {
             row[j] = squares.product(column, self.columns[j]);
@@ -87,7 +87,7 @@ impl<'a> CommonFactor<'a> {
         let last = value * self.inverse[i];
         self.residual -= value * last;
         // Back substitution gives the regression of this column on the previous ones, which changes their coefficients.
-        let mut sum = whole;
+        let mut sum = square;
         for j in (0..i).rev() {
             row[j] = self.lower[i][j];
             for l in j + 1..i {
@@ -119,19 +119,19 @@ impl<'a> CommonFactor<'a> {
     /// Do the work of [`Self::append_open`] for `count` common terms.
     #[inline(always)]
     fn append_open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
-        let mut from = 0;
-        while from + L <= columns.len() {
-            let changing = Columns::<L>::from_ascending(part_of(&columns[from..]));
-            self.append_open_lanes(count, &changing, (from, L), limit, open);
-            from += L;
+        let mut start = 0;
+        while start + L <= columns.len() {
+            let changing = Columns::<L>::from_ascending(part_of(&columns[start..]));
+            self.append_open_lanes(count, &changing, (start, L), limit, open);
+            start += L;
         }
-        if from < columns.len() {
-            let rest = &columns[from..];
-            let mut at = [rest[0]; L];
-            at[..rest.len()].copy_from_slice(rest);
-            let mut changing = Columns::new(at);
+        if start < columns.len() {
+            let remaining = &columns[start..];
+            let mut lane_columns = [remaining[0]; L];
+            lane_columns[..remaining.len()].copy_from_slice(remaining);
+            let mut changing = Columns::new(lane_columns);
             changing.compare();
-            self.append_open_lanes(count, &changing, (from, rest.len()), limit, open);
+            self.append_open_lanes(count, &changing, (start, remaining.len()), limit, open);
         }
     }
 
@@ -145,11 +145,11 @@ impl<'a> CommonFactor<'a> {
         limit: f64,
         open: &mut Vec<usize>,
     ) {
-        let excluded = self.exclusion_flags(count, changing, limit);
-        if excluded == [true; L] {
+        let flags = self.exclusion_flags(count, changing, limit);
+        if flags == [true; L] {
             return;
         }
-        open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
+        open.extend((from..from + lanes).zip(flags).filter(|(_, flag)| !flag).map(|(position, _)| position));
     }
 
     /// Return one flag for each of L candidates. It is true if no coefficients reduce the sum of squared equation
@@ -158,13 +158,13 @@ impl<'a> CommonFactor<'a> {
     #[allow(clippy::needless_range_loop)] // triangular arrays of lanes, indexed by row and column
     fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
         let squares = self.squares;
-        let whole = changing.of(squares.diagonal());
-        let norms = changing.of(squares.norms());
-        let (mut pivot, mut value) = (whole, changing.of(squares.row(squares.target())));
+        let square = changing.gather(squares.diagonal());
+        let norms = changing.gather(squares.norms());
+        let (mut pivot, mut value) = (square, changing.gather(squares.row(squares.target())));
         // Row of L D for the varying term, later its row of L.
         let mut row: [Lanes<L>; MAX_COMMON_TERMS] = [[0.0; L]; MAX_COMMON_TERMS];
         for j in 0..count {
-            let mut sum = changing.of(squares.row(self.columns[j]));
+            let mut sum = changing.gather(squares.row(self.columns[j]));
             for l in 0..j {
                 for n in 0..L {
                     sum[n] -= row[l][n] * self.lower[j][l];
@@ -180,7 +180,7 @@ impl<'a> CommonFactor<'a> {
                 row[j][n] = scaled;
             }
         }
-        let (mut error, mut size, mut sum) = ([0.0; L], [0.0; L], whole);
+        let (mut error, mut size, mut sum) = ([0.0; L], [0.0; L], square);
         let (mut inverse, mut last) = ([0.0; L], [0.0; L]);
         for n in 0..L {
             inverse[n] = 1.0 / pivot[n];
@@ -197,19 +197,19 @@ impl<'a> CommonFactor<'a> {
                 }
             }
             for n in 0..L {
-                let share = row[j][n] * self.norms[j];
-                sum[n] += share * share;
+                let coefficient = row[j][n] * self.norms[j];
+                sum[n] += coefficient * coefficient;
                 size[n] += (self.common_coefficients[j] - row[j][n] * last[n]).abs() * self.norms[j];
             }
         }
         let (slack, flat) = (squares.slack(), squares.min_eigenvalue());
-        let mut excluded = [false; L];
+        let mut flags = [false; L];
         for n in 0..L {
             // This form of the condition lets NaN exclude nothing.
             let is_sound = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
-            excluded[n] = is_sound & (error[n] - slack * size[n] * size[n] > limit);
+            flags[n] = is_sound & (error[n] - slack * size[n] * size[n] > limit);
         }
-        excluded
+        flags
     }
 }
 

@@ -28,14 +28,15 @@ impl BlockSimulation {
     /// Simulate a candidate and add its error Σ|e| or Σe² to the sum `raw`. The simulation stops once the sum exceeds
     /// the limit or the caller requests a stop.
     ///
-    /// The simulated output is N/D. The denominator D = 1 − Σ c F is summed over the kernels F in `own`. The numerator
-    /// N = Σ c x is summed over the columns x in `driven`. Only the part of a kernel up to the current block is read.
+    /// The simulated output is N/D. The denominator D = 1 − Σ c F is summed over the kernels F in `output_terms`. The
+    /// numerator N = Σ c x is summed over the columns x in `input_terms`. Only the part of a kernel up to the current
+    /// block is read.
     #[allow(clippy::too_many_arguments)]
     pub(crate) fn accumulate_error<'a>(
         &mut self,
         target: &[f64],
-        own: impl Iterator<Item = Weighted<'a>> + Clone,
-        driven: impl Iterator<Item = Weighted<'a>> + Clone,
+        output_terms: impl Iterator<Item = Weighted<'a>> + Clone,
+        input_terms: impl Iterator<Item = Weighted<'a>> + Clone,
         norm: Norm,
         mut raw: f64,
         limit: f64,
@@ -56,13 +57,13 @@ impl BlockSimulation {
         while division.solved_terms() < m {
             let lo = division.solved_terms();
             let hi = (lo + BLOCK_TERMS).min(m);
-            let from = divisor.len();
-            let needed = division.required_terms().max(from);
-            divisor.resize(needed, 0.0);
-            for (kernel, c) in own.clone() {
-                divisor[from..].iter_mut().zip(&kernel[from..needed]).for_each(|(d, v)| *d -= c * v);
+            let computed = divisor.len();
+            let required = division.required_terms().max(computed);
+            divisor.resize(required, 0.0);
+            for (kernel, c) in output_terms.clone() {
+                divisor[computed..].iter_mut().zip(&kernel[computed..required]).for_each(|(d, v)| *d -= c * v);
             }
-            if from == 0 {
+            if computed == 0 {
                 divisor[0] += 1.0;
                 if divisor[0] == 0.0 || !divisor[0].is_finite() {
                     return Verdict::Failed(Failure::Singular);
@@ -70,7 +71,7 @@ impl BlockSimulation {
                 inverse[0] = 1.0 / divisor[0];
             }
             let block = &mut block[..hi - lo];
-            combine(block, lo, driven.clone());
+            combine(block, lo, input_terms.clone());
             division.add(0, lo, block);
             division.solve_block(&inverse, |_, _, len| &divisor[..len]);
             raw = norm.add(raw, &target[lo..hi], &division.quotient(0)[lo..hi]);
@@ -81,7 +82,7 @@ impl BlockSimulation {
             if raw > limit || control.is_stopped() {
                 return Verdict::Stopped(raw);
             }
-            division.join(|_, _, len| &divisor[..len]);
+            division.subtract_contributions(|_, _, len| &divisor[..len]);
         }
         Verdict::Score(raw)
     }

@@ -142,21 +142,21 @@ impl CellBisection<'_> {
                 why: format!("no orders in these intervals are {} below alpha and apart", self.region.min_separation),
             });
         }
-        let (mut best, mut place) = (f64::INFINITY, Vec::new());
+        let (mut best, mut best_point) = (f64::INFINITY, Vec::new());
         let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
         let target = |best: f64| (1.0 - self.options.tolerance).powi(2) * best;
-        let most =
+        let max_cells =
             self.options.max_cells.min(self.options.memory.saturating_sub(self.tables.bytes) / CELL_MEMORY_BYTES);
         // Good initial orders save bisections.
         for cells in cells.chunks(CELLS_PER_PASS) {
             let bounds = self.bounds(cells, 0.0)?;
-            self.update_best(records, (cells, &bounds), &mut best, &mut place)?;
+            self.update_best(records, (cells, &bounds), &mut best, &mut best_point)?;
         }
-        self.polish(records, &mut best, &mut place)?;
+        self.polish(records, &mut best, &mut best_point)?;
         while !cells.is_empty() {
-            if bounded + cells.len() as u64 > most {
+            if bounded + cells.len() as u64 > max_cells {
                 open += cells.len() as u64;
-                proved = cells.iter().fold(proved, |least, cell| least.min(cell.inherited_bound));
+                proved = cells.iter().fold(proved, |bound, cell| bound.min(cell.inherited_bound));
                 break;
             }
             // The total is the number of cells known so far. Halves of these cells are added later.
@@ -165,43 +165,43 @@ impl CellBisection<'_> {
             for cells in cells.chunks(CELLS_PER_PASS) {
                 let bounds = self.bounds(cells, target(best))?;
                 self.control.count(cells.len() as u64, 0);
-                self.update_best(records, (cells, &bounds), &mut best, &mut place)?;
-                let goal = target(best);
+                self.update_best(records, (cells, &bounds), &mut best, &mut best_point)?;
+                let target_bound = target(best);
                 for (cell, bounds) in cells.iter().zip(&bounds) {
-                    let least = bounds.lower_bound.max(cell.inherited_bound);
-                    if least >= goal {
-                        proved = proved.min(least);
-                    } else if let Some(halves) = self.halve_cell(cell, least, &bounds.costs) {
+                    let bound = bounds.lower_bound.max(cell.inherited_bound);
+                    if bound >= target_bound {
+                        proved = proved.min(bound);
+                    } else if let Some(halves) = self.halve_cell(cell, bound, &bounds.costs) {
                         next.extend(halves.into_iter().flatten());
                     } else {
                         open += 1;
-                        proved = proved.min(least);
+                        proved = proved.min(bound);
                     }
                 }
             }
             bounded += cells.len() as u64;
             cells = next;
         }
-        self.polish(records, &mut best, &mut place)?;
+        self.polish(records, &mut best, &mut best_point)?;
         #[allow(clippy::cast_precision_loss)]
         let mean = {
             let squares: f64 = records.iter().flat_map(|r| r.signal(self.region.output)).map(|y| y * y).sum();
             squares / records.iter().map(Record::m).sum::<usize>() as f64
         };
-        // Without a point whose error is finite, `place` is empty and there is no order.
-        let found = if best.is_finite() { self.region.orders(&place) } else { None };
-        let (order, orders) = found.unwrap_or((f64::NAN, Vec::new()));
-        let root = |share: f64| if share.is_finite() { (share * mean).sqrt() } else { f64::INFINITY };
+        // Without a point whose error is finite, `best_point` is empty and there is no order.
+        let best_orders = if best.is_finite() { self.region.orders(&best_point) } else { None };
+        let (order, orders) = best_orders.unwrap_or((f64::NAN, Vec::new()));
+        let root = |mean_bound: f64| if mean_bound.is_finite() { (mean_bound * mean).sqrt() } else { f64::INFINITY };
         let at_least = if proved.is_finite() { root(proved) * (1.0 - 1e-9) } else { 0.0 };
         Ok(Certificate { lower_bound: at_least, best: root(best), order, orders, cells: bounded, open_cells: open })
     }
 
-    /// Compute the bounds of some cells, relative to the squared norm of the output. `goal` is the bound at which a
-    /// cell (box of orders) is excluded.
-    fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<CellBound>> {
+    /// Compute the bounds of some cells, relative to the squared norm of the output. `target_bound` is the bound at
+    /// which a cell (box of orders) is excluded.
+    fn bounds(&self, cells: &[Cell], target_bound: f64) -> Result<Vec<CellBound>> {
         let bounds = |chunk: &'_ [Cell]| -> Vec<CellBound> {
             let all = chunk.iter().take(if self.control.is_stopped() { 0 } else { CELLS_PER_TASK });
-            all.map(|cell| self.bound(cell, goal)).collect()
+            all.map(|cell| self.bound(cell, target_bound)).collect()
         };
         let cell_bounds = cells.par_chunks(CELLS_PER_TASK).flat_map_iter(bounds).collect();
         self.control.check_stop()?;
@@ -209,33 +209,33 @@ impl CellBisection<'_> {
     }
 
     /// Evaluate the equation at the midpoints of the best of these cells (boxes of orders). If the relative squared
-    /// residual there is below `best`, store it in `best` and the orders of integration in `place`.
+    /// residual there is below `best`, store it in `best` and the orders of integration in `best_point`.
     fn update_best(
         &self,
         records: &[Record],
         (cells, bounds): (&[Cell], &[CellBound]),
         best: &mut f64,
-        place: &mut Vec<f64>,
+        best_point: &mut Vec<f64>,
     ) -> Result<()> {
-        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| bounds[n].midpoint_residual < *best).collect();
-        likely.sort_by(|&a, &b| bounds[a].midpoint_residual.total_cmp(&bounds[b].midpoint_residual).then(a.cmp(&b)));
-        for n in likely.into_iter().take(MIDPOINTS_PER_PASS) {
+        let mut promising: Vec<usize> = (0..cells.len()).filter(|&n| bounds[n].midpoint_residual < *best).collect();
+        promising.sort_by(|&a, &b| bounds[a].midpoint_residual.total_cmp(&bounds[b].midpoint_residual).then(a.cmp(&b)));
+        for n in promising.into_iter().take(MIDPOINTS_PER_PASS) {
             let Some(orders) = self.region.midpoint_orders(&self.cell_intervals(&cells[n])) else { continue };
             let residual = self.relative_residual(records, &orders)?;
             if residual < *best {
-                (*best, *place) = (residual, orders);
+                (*best, *best_point) = (residual, orders);
             }
         }
         Ok(())
     }
 
     /// Compute the bounds of one cell, relative to the squared norm of the output. The subspace bound is also computed
-    /// if the first bound is below `goal`.
-    fn bound(&self, cell: &Cell, goal: f64) -> CellBound {
+    /// if the first bound is below `target_bound`.
+    fn bound(&self, cell: &Cell, target_bound: f64) -> CellBound {
         let mut cell_bound = self.tables.local(cell).bound();
-        if cell_bound.lower_bound.max(cell.inherited_bound) < goal {
+        if cell_bound.lower_bound.max(cell.inherited_bound) < target_bound {
             cell_bound.lower_bound =
-                cell_bound.lower_bound.max(self.tables.span(cell).bound(self.options.max_coefficient, goal));
+                cell_bound.lower_bound.max(self.tables.span(cell).bound(self.options.max_coefficient, target_bound));
         }
         cell_bound
     }
@@ -250,22 +250,24 @@ impl CellBisection<'_> {
             .midpoint_residual)
     }
 
-    /// Refine the best orders of integration `place` by a local search, which changes one or two orders at a time. It
-    /// also reaches the edges of the region, where no cell has its midpoint.
-    fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
-        if place.is_empty() {
+    /// Refine the best orders of integration `best_point` by a local search, which changes one or two orders at a time.
+    /// It also reaches the edges of the region, where no cell has its midpoint.
+    fn polish(&self, records: &[Record], best: &mut f64, best_point: &mut Vec<f64>) -> Result<()> {
+        if best_point.is_empty() {
             return Ok(());
         }
         // The order α of the equation comes last.
-        let k = place.len();
-        let vary: Vec<usize> = (0..k)
+        let k = best_point.len();
+        let varying: Vec<usize> = (0..k)
             .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
             .chain((self.region.alpha.0 < self.region.alpha.1).then_some(k))
             .collect();
-        let ways = [-1.0, 0.0, 1.0];
-        let pairs = vary.iter().enumerate().flat_map(|(n, &i)| vary[n..].iter().map(move |&j| (i, j)));
+        let directions = [-1.0, 0.0, 1.0];
+        let pairs = varying.iter().enumerate().flat_map(|(n, &i)| varying[n..].iter().map(move |&j| (i, j)));
         let moves: Vec<[(usize, f64); 2]> = pairs
-            .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| [(i, a), (j, b)])))
+            .flat_map(|(i, j)| {
+                directions.into_iter().flat_map(move |a| directions.into_iter().map(move |b| [(i, a), (j, b)]))
+            })
             .filter(|[(i, a), (j, b)]| *a != 0.0 && (i == j) == (*b == 0.0))
             .collect();
         let (mut step, mut evaluations) = (cell_width(1), 0);
@@ -273,18 +275,18 @@ impl CellBisection<'_> {
             let before = *best;
             for moves in &moves {
                 self.control.check_stop()?;
-                let Some((alpha, mut orders)) = self.region.orders(place) else { return Ok(()) };
+                let Some((alpha, mut orders)) = self.region.orders(best_point) else { return Ok(()) };
                 orders.push(alpha);
-                moves.iter().for_each(|(term, way)| orders[*term] += way * step);
+                moves.iter().for_each(|(term, direction)| orders[*term] += direction * step);
                 let Some(candidate) =
-                    self.region.of_orders(orders[k], &orders[..k]).filter(|candidate| candidate != place)
+                    self.region.of_orders(orders[k], &orders[..k]).filter(|candidate| candidate != best_point)
                 else {
                     continue;
                 };
                 evaluations += 1;
                 let residual = self.relative_residual(records, &candidate)?;
                 if residual < *best {
-                    (*best, *place) = (residual, candidate);
+                    (*best, *best_point) = (residual, candidate);
                 }
             }
             if *best >= before {
@@ -309,7 +311,7 @@ impl CellBisection<'_> {
     /// # Errors
     /// [`Error::Structure`] if there are more than four times the maximum number of cells (boxes of orders).
     fn initial_cells(&self) -> Result<Vec<Cell>> {
-        let mut cells = vec![Cell { level: [0; MAX_TERMS], at: [0; MAX_TERMS], inherited_bound: 0.0 }];
+        let mut cells = vec![Cell { level: [0; MAX_TERMS], position: [0; MAX_TERMS], inherited_bound: 0.0 }];
         for term in 0..self.region.terms.len() {
             let (first, count) = self.tables.initial_intervals(self.region, term);
             let all = cells.len() as u128 * count as u128;
@@ -326,10 +328,10 @@ impl CellBisection<'_> {
             for cell in &cells {
                 for at in first..first + count {
                     let mut cell = *cell;
-                    cell.at[term] = u32::try_from(at).unwrap_or(u32::MAX);
-                    let within: Vec<(f64, f64)> =
+                    cell.position[term] = u32::try_from(at).unwrap_or(u32::MAX);
+                    let intervals: Vec<(f64, f64)> =
                         (0..=term).map(|t| self.tables.order_interval(self.region, &cell, t)).collect();
-                    if self.region.alpha_interval(&within).is_some() {
+                    if self.region.alpha_interval(&intervals).is_some() {
                         next.push(cell);
                     }
                 }
@@ -341,14 +343,14 @@ impl CellBisection<'_> {
 
     /// Halve a cell (box of orders) along the order with the largest cost, and return the halves that contain orders of
     /// the region. `None` if all orders are fixed or at the finest level.
-    fn halve_cell(&self, cell: &Cell, least: f64, costs: &[f64; MAX_TERMS]) -> Option<[Option<Cell>; 2]> {
-        let may = (0..self.region.terms.len())
+    fn halve_cell(&self, cell: &Cell, lower_bound: f64, costs: &[f64; MAX_TERMS]) -> Option<[Option<Cell>; 2]> {
+        let divisible = (0..self.region.terms.len())
             .filter(|&term| !self.tables.has_fixed_order(term) && cell.level[term] < MAX_CELL_LEVEL);
-        let term = may.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;
+        let term = divisible.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;
         Some([0, 1].map(|half| {
-            let mut part = Cell { inherited_bound: least, ..*cell };
+            let mut part = Cell { inherited_bound: lower_bound, ..*cell };
             part.level[term] += 1;
-            part.at[term] = 2 * part.at[term] + half;
+            part.position[term] = 2 * part.position[term] + half;
             self.holds_orders(&part).then_some(part)
         }))
     }

@@ -99,12 +99,12 @@ impl CellProducts {
             c[i] = (0..k).map(|j| inverse[i][j] * self.target[0][j]).sum();
         }
         let all = 1.0 + (0..k).map(|i| c[i].abs() * self.sizes[0][i]).sum::<f64>();
-        let along = |m: usize, j: usize| -> f64 {
+        let correction = |m: usize, j: usize| -> f64 {
             self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
         };
         // ‖e‖² follows from the quadratic form, which is valid for any coefficients.
-        let explained: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + along(0, i))).sum();
-        let square = 1.0 - explained;
+        let explained_square: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + correction(0, i))).sum();
+        let square = 1.0 - explained_square;
         let error = self.rounding * all * all;
         if !(square.is_finite() && square > error) {
             return cell_bound;
@@ -114,8 +114,8 @@ impl CellProducts {
         let (mut tau, mut gamma, mut a) = ([0.0; MAX_TERMS], [0.0; MAX_TERMS], [[0.0; MAX_TERMS]; MAX_TERMS]);
         for j in 0..k {
             let half = self.halves[j];
-            tau[j] = along(0, j).abs() + self.rounding * all;
-            gamma[j] = taylor_sum(half, |m| along(m, j).abs() + self.rounding * all * self.sizes[m][j])
+            tau[j] = correction(0, j).abs() + self.rounding * all;
+            gamma[j] = taylor_sum(half, |m| correction(m, j).abs() + self.rounding * all * self.sizes[m][j])
                 + size * self.remainder_bounds[j];
             for i in 0..k {
                 let part = |m: usize| -> (f64, f64) {
@@ -123,12 +123,12 @@ impl CellProducts {
                     terms.fold((0.0, 0.0), |(sum, all), x| (sum + x, all + x.abs()))
                 };
                 let rounded = rounding * trace;
-                let within = taylor_sum(half, |m| {
+                let cell_deviation = taylor_sum(half, |m| {
                     let (sum, all) = part(m);
                     sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
                 });
                 let outer = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.remainder_bounds[j];
-                a[i][j] = within + outer;
+                a[i][j] = cell_deviation + outer;
             }
         }
         let costs = |j: usize| (0..k).map(|i| a[i][j]).sum::<f64>();
@@ -143,10 +143,11 @@ impl CellProducts {
                 second += (b[i] + tau[i]) * inverse[i][j].abs() * (b[j] + tau[j]);
             }
         }
-        let least = (square - error - first - second * (1.0 + INVERSE_TOLERANCE)) * (1.0 - BOUND_MARGIN * BOUND_MARGIN);
+        let lower_bound =
+            (square - error - first - second * (1.0 + INVERSE_TOLERANCE)) * (1.0 - BOUND_MARGIN * BOUND_MARGIN);
         // Neither NaN nor an overflow proves anything.
-        if least > 0.0 && least.is_finite() {
-            cell_bound.lower_bound = least;
+        if lower_bound > 0.0 && lower_bound.is_finite() {
+            cell_bound.lower_bound = lower_bound;
         }
         cell_bound
     }
@@ -268,12 +269,12 @@ pub(super) fn expand_cell(
         .map(|&(s, middle, half)| RegressorExpansion::new(records, s, middle, half, stop))
         .collect::<Result<Vec<_>>>()?;
     let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
-    let (products, along) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
+    let (products, target_products) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
     stop.check()?;
     let product = |(i, n): (usize, usize), (j, m): (usize, usize)| {
         products[(i * EXPANSION_COLUMNS + n) * all.len() + j * EXPANSION_COLUMNS + m]
     };
-    let target_product = |(j, m): (usize, usize)| along[j * EXPANSION_COLUMNS + m] / square.sqrt();
+    let target_product = |(j, m): (usize, usize)| target_products[j * EXPANSION_COLUMNS + m] / square.sqrt();
     let (mut local, mut span) = (CellProducts::new(terms.len(), target.len()), DerivativeSubspace::new(target.len()));
     for (j, (curve, &(_, _, half))) in curves.iter().zip(terms).enumerate() {
         for m in 0..EXPANSION_COLUMNS {

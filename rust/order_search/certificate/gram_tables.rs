@@ -31,7 +31,7 @@ pub(super) struct Cell {
     /// Bisection level of the interval of each term.
     pub(super) level: [u8; MAX_TERMS],
     /// Index of the interval of each term. The interval starts at this index times the interval width of its level.
-    pub(super) at: [u32; MAX_TERMS],
+    pub(super) position: [u32; MAX_TERMS],
     /// Lower bound of the relative squared residual that was proved for the parent cell.
     pub(super) inherited_bound: f64,
 }
@@ -123,23 +123,23 @@ fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
             *all = (all.0.min(low), all.1.max(high));
         }
     }
-    let mut of: BTreeMap<usize, LevelIntervals> = BTreeMap::new();
+    let mut intervals_of_level: BTreeMap<usize, LevelIntervals> = BTreeMap::new();
     for (&signal, &range) in &ranges {
         for level in 0..=deepest {
             let (first, count) = level_intervals(range, level);
-            of.entry(signal).or_default().push((first, nodes.len()));
+            intervals_of_level.entry(signal).or_default().push((first, nodes.len()));
             let half = cell_width(level) / 2.0;
             nodes.extend((first..first + count).map(|i| (signal, (2 * i + 1) as f64 * half, half)));
         }
     }
     let mut terms = Vec::new();
     for (term, range) in region.terms.iter().enumerate() {
-        let within = region.integrations(term);
-        if is_point(within) {
-            nodes.push((range.signal, within.1, 0.0));
+        let integrations = region.integrations(term);
+        if is_point(integrations) {
+            nodes.push((range.signal, integrations.1, 0.0));
             terms.push((None, nodes.len() - 1));
         } else {
-            terms.push((of.get(&range.signal).cloned(), 0));
+            terms.push((intervals_of_level.get(&range.signal).cloned(), 0));
         }
     }
     NodeLayout { nodes, terms }
@@ -159,8 +159,8 @@ impl GramTables {
     pub(super) fn new(records: &[Record], region: &Region, memory: u64, control: &Control) -> Result<Self> {
         let target: Vec<f64> = records.iter().flat_map(|r| r.signal(region.output)).copied().collect();
         let samples = target.len();
-        let fits = |deepest: u8| bytes(lay_out_nodes(region, deepest).nodes.len(), samples) <= memory;
-        let Some(tabled) = (2..=MAX_TABLE_LEVEL).rev().find(|d| fits(*d)) else {
+        let fits_memory = |deepest: u8| bytes(lay_out_nodes(region, deepest).nodes.len(), samples) <= memory;
+        let Some(tabled) = (2..=MAX_TABLE_LEVEL).rev().find(|d| fits_memory(*d)) else {
             let (bytes, limit) = (bytes(lay_out_nodes(region, 2).nodes.len(), samples).into(), memory.into());
             return Err(Error::Memory {
                 what: "the regressors of a certificate and their inner products".into(),
@@ -191,16 +191,17 @@ impl GramTables {
                     return (pair, Vec::new(), Vec::new());
                 }
                 let columns: Vec<&[f64]> = batch.iter().map(|c| &c.columns[m][..]).collect();
-                let along = if n == 0 { inner_products(&columns, &[&target], &control.stop) } else { Vec::new() };
-                (pair, inner_products(&columns, &all[n], &control.stop), along)
+                let target_products =
+                    if n == 0 { inner_products(&columns, &[&target], &control.stop) } else { Vec::new() };
+                (pair, inner_products(&columns, &all[n], &control.stop), target_products)
             },
         );
         control.check_stop()?;
-        let (mut products, mut along): ([Vec<f64>; DERIVATIVE_PAIRS.len()], [Vec<f64>; EXPANSION_COLUMNS]) =
+        let (mut products, mut target_products): ([Vec<f64>; DERIVATIVE_PAIRS.len()], [Vec<f64>; EXPANSION_COLUMNS]) =
             Default::default();
         for (pair, inner, target) in pair_products {
             products[pair].extend(inner);
-            along[DERIVATIVE_PAIRS[pair].1].extend(target.into_iter().map(|v| v / size));
+            target_products[DERIVATIVE_PAIRS[pair].1].extend(target.into_iter().map(|v| v / size));
         }
         Ok(Self {
             terms,
@@ -209,7 +210,7 @@ impl GramTables {
             nodes: count,
             samples,
             products,
-            target: along,
+            target: target_products,
             sizes: curves.iter().map(|c| c.sizes).collect(),
             remainder_bounds: curves.iter().map(|c| c.remainder).collect(),
         })
@@ -226,8 +227,8 @@ impl GramTables {
             let (_, fixed_order) = region.integrations(term);
             return (fixed_order, fixed_order);
         }
-        let (width, at) = (cell_width(cell.level[term]), f64::from(cell.at[term]));
-        (at * width, (at + 1.0) * width)
+        let (width, position) = (cell_width(cell.level[term]), f64::from(cell.position[term]));
+        (position * width, (position + 1.0) * width)
     }
 
     /// Return the intervals of a term at the coarsest bisection level: the number of the first interval, and their
@@ -246,13 +247,14 @@ impl GramTables {
         for (term, ((stretches, fixed_node), out)) in self.terms.iter().zip(&mut out).enumerate() {
             (out.node, out.taylor_powers[0]) = (*fixed_node, 1.0);
             let Some(stretches) = stretches else { continue };
-            let (level, at) = (cell.level[term], cell.at[term]);
+            let (level, position) = (cell.level[term], cell.position[term]);
             let above = level.min(self.table_level);
-            let whole = at >> (level - above);
+            let ancestor = position >> (level - above);
             let (first, node) = stretches[usize::from(above)];
-            out.node = node + whole as usize - first;
+            out.node = node + ancestor as usize - first;
             out.half = cell_width(level) / 2.0;
-            let distance = f64::from(2 * at + 1) * out.half - f64::from(2 * whole + 1) * cell_width(above) / 2.0;
+            let distance =
+                f64::from(2 * position + 1) * out.half - f64::from(2 * ancestor + 1) * cell_width(above) / 2.0;
             for m in 1..EXPANSION_COLUMNS {
                 #[allow(clippy::cast_precision_loss)]
                 let next = out.taylor_powers[m - 1] * distance / m as f64;
@@ -380,14 +382,14 @@ impl Region {
     }
 
     /// Return true if the signal of a term is the output.
-    fn own(&self, term: usize) -> bool {
+    fn is_output_term(&self, term: usize) -> bool {
         self.terms[term].signal == self.output
     }
 
     /// Return the lowest and the highest order of integration α − ν of a term.
     pub(super) fn integrations(&self, term: usize) -> (f64, f64) {
-        let least = if self.own(term) { self.min_separation } else { 0.0 };
-        ((self.alpha.0 - self.terms[term].highest).max(least), self.alpha.1 - self.terms[term].lowest)
+        let min_integration = if self.is_output_term(term) { self.min_separation } else { 0.0 };
+        ((self.alpha.0 - self.terms[term].highest).max(min_integration), self.alpha.1 - self.terms[term].lowest)
     }
 
     /// Return true if two terms are interchangeable: their signals and intervals are equal, and their orders vary.
@@ -396,24 +398,24 @@ impl Region {
     }
 
     /// Return the interval of the order α of the equation that permits orders of integration of the first terms within
-    /// the intervals `within`. `None` if it is empty.
-    pub(super) fn alpha_interval(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
+    /// the intervals `intervals`. `None` if it is empty.
+    pub(super) fn alpha_interval(&self, intervals: &[(f64, f64)]) -> Option<(f64, f64)> {
         let (mut low, mut high) = self.alpha;
-        for (term, &(a, b)) in within.iter().enumerate() {
-            let (least, most) = self.integrations(term);
-            let (a, b) = (a.max(least), b.min(most));
+        for (term, &(a, b)) in intervals.iter().enumerate() {
+            let (min_integration, max_integration) = self.integrations(term);
+            let (a, b) = (a.max(min_integration), b.min(max_integration));
             if a > b + ORDER_TOLERANCE {
                 return None;
             }
             low = low.max(a + self.terms[term].lowest);
             high = high.min(b + self.terms[term].highest);
-            for (other, &(c, d)) in within.iter().enumerate().take(term) {
+            for (other, &(c, d)) in intervals.iter().enumerate().take(term) {
                 if self.terms[other].signal != self.terms[term].signal {
                     continue;
                 }
                 // Interchangeable terms are sorted by their orders.
-                let ways = [d - a, if self.are_interchangeable(other, term) { f64::NEG_INFINITY } else { b - c }];
-                if ways[0].max(ways[1]) < self.min_separation - ORDER_TOLERANCE {
+                let distances = [d - a, if self.are_interchangeable(other, term) { f64::NEG_INFINITY } else { b - c }];
+                if distances[0].max(distances[1]) < self.min_separation - ORDER_TOLERANCE {
                     return None;
                 }
             }
@@ -432,10 +434,10 @@ impl Region {
 
     /// Return the orders of integration in the region that are nearest to the midpoint of a cell (box of orders), given
     /// as one interval per term. `None` if the cell contains no orders of the region.
-    pub(super) fn midpoint_orders(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
-        let (low, high) = self.alpha_interval(within)?;
+    pub(super) fn midpoint_orders(&self, intervals: &[(f64, f64)]) -> Option<Vec<f64>> {
+        let (low, high) = self.alpha_interval(intervals)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
-        let etas: Vec<f64> = within.iter().map(|(a, b)| (a + b) / 2.0).collect();
+        let etas: Vec<f64> = intervals.iter().map(|(a, b)| (a + b) / 2.0).collect();
         self.of_orders(alpha, &etas.iter().map(|eta| alpha - eta).collect::<Vec<_>>())
     }
 
@@ -443,11 +445,11 @@ impl Region {
     /// to its interval. `None` if the result is not in the region.
     pub(super) fn of_orders(&self, alpha: f64, orders: &[f64]) -> Option<Vec<f64>> {
         let alpha = alpha.clamp(self.alpha.0, self.alpha.1);
-        let inside = |(term, order): (usize, &f64)| {
-            let (least, range) = (self.integrations(term).0, self.terms[term]);
-            (alpha - order.clamp(range.lowest, range.highest)).max(least)
+        let clamped_integration = |(term, order): (usize, &f64)| {
+            let (min_integration, range) = (self.integrations(term).0, self.terms[term]);
+            (alpha - order.clamp(range.lowest, range.highest)).max(min_integration)
         };
-        let etas: Vec<f64> = orders.iter().enumerate().map(inside).collect();
+        let etas: Vec<f64> = orders.iter().enumerate().map(clamped_integration).collect();
         self.orders(&etas).map(|_| etas)
     }
 }

@@ -93,15 +93,15 @@ impl BinomialSums {
             0 => 2.0 * libm::expm1(self.eta * std::f64::consts::LN_2),
             _ => double * power(std::f64::consts::LN_2 - mu) - 2.0 * power(-mu),
         };
-        let rest = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
-            let (mut value, mut turn) = (0.0, 1.0);
+        let smooth_part = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
+            let (mut value, mut falling_factorial) = (0.0, 1.0);
             for i in 0..=j {
-                value += turn / FACTORIAL_TABLE[i] * sums[j - i];
-                turn *= logarithm - mu;
+                value += falling_factorial / FACTORIAL_TABLE[i] * sums[j - i];
+                falling_factorial *= logarithm - mu;
             }
             2.0 * FACTORIAL_TABLE[j] * lead * value
         });
-        [power(-mu), second].into_iter().chain(rest).take(m).collect()
+        [power(-mu), second].into_iter().chain(smooth_part).take(m).collect()
     }
 }
 
@@ -210,10 +210,10 @@ impl BinomialSums {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
         let first_terms = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
         let other_terms = self.sums.iter().zip(&self.powers).map(|(sums, (lead, logarithm))| {
-            let (mut value, mut turn) = (0.0, 1.0);
+            let (mut value, mut falling_factorial) = (0.0, 1.0);
             for i in 0..=j {
-                value += turn / FACTORIAL_TABLE[i] * sums[j - i].abs();
-                turn *= (logarithm - mu).abs();
+                value += falling_factorial / FACTORIAL_TABLE[i] * sums[j - i].abs();
+                falling_factorial *= (logarithm - mu).abs();
             }
             2.0 * FACTORIAL_TABLE[j] * lead * value
         });
@@ -235,13 +235,13 @@ fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers)
     out
 }
 
-/// Return the Taylor sum Σ `half`^j/j!·`of(j)` for j = 1, 2, 3.
-pub(super) fn taylor_sum(half: f64, of: impl Fn(usize) -> f64) -> f64 {
+/// Return the Taylor sum Σ `half`^j/j!·`derivative(j)` for j = 1, 2, 3.
+pub(super) fn taylor_sum(half: f64, derivative: impl Fn(usize) -> f64) -> f64 {
     let mut power = 1.0;
     let mut sum = 0.0;
     for (j, factorial) in FACTORIAL_TABLE.iter().enumerate().take(EXPANSION_COLUMNS).skip(1) {
         power *= half;
-        sum += power / factorial * of(j);
+        sum += power / factorial * derivative(j);
     }
     sum
 }

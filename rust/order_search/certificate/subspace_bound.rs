@@ -13,7 +13,7 @@ const SPANNED_DERIVATIVES: usize = 3;
 const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
 /// Ridge parameter times the largest admissible sum of squared coefficients, relative to the goal of the bound. The
 /// ridge limits the coefficients of nearly dependent columns.
-const RIDGE_GOAL_SHARE: f64 = 0.05;
+const RIDGE_TARGET_FRACTION: f64 = 0.05;
 /// Minimum ridge parameter of [`DerivativeSubspace::bound`].
 const MIN_RIDGE: f64 = 1e-11;
 /// Relative margin for the rounding error of the lower bound.
@@ -57,29 +57,30 @@ impl DerivativeSubspace {
     }
 
     /// Add a term. `half` is the half width of its interval of orders, `sizes` holds the norms of its column and of the
-    /// derivatives, and `rest` is the remainder of its expansion.
-    pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], rest: f64) {
+    /// derivatives, and `remainder` is the remainder of its expansion.
+    pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], remainder: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
         for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED_DERIVATIVES } else { 1 }) {
             self.rows[self.count] = ((self.terms, derivative), unit);
             self.count += 1;
         }
         self.terms += 1;
-        let off = |from: usize| (from..EXPANSION_COLUMNS).map(|m| units[m] * sizes[m]).sum::<f64>() + rest;
-        self.max_omitted_norm = self.max_omitted_norm.max(off(SPANNED_DERIVATIVES));
-        self.min_column_norm = self.min_column_norm.min(1.0 - off(1));
+        let tail_norm = |first: usize| (first..EXPANSION_COLUMNS).map(|m| units[m] * sizes[m]).sum::<f64>() + remainder;
+        self.max_omitted_norm = self.max_omitted_norm.max(tail_norm(SPANNED_DERIVATIVES));
+        self.min_column_norm = self.min_column_norm.min(1.0 - tail_norm(1));
     }
 
-    /// Compute the inner products of the columns. `product` and `along` return the products of two derivatives, and of
-    /// a derivative with the measured output. A derivative is given as (term, order of the derivative).
+    /// Compute the inner products of the columns. `product` and `target_product` return the products of two
+    /// derivatives, and of a derivative with the measured output. A derivative is given as (term, order of the
+    /// derivative).
     pub(super) fn fill(
         &mut self,
         product: impl Fn((usize, usize), (usize, usize)) -> f64,
-        along: impl Fn((usize, usize)) -> f64,
+        target_product: impl Fn((usize, usize)) -> f64,
     ) {
         for i in 0..self.count {
             let (a, scale) = self.rows[i];
-            self.target[i] = scale * along(a);
+            self.target[i] = scale * target_product(a);
             for j in 0..=i {
                 let (b, other) = self.rows[j];
                 self.matrix[i][j] = scale * other * product(a, b);
@@ -90,14 +91,14 @@ impl DerivativeSubspace {
 
     /// Return a lower bound of the squared residual over the cell (box of orders), relative to the squared norm of the
     /// output y, 0 without a proof. It holds for all coefficients c with Σ‖c x‖ ≤ `largest`·‖y‖ over the columns x. The
-    /// ridge parameter is tuned to reach the bound `goal`.
-    pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
-        if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
+    /// ridge parameter is tuned to reach the bound `target_bound`.
+    pub(super) fn bound(&self, largest: f64, target_bound: f64) -> f64 {
+        if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || target_bound.is_nan() {
             return 0.0;
         }
         let (n, all) = (self.count, largest / self.min_column_norm);
         let powers = f64::from(u8::try_from(SPANNED_DERIVATIVES).unwrap_or(u8::MAX));
-        let added = (RIDGE_GOAL_SHARE * goal / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
+        let added = (RIDGE_TARGET_FRACTION * target_bound / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
         let coefficients = self.ridge_solution(added);
         // The minimum of the form with the ridge is at least its value anywhere minus |gradient|²/(4·ridge). The bound
         // uses the exact form of the columns, which is positive semidefinite, not the rounded one.
@@ -105,8 +106,8 @@ impl DerivativeSubspace {
         for i in 0..n {
             let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + added * coefficients[i];
             value += coefficients[i] * (row - 2.0 * self.target[i]);
-            let off = 2.0 * (row - self.target[i]);
-            gradient += off * off;
+            let partial = 2.0 * (row - self.target[i]);
+            gradient += partial * partial;
             sum += coefficients[i].abs();
         }
         #[allow(clippy::cast_precision_loss)]
@@ -116,9 +117,9 @@ impl DerivativeSubspace {
         // The coefficients of the values, and those of each derivative, sum up to at most `all`.
         let square = ridge - added * powers * all * all;
         let root = square.max(0.0).sqrt() - all * self.max_omitted_norm;
-        let least = root * root * (1.0 - ROUNDING_MARGIN);
-        if root > 0.0 && least.is_finite() {
-            least
+        let lower_bound = root * root * (1.0 - ROUNDING_MARGIN);
+        if root > 0.0 && lower_bound.is_finite() {
+            lower_bound
         } else {
             0.0
         }
@@ -134,11 +135,11 @@ impl DerivativeSubspace {
             let row = factor[i];
             let pivot = row[i].max(added);
             for l in i + 1..n {
-                let share = row[l] / pivot;
+                let multiplier = row[l] / pivot;
                 for (a, b) in factor[l][l..n].iter_mut().zip(&row[l..n]) {
-                    *a -= share * b;
+                    *a -= multiplier * b;
                 }
-                x[l] -= share * x[i];
+                x[l] -= multiplier * x[i];
             }
         }
         for i in (0..n).rev() {

@@ -44,7 +44,7 @@ pub(crate) struct InfeasibilityProof {
     /// Contribution of unknown coefficient i to the conditions of group g of test vectors, at index g·unknowns + i.
     effects: Vec<Effect>,
     /// Current values of the unknown coefficients, then the constant 1.
-    at: Vec<f64>,
+    values: Vec<f64>,
     /// Multiplier of the condition of each test vector, by group.
     weights: Vec<Wide>,
     /// Lower triangle of the weighted sum of the quadratic forms, row-major.
@@ -136,10 +136,10 @@ impl InfeasibilityProof {
                 effects[last] = constant;
             }
         }
-        self.at.clear();
-        self.at.extend(start.iter().zip(fixed).filter(|(_, f)| f.is_none()).map(|(x, _)| *x));
-        self.at.extend(&start[fixed.len()..]);
-        self.at.push(1.0);
+        self.values.clear();
+        self.values.extend(start.iter().zip(fixed).filter(|(_, f)| f.is_none()).map(|(x, _)| *x));
+        self.values.extend(&start[fixed.len()..]);
+        self.values.push(1.0);
     }
 
     /// Search for multipliers of the conditions for which the weighted sum of their quadratic forms is positive
@@ -152,22 +152,22 @@ impl InfeasibilityProof {
         let groups = self.effects.len() / k;
         self.weights.clear();
         for step in 0..MAX_MULTIPLIER_STEPS {
-            let smallest = 1e-6 * self.at.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+            let smallest = 1e-6 * self.values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
             if !smallest.is_finite() {
                 return false;
             }
             let states: Vec<[Wide; 3]> = (0..groups).map(|g| self.state(g)).collect();
-            let mut worst = 0.0_f64;
+            let mut max_violation = 0.0_f64;
             for [ratios, _, _] in &states {
                 for &q in ratios {
                     if q.is_nan() {
                         return false;
                     }
-                    worst = worst.max(q);
+                    max_violation = max_violation.max(q);
                 }
             }
             // No condition is violated at this point.
-            if worst <= 1.0 || worst.is_infinite() {
+            if max_violation <= 1.0 || max_violation.is_infinite() {
                 return false;
             }
             if step == 0 {
@@ -182,27 +182,27 @@ impl InfeasibilityProof {
             }
             for (weight, [ratios, _, _]) in self.weights.iter_mut().zip(&states) {
                 for n in 0..LANE_COUNT {
-                    weight[n] *= (ratios[n] / worst + 1e-3).sqrt();
+                    weight[n] *= (ratios[n] / max_violation + 1e-3).sqrt();
                 }
             }
             self.assemble(&states, smallest);
             if !self.form.iter().chain(&self.errors).all(|v| v.is_finite()) {
                 return false;
             }
-            let convex = factorise(&self.form, k, &mut self.factor);
+            let convex = factorize(&self.form, k, &mut self.factor);
             if convex == k {
                 return true;
             }
-            if convex < k - 1 && factorise(&self.errors, k, &mut self.factor) < k - 1 {
+            if convex < k - 1 && factorize(&self.errors, k, &mut self.factor) < k - 1 {
                 return false;
             }
-            self.at[k - 1] = 1.0;
+            self.values[k - 1] = 1.0;
             for i in (0..k - 1).rev() {
                 let mut value = -self.factor[packed_index(k - 1, i)];
                 for j in i + 1..k - 1 {
-                    value -= self.factor[packed_index(j, i)] * self.at[j];
+                    value -= self.factor[packed_index(j, i)] * self.values[j];
                 }
-                self.at[i] = value;
+                self.values[i] = value;
             }
         }
         false
@@ -215,7 +215,7 @@ impl InfeasibilityProof {
     fn state(&self, group: usize) -> [Wide; 3] {
         let zero = [0.0; LANE_COUNT];
         let (mut error, mut divisor, mut slack) = ([zero; 2], [zero; 2], zero);
-        for (effect, &x) in self.effects[group * self.unknowns..(group + 1) * self.unknowns].iter().zip(&self.at) {
+        for (effect, &x) in self.effects[group * self.unknowns..(group + 1) * self.unknowns].iter().zip(&self.values) {
             for n in 0..LANE_COUNT {
                 error[0][n] += x * effect.error[0][n];
                 error[1][n] += x * effect.error[1][n];
@@ -227,8 +227,8 @@ impl InfeasibilityProof {
         let (mut ratios, mut size) = (zero, zero);
         for n in 0..LANE_COUNT {
             size[n] = (divisor[0][n] * divisor[0][n] + divisor[1][n] * divisor[1][n]).sqrt();
-            let allowed = size[n] + slack[n];
-            ratios[n] = (error[0][n] * error[0][n] + error[1][n] * error[1][n]) / (allowed * allowed);
+            let limit = size[n] + slack[n];
+            ratios[n] = (error[0][n] * error[0][n] + error[1][n] * error[1][n]) / (limit * limit);
         }
         [ratios, size, slack]
     }
@@ -246,23 +246,23 @@ impl InfeasibilityProof {
         self.sizes.resize(k, 0.0);
         for (g, (weight, [_, size, slack])) in self.weights.iter().zip(states).enumerate() {
             let effects = &self.effects[g * k..(g + 1) * k];
-            let (mut own, mut rest, mut total) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT], [0.0; LANE_COUNT]);
-            for (effect, x) in effects.iter().zip(&self.at) {
+            let (mut fixed_sum, mut free_sum, mut total) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT], [0.0; LANE_COUNT]);
+            for (effect, x) in effects.iter().zip(&self.values) {
                 for (sum, slack) in total.iter_mut().zip(&effect.slack) {
                     *sum += slack * x.abs().max(smallest);
                 }
             }
             for n in 0..LANE_COUNT {
                 let kappa = (slack[n] / size[n]).clamp(1e-6, 1e6);
-                own[n] = weight[n] * (1.0 + kappa);
-                rest[n] = weight[n] * (1.0 + 1.0 / kappa) * total[n];
+                fixed_sum[n] = weight[n] * (1.0 + kappa);
+                free_sum[n] = weight[n] * (1.0 + 1.0 / kappa) * total[n];
             }
             for (i, a) in effects.iter().enumerate() {
                 let (mut lhs, mut right) = ([[0.0; LANE_COUNT]; 2], [[0.0; LANE_COUNT]; 2]);
                 for half in 0..2 {
                     for n in 0..LANE_COUNT {
                         lhs[half][n] = weight[n] * a.error[half][n];
-                        right[half][n] = own[n] * a.divisor[half][n];
+                        right[half][n] = fixed_sum[n] * a.divisor[half][n];
                     }
                 }
                 for (j, b) in effects[..=i].iter().enumerate() {
@@ -278,8 +278,8 @@ impl InfeasibilityProof {
                         self.sizes[i] += errors + divisors;
                     }
                 }
-                let slacks = rest.iter().zip(&a.slack).map(|(r, s)| r * s).sum::<f64>();
-                let slacks = slacks / self.at[i].abs().max(smallest);
+                let slacks = free_sum.iter().zip(&a.slack).map(|(r, s)| r * s).sum::<f64>();
+                let slacks = slacks / self.values[i].abs().max(smallest);
                 self.form[packed_index(i, i)] -= slacks;
                 self.sizes[i] += slacks;
             }
@@ -294,7 +294,7 @@ impl InfeasibilityProof {
 /// Factor a symmetric k × k matrix, given by the rows of its lower triangle, into L D Lᵀ. Return the number of leading
 /// positive pivots. The rows of L are valid up to and including the first nonpositive pivot.
 #[inline(always)]
-fn factorise(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
+fn factorize(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
     factor.clear();
     factor.extend_from_slice(matrix);
     for i in 0..k {

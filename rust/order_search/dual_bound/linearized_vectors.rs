@@ -28,9 +28,9 @@ const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
 /// Magnitude below which products of two values do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Return true if the test vector built for `made_for` proves that the output error of `equation` exceeds `limit`. The
-/// output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions. The vector is corrected to first order. The
-/// output terms of both equations must have the same orders.
+/// Return true if the test vector built for `vector_equation` proves that the output error of `equation` exceeds
+/// `limit`. The output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions. The vector is corrected to first
+/// order. The output terms of both equations must have the same orders.
 ///
 /// # Errors
 /// [`Error::Structure`] for invalid signals, and [`Error::Length`] for a wrong number of coefficients.
@@ -57,14 +57,14 @@ const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 /// ```
 pub fn excluded_by_linearized_vector(
     record: &Record,
-    made_for: &Equation,
+    vector_equation: &Equation,
     equation: &Equation,
     norm: Norm,
     limit: f64,
 ) -> Result<bool> {
     let mut index = Index::default();
     let mut positions = Vec::new();
-    for Equation { structure, coefficients } in [made_for, equation] {
+    for Equation { structure, coefficients } in [vector_equation, equation] {
         structure.check(record.len(), |_| true)?;
         check_length("coefficients", structure.terms.len(), coefficients.len())?;
         let keys = (0..structure.terms.len())
@@ -74,8 +74,11 @@ pub fn excluded_by_linearized_vector(
     let bank = Bank::new(&index, record, equation.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
     let mut linearized_vectors = LinearizedVectors::new(&banks, &targets, norm);
-    let own = linearized_vectors.own_columns(&positions[0]);
-    if own != linearized_vectors.own_columns(&positions[1]) || own.is_empty() || own.len() > MAX_OWN_TERMS {
+    let output_columns = linearized_vectors.own_columns(&positions[0]);
+    if output_columns != linearized_vectors.own_columns(&positions[1])
+        || output_columns.is_empty()
+        || output_columns.len() > MAX_OWN_TERMS
+    {
         return Err(Error::OutOfRange {
             name: "own terms".into(),
             value: 0.0,
@@ -83,8 +86,8 @@ pub fn excluded_by_linearized_vector(
             remedy: "give both equations these".into(),
         });
     }
-    let vector = linearized_vectors.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
-    linearized_vectors.add(own, vector.into_iter().collect());
+    let vector = linearized_vectors.fit((&banks, &targets), &positions[0], &vector_equation.coefficients, limit);
+    linearized_vectors.add(output_columns, vector.into_iter().collect());
     Ok(linearized_vectors.excludes_candidate(
         &positions[1],
         &equation.coefficients,
@@ -100,7 +103,7 @@ pub(crate) struct LinearizedVector {
     center: Vec<f64>,
     /// Coefficients of the kernel matrices F_i of the k output terms in the basis of orthogonalized matrices G_i: F_i =
     /// G_i + Σ_{j<i} mix[i·k + j] G_j.
-    mix: Vec<f64>,
+    projections: Vec<f64>,
     /// Largest modulus of the values of each first-order correction of the test vector.
     peak_values: Vec<f64>,
     /// Rounding error ‖D₀ᵀv_m − G_mᵀt₀‖ of each first-order correction v_m of the test vector t₀, in the dual norm. D₀
@@ -168,9 +171,9 @@ impl LinearizedVectors {
         }
     }
 
-    /// Return the memory of one vector for candidates with `own` output terms \[bytes\].
-    pub(crate) fn bytes(&self, own: usize) -> u64 {
-        8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
+    /// Return the memory of one vector for candidates with `output_count` output terms \[bytes\].
+    pub(crate) fn bytes(&self, output_count: usize) -> u64 {
+        8 * ((output_count + 1) * (output_count + 1 + self.width) + output_count * (2 * output_count + 4) + 8) as u64
     }
 
     /// Return those columns of a candidate that are integrals of the output.
@@ -179,10 +182,10 @@ impl LinearizedVectors {
     }
 
     /// Store the vectors built for candidates with these output columns.
-    pub(crate) fn add(&mut self, own: Vec<usize>, new_vectors: Vec<LinearizedVector>) {
-        let from = self.vectors.len();
+    pub(crate) fn add(&mut self, output_columns: Vec<usize>, new_vectors: Vec<LinearizedVector>) {
+        let start = self.vectors.len();
         self.vectors.extend(new_vectors);
-        self.ranges.insert(own, (from, self.vectors.len()));
+        self.ranges.insert(output_columns, (start, self.vectors.len()));
     }
 
     /// Return the number of linearized test vectors.
@@ -192,7 +195,10 @@ impl LinearizedVectors {
 
     /// Return the memory of all linearized test vectors \[bytes\].
     pub(crate) fn memory_bytes(&self) -> u64 {
-        self.ranges.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
+        self.ranges
+            .iter()
+            .map(|(output_columns, (start, end))| self.bytes(output_columns.len()) * (end - start) as u64)
+            .sum()
     }
 
     /// Build the test vector of the candidate with columns `terms` and coefficients `c`. It covers the first samples,
@@ -204,23 +210,23 @@ impl LinearizedVectors {
         c: &[f64],
         limit: f64,
     ) -> Option<LinearizedVector> {
-        let own: Vec<(usize, f64)> =
+        let output_terms: Vec<(usize, f64)> =
             terms.iter().zip(c).map(|(&p, &c)| (p, c)).filter(|(p, _)| self.input_index[*p] == NO_INDEX).collect();
-        let k = own.len();
+        let k = output_terms.len();
         let mut parts: Vec<RecordVectors> = Vec::new();
         let mut raw = 0.0;
         for (bank, target) in banks.iter().zip(targets) {
-            let (mut divisor, mut driven) = (vec![0.0; target.len()], vec![0.0; target.len()]);
+            let (mut divisor, mut input_sum) = (vec![0.0; target.len()], vec![0.0; target.len()]);
             divisor[0] = 1.0;
             for (&p, &c) in terms.iter().zip(c) {
                 let (sum, values, c) = match bank.kernel(p) {
-                    [] => (&mut driven, bank.column(p), c),
+                    [] => (&mut input_sum, bank.column(p), c),
                     kernel => (&mut divisor, kernel, -c),
                 };
                 sum.iter_mut().zip(values).for_each(|(sum, x)| *sum += c * x);
             }
             let mut target_series: Vec<f64> = Vec::new();
-            for (v, y) in divide(&driven, &divisor).ok()?.iter().zip(target) {
+            for (v, y) in divide(&input_sum, &divisor).ok()?.iter().zip(target) {
                 let error = y - v;
                 let (size, slope) = match self.rounding_bounds.norm {
                     Norm::L1 => (error.abs(), if error < 0.0 { -1.0 } else { 1.0 }),
@@ -238,7 +244,7 @@ impl LinearizedVectors {
             }
             divisor.truncate(target_series.len());
             // In reversed time, transposed operators become the operators themselves.
-            let vector = divide(&backwards(&target_series), &divisor).ok()?;
+            let vector = divide(&time_reversed(&target_series), &divisor).ok()?;
             parts.push(RecordVectors {
                 divisor,
                 vectors: vec![vector],
@@ -251,11 +257,11 @@ impl LinearizedVectors {
             return None;
         }
         parts.iter_mut().flat_map(|part| &mut part.vectors[0]).for_each(|v| *v /= top);
-        let mut mix = vec![0.0; k * k];
+        let mut projections = vec![0.0; k * k];
         let mut buffers = Buffers::default();
         for (part, bank) in parts.iter_mut().zip(banks) {
             let vector = Kernel::new(&part.vectors[0]);
-            for &(p, _) in &own {
+            for &(p, _) in &output_terms {
                 let series = bank.kernel(p)[..part.divisor.len()].to_vec();
                 let mut step = vec![0.0; series.len()];
                 Kernel::new(&series).times(&vector, &mut step, &mut buffers);
@@ -270,12 +276,12 @@ impl LinearizedVectors {
                     parts.iter().map(|part| simd::dot(&part.first_order_terms[a], &part.first_order_terms[b])).sum()
                 };
                 let square = inner(j, j);
-                let share = if square > 0.0 { inner(i, j) / square } else { 0.0 };
-                mix[i * k + j] = share;
+                let projection = if square > 0.0 { inner(i, j) / square } else { 0.0 };
+                projections[i * k + j] = projection;
                 for part in &mut parts {
                     for rows in [&mut part.first_order_terms, &mut part.series] {
                         let (before, after) = rows.split_at_mut(i);
-                        after[0].iter_mut().zip(&before[j]).for_each(|(x, y)| *x -= share * y);
+                        after[0].iter_mut().zip(&before[j]).for_each(|(x, y)| *x -= projection * y);
                     }
                 }
             }
@@ -285,30 +291,30 @@ impl LinearizedVectors {
             part.add_corrections(&mut accumulator, &mut buffers);
         }
         let mut lengths: Vec<f64> = Vec::new();
-        for (i, &(p, _)) in own.iter().enumerate() {
-            let mixed: f64 = (0..i).map(|j| mix[i * k + j].abs() * lengths[j]).sum();
+        for (i, &(p, _)) in output_terms.iter().enumerate() {
+            let mixed: f64 = (0..i).map(|j| projections[i * k + j].abs() * lengths[j]).sum();
             lengths.push(self.rounding_bounds.kernel_norms[p] + mixed);
         }
         let sizes: Vec<f64> = (1..=k).map(|m| largest(parts.iter().flat_map(|part| &part.vectors[m]))).collect();
-        let products = self.products(&parts, banks, targets, &own);
-        let around = self.rounding_bounds.max_dual_norm
-            + own.iter().map(|&(p, c)| c.abs() * self.rounding_bounds.kernel_norms[p]).sum::<f64>();
+        let products = self.products(&parts, banks, targets, &output_terms);
+        let center_bound = self.rounding_bounds.max_dual_norm
+            + output_terms.iter().map(|&(p, c)| c.abs() * self.rounding_bounds.kernel_norms[p]).sum::<f64>();
         let NormAccumulator { norm, solution_residuals: rests, second_order_norms: bends, .. } =
             accumulator.final_norms();
-        let sound = [&lengths, &sizes, &products, &rests, &bends, &mix]
+        let is_finite = [&lengths, &sizes, &products, &rests, &bends, &projections]
             .into_iter()
             .flatten()
             .all(|v| v.abs() < MAX_SAFE_MAGNITUDE);
-        let centre = own.iter().map(|(_, c)| *c).collect();
-        (sound && norm < MAX_SAFE_MAGNITUDE && around < MAX_SAFE_MAGNITUDE).then_some(LinearizedVector {
-            center: centre,
-            mix,
+        let center = output_terms.iter().map(|(_, c)| *c).collect();
+        (is_finite && norm < MAX_SAFE_MAGNITUDE && center_bound < MAX_SAFE_MAGNITUDE).then_some(LinearizedVector {
+            center,
+            projections,
             peak_values: sizes,
             solution_residuals: rests,
             series_norms: lengths,
             second_order_norms: bends,
             norm,
-            center_norm: around,
+            center_norm: center_bound,
             products,
         })
     }
@@ -320,15 +326,15 @@ impl LinearizedVectors {
         parts: &[RecordVectors],
         banks: &[Bank],
         targets: &[Vec<f64>],
-        own: &[(usize, f64)],
+        output_terms: &[(usize, f64)],
     ) -> Vec<f64> {
-        let row = own.len() + 1 + self.width;
-        let mut products = vec![0.0; (own.len() + 1) * row];
+        let row = output_terms.len() + 1 + self.width;
+        let mut products = vec![0.0; (output_terms.len() + 1) * row];
         for ((part, bank), target) in parts.iter().zip(banks).zip(targets) {
-            let vectors: Vec<Vec<f64>> = part.vectors.iter().map(|v| backwards(v)).collect();
-            let driven = (0..bank.len()).filter(|&p| self.input_index[p] != NO_INDEX);
-            let columns = std::iter::once(&target[..]).chain(own.iter().map(|&(p, _)| bank.column(p)));
-            let columns = columns.chain(driven.map(|p| bank.column(p)));
+            let vectors: Vec<Vec<f64>> = part.vectors.iter().map(|v| time_reversed(v)).collect();
+            let input_columns = (0..bank.len()).filter(|&p| self.input_index[p] != NO_INDEX);
+            let columns = std::iter::once(&target[..]).chain(output_terms.iter().map(|&(p, _)| bank.column(p)));
+            let columns = columns.chain(input_columns.map(|p| bank.column(p)));
             let columns: Vec<&[f64]> = columns.map(|column| &column[..part.divisor.len()]).collect();
             simd::dispatch_simd(Products { vectors: &vectors, columns: &columns, out: &mut products });
         }
@@ -352,10 +358,10 @@ impl LinearizedVectors {
             *range = self.ranges.get(&own[..]).copied().unwrap_or((0, 0));
         }
         let count = range.1 - range.0;
-        for turn in 0..count {
-            let which = (*last + turn) % count;
-            if self.vector_excludes(&self.vectors[range.0 + which], terms, coefficients, limit) {
-                *last = which;
+        for attempt in 0..count {
+            let index = (*last + attempt) % count;
+            if self.vector_excludes(&self.vectors[range.0 + index], terms, coefficients, limit) {
+                *last = index;
                 return true;
             }
         }
@@ -372,49 +378,51 @@ impl LinearizedVectors {
         coefficients: &[f64],
         limit: f64,
     ) -> bool {
-        let (losses, k) = (&self.rounding_bounds, linearized.center.len());
-        let limit = losses.norm_threshold(limit);
-        let (mut rounding, mut length) = (losses.target_rounding, 0.0);
-        let (mut mine, mut filled) = ([0.0; MAX_OWN_TERMS], 0);
+        let (rounding_bounds, k) = (&self.rounding_bounds, linearized.center.len());
+        let limit = rounding_bounds.norm_threshold(limit);
+        let (mut rounding, mut length) = (rounding_bounds.target_rounding, 0.0);
+        let (mut output_coefficients, mut filled) = ([0.0; MAX_OWN_TERMS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
-            rounding += c.abs() * losses.rounding[p];
-            length += c.abs() * losses.kernel_norms[p];
+            rounding += c.abs() * rounding_bounds.rounding[p];
+            length += c.abs() * rounding_bounds.kernel_norms[p];
             if self.input_index[p] == NO_INDEX {
-                mine[filled] = c;
+                output_coefficients[filled] = c;
                 filled += 1;
             }
         }
         // Coordinates of the coefficient differences in the basis of the G_m.
         let mut x = [0.0; MAX_OWN_TERMS];
         for i in 0..k {
-            let off = mine[i] - linearized.center[i];
-            x[i] += off;
-            x.iter_mut().zip(&linearized.mix[i * k..i * k + i]).for_each(|(x, share)| *x += share * off);
+            let deviation = output_coefficients[i] - linearized.center[i];
+            x[i] += deviation;
+            x.iter_mut()
+                .zip(&linearized.projections[i * k..i * k + i])
+                .for_each(|(x, projection)| *x += projection * deviation);
         }
-        let (mut size, mut norm, mut steps, mut at) = (1.0, linearized.norm, 0.0, 0);
+        let (mut size, mut norm, mut steps, mut index) = (1.0, linearized.norm, 0.0, 0);
         for m in 0..k {
             size += x[m].abs() * linearized.peak_values[m];
             norm += x[m].abs() * linearized.solution_residuals[m];
             steps += x[m].abs() * linearized.series_norms[m];
             for n in 0..=m {
-                norm += (x[m] * x[n]).abs() * linearized.second_order_norms[at];
-                at += 1;
+                norm += (x[m] * x[n]).abs() * linearized.second_order_norms[index];
+                index += 1;
             }
         }
-        norm += losses.unit * size * (linearized.center_norm + length + steps);
+        norm += rounding_bounds.unit * size * (linearized.center_norm + length + steps);
         let (mut response, row) = (0.0, k + 1 + self.width);
         for m in 0..=k {
             let products = &linearized.products[m * row..(m + 1) * row];
-            let mut along = products[0];
+            let mut correlation = products[0];
             for i in 0..k {
-                along -= mine[i] * products[1 + i];
+                correlation -= output_coefficients[i] * products[1 + i];
             }
             for (&p, &c) in terms.iter().zip(coefficients) {
                 if self.input_index[p] != NO_INDEX {
-                    along -= c * products[1 + k + self.input_index[p]];
+                    correlation -= c * products[1 + k + self.input_index[p]];
                 }
             }
-            response += if m == 0 { along } else { x[m - 1] * along };
+            response += if m == 0 { correlation } else { x[m - 1] * correlation };
         }
         // Neither NaN nor an overflow proves anything.
         response.abs() - size * rounding > limit * norm && response.abs() < f64::MAX
@@ -455,7 +463,7 @@ impl RecordVectors {
             corrections.push(spectrum);
             self.vectors.push(vector);
         }
-        let (mut sum, mut at) = (SumOfProducts::new(m), 0);
+        let (mut sum, mut index) = (SumOfProducts::new(m), 0);
         for i in 0..k {
             for j in 0..=i {
                 sum.add(1.0, &series[i], &corrections[j]);
@@ -463,8 +471,9 @@ impl RecordVectors {
                     sum.add(1.0, &series[j], &corrections[i]);
                 }
                 sum.take(&mut out, buffers);
-                accumulator.second_order_norms[at] = accumulator.accumulate(accumulator.second_order_norms[at], &out);
-                at += 1;
+                accumulator.second_order_norms[index] =
+                    accumulator.accumulate(accumulator.second_order_norms[index], &out);
+                index += 1;
             }
         }
     }
@@ -473,30 +482,30 @@ impl RecordVectors {
 /// Norms over all records: the largest modulus for [`Norm::L1`]. For [`Norm::L2`] they are sums of squares until
 /// [`Self::final_norms`] takes the roots.
 struct NormAccumulator {
-    of: Norm,
+    kind: Norm,
     norm: f64,
     solution_residuals: Vec<f64>,
     second_order_norms: Vec<f64>,
 }
 
 impl NormAccumulator {
-    fn new(of: Norm, k: usize) -> Self {
-        Self { of, norm: 0.0, solution_residuals: vec![0.0; k], second_order_norms: vec![0.0; k * (k + 1) / 2] }
+    fn new(kind: Norm, k: usize) -> Self {
+        Self { kind, norm: 0.0, solution_residuals: vec![0.0; k], second_order_norms: vec![0.0; k * (k + 1) / 2] }
     }
 
-    /// Return the accumulated norm `so_far` with these values included. Infinite for [`Norm::L1`] if a value is not
-    /// finite.
-    fn accumulate(&self, so_far: f64, values: &[f64]) -> f64 {
-        match self.of {
-            Norm::L1 if values.iter().all(|v| v.is_finite()) => so_far.max(largest(values)),
+    /// Return the accumulated norm `partial_norm` with these values included. Infinite for [`Norm::L1`] if a value is
+    /// not finite.
+    fn accumulate(&self, partial_norm: f64, values: &[f64]) -> f64 {
+        match self.kind {
+            Norm::L1 if values.iter().all(|v| v.is_finite()) => partial_norm.max(largest(values)),
             Norm::L1 => f64::INFINITY,
-            Norm::L2 => so_far + values.iter().map(|v| v * v).sum::<f64>(),
+            Norm::L2 => partial_norm + values.iter().map(|v| v * v).sum::<f64>(),
         }
     }
 
     /// Take the square roots of the sums of squares for [`Norm::L2`].
     fn final_norms(mut self) -> Self {
-        if self.of == Norm::L2 {
+        if self.kind == Norm::L2 {
             let all = self
                 .solution_residuals
                 .iter_mut()
@@ -530,7 +539,7 @@ impl simd::SimdKernel for Products<'_> {
 }
 
 /// Return the values in reversed order.
-fn backwards(x: &[f64]) -> Vec<f64> {
+fn time_reversed(x: &[f64]) -> Vec<f64> {
     x.iter().rev().copied().collect()
 }
 

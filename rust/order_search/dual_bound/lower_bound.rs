@@ -49,9 +49,9 @@ use crate::simd::LANE_COUNT;
 pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<Vec<f64>> {
     let (bound, positions) = build_pool_bound(record, &equation.structure, norm)?;
     check_length("coefficients", positions.len(), equation.coefficients.len())?;
-    let mut each = vec![0.0; bound.len()];
-    bound.bound_per_vector(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut each);
-    Ok(each)
+    let mut vector_bounds = vec![0.0; bound.len()];
+    bound.bound_per_vector(|_| (&positions[..], &equation.coefficients[..], &[][..], &[][..]), &mut vector_bounds);
+    Ok(vector_bounds)
 }
 
 /// Return true if it is proved that no coefficients of this structure give an output error of at most `limit`. The
@@ -91,8 +91,8 @@ pub fn is_infeasible(
     Ok(bound.proves_infeasible(limit, &positions, fixed, &[], start, &mut InfeasibilityProof::default()))
 }
 
-/// Return true if the test vector tailored to `made_for` proves that the output error of `equation` exceeds `limit`.
-/// The output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
+/// Return true if the test vector tailored to `vector_equation` proves that the output error of `equation` exceeds
+/// `limit`. The output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
 ///
 /// # Errors
 /// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
@@ -115,8 +115,14 @@ pub fn is_infeasible(
 /// assert!(proved(1.99 * error)? && !proved(2.0 * error)?);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
-    Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
+pub fn excluded_by(
+    record: &Record,
+    vector_equation: &Equation,
+    equation: &Equation,
+    norm: Norm,
+    limit: f64,
+) -> Result<bool> {
+    Ok(exclusion_flags(record, vector_equation, std::slice::from_ref(equation), norm, limit)? == [true])
 }
 
 /// Apply [`excluded_by`] to several equations of the same output in sequence, and return one result per equation. As in
@@ -125,26 +131,26 @@ pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, no
 /// # Errors
 /// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
 /// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
-pub fn excluded_in_turn(
+pub fn exclusion_flags(
     record: &Record,
-    made_for: &Equation,
+    vector_equation: &Equation,
     equations: &[Equation],
     norm: Norm,
     limit: f64,
 ) -> Result<Vec<bool>> {
     let mut index = Index::default();
     let mut positions = Vec::new();
-    for Equation { structure, coefficients } in std::iter::once(made_for).chain(equations) {
+    for Equation { structure, coefficients } in std::iter::once(vector_equation).chain(equations) {
         structure.check(record.len(), |_| true)?;
         check_length("coefficients", structure.terms.len(), coefficients.len())?;
         let keys = (0..structure.terms.len())
             .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))));
         positions.push(keys.collect::<Vec<_>>());
     }
-    let bank = Bank::new(&index, record, made_for.structure.output)?;
-    let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
+    let bank = Bank::new(&index, record, vector_equation.structure.output)?;
+    let (banks, targets) = ([bank], [record.signal(vector_equation.structure.output).to_vec()]);
     let mut tailored = TailoredVectors::new(&banks, &targets, norm);
-    tailored.vectors.extend(tailored.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    tailored.vectors.extend(tailored.fit(&banks, &targets, &positions[0], &vector_equation.coefficients));
     let mut memory = NormCache::for_adjacent_candidates();
     let candidates = positions[1..].iter().zip(equations);
     Ok(candidates
@@ -203,10 +209,10 @@ impl Bound {
         self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
-    /// Return the bound with only the test vectors `which`, in the given sequence. Their number is a multiple of
+    /// Return the bound with only the test vectors `indices`, in the given sequence. Their number is a multiple of
     /// [`LANE_COUNT`].
-    pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
-        Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
+    pub(crate) fn select_vectors(&self, indices: &[usize]) -> Self {
+        Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(indices)).collect() }
     }
 
     /// Return a lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of the score that determines the
@@ -224,7 +230,7 @@ impl Bound {
         for (r, test_vectors) in self.test_vectors.iter().enumerate() {
             let (terms, coefficients, initial, weights) = columns(r);
             let rounding = test_vectors.rounding_bound(terms, coefficients, initial, weights);
-            let (mut largest, mut farthest) = (0.0, 0.0);
+            let (mut largest, mut max_distance) = (0.0, 0.0);
             for group in 0..test_vectors.groups {
                 let (bounds, guesses) =
                     test_vectors.group_bounds(group, terms, coefficients, initial, weights, rounding);
@@ -233,8 +239,8 @@ impl Bound {
                     if bounds[n] > largest && bounds[n] < f64::MAX {
                         largest = bounds[n];
                     }
-                    if guesses[n] > farthest {
-                        farthest = guesses[n];
+                    if guesses[n] > max_distance {
+                        max_distance = guesses[n];
                     }
                 }
                 if bound + self.raw(largest) > limit {
@@ -242,7 +248,7 @@ impl Bound {
                 }
             }
             bound += self.raw(largest);
-            guess += self.raw(farthest);
+            guess += self.raw(max_distance);
         }
         (bound, guess)
     }

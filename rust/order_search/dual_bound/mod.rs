@@ -8,5 +8,5 @@ pub(crate) mod test_vectors;
 pub(crate) mod unstable_zeros;
 
 pub use linearized_vectors::excluded_by_linearized_vector;
-pub use lower_bound::{excluded_by, excluded_in_turn, is_infeasible, lower_bounds};
+pub use lower_bound::{excluded_by, exclusion_flags, is_infeasible, lower_bounds};
 pub use unstable_zeros::has_unstable_zeros;

@@ -54,7 +54,7 @@ struct CachedNorm {
     norm: f64,
     /// Factor in a₂ = share·a₁ + r. Here a₁ and a₂ are the products Fᵀt of the test vector t with the convolution
     /// matrices F of the two output columns. The remainder r is orthogonal to a₁.
-    share: f64,
+    projection: f64,
     /// Dual norms of a₁ and a₂ − share·a₁ as defined for `share`, NaN until they are computed.
     deviation_norms: [f64; MAX_CACHED_OWN_TERMS],
     /// Rounding-error bound of the norm per unit change of each coefficient.
@@ -91,8 +91,8 @@ impl TailoredVectors {
     /// Return the memory of one test vector for these banks \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         let samples: usize = banks.iter().map(samples).sum();
-        let own = banks.first().map_or(0, |bank| own_columns(bank).len());
-        8 * (samples.next_multiple_of(NORM_CHECK_SAMPLES) as u64 * (own as u64 + 1)
+        let output_count = banks.first().map_or(0, |bank| own_columns(bank).len());
+        8 * (samples.next_multiple_of(NORM_CHECK_SAMPLES) as u64 * (output_count as u64 + 1)
             + banks.first().map_or(0, Bank::len) as u64)
     }
 
@@ -114,25 +114,25 @@ impl TailoredVectors {
         terms: &[usize],
         c: &[f64],
     ) -> Option<TailoredVector> {
-        let backwards = |x: &[f64]| -> Vec<f64> { x.iter().rev().copied().collect() };
+        let time_reversed = |x: &[f64]| -> Vec<f64> { x.iter().rev().copied().collect() };
         let mut vectors: Vec<Vec<f64>> = Vec::new();
         for (bank, target) in banks.iter().zip(targets) {
-            let (mut divisor, mut driven) = (vec![0.0; target.len()], vec![0.0; target.len()]);
+            let (mut divisor, mut input_sum) = (vec![0.0; target.len()], vec![0.0; target.len()]);
             divisor[0] = 1.0;
             for (&p, &c) in terms.iter().zip(c) {
                 let kernel = bank.kernel(p);
                 if kernel.is_empty() {
-                    driven.iter_mut().zip(bank.column(p)).for_each(|(n, x)| *n += c * x);
+                    input_sum.iter_mut().zip(bank.column(p)).for_each(|(n, x)| *n += c * x);
                 } else {
                     divisor.iter_mut().zip(kernel).for_each(|(d, x)| *d -= c * x);
                 }
             }
-            let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
+            let error: Vec<f64> = divide(&input_sum, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
             let target_series: Vec<f64> = match self.rounding_bounds.norm {
                 Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
                 Norm::L2 => error,
             };
-            vectors.push(backwards(&divide(&backwards(&target_series), &divisor).ok()?));
+            vectors.push(time_reversed(&divide(&time_reversed(&target_series), &divisor).ok()?));
         }
         let top = vectors.iter().flatten().fold(0.0_f64, |top, v| top.max(v.abs()));
         if !vectors.iter().flatten().all(|v| v.is_finite()) || top < f64::MIN_POSITIVE {
@@ -147,23 +147,24 @@ impl TailoredVectors {
             products.iter_mut().zip(&inner).for_each(|(sum, x)| *sum += x);
             target += inner[bank.len()];
         }
-        let spectra: Vec<Kernel> = vectors.iter().map(|t| Kernel::new(&backwards(t))).collect();
+        let spectra: Vec<Kernel> = vectors.iter().map(|t| Kernel::new(&time_reversed(t))).collect();
         let mut vector: Vec<f64> = vectors.concat();
         let length = vector.len().next_multiple_of(NORM_CHECK_SAMPLES);
         vector.resize(length, 0.0);
-        let own: Vec<usize> = (0..self.rows.len()).filter(|&p| self.rows[p] != NO_INDEX).collect();
-        let mut acted = vec![0.0; own.len() * length];
-        acted.par_chunks_mut(length).zip(&own).for_each(|(acted, &p)| {
-            let (mut at, mut buffers) = (0, Buffers::default());
+        let output_columns: Vec<usize> = (0..self.rows.len()).filter(|&p| self.rows[p] != NO_INDEX).collect();
+        let mut kernel_products = vec![0.0; output_columns.len() * length];
+        kernel_products.par_chunks_mut(length).zip(&output_columns).for_each(|(kernel_products, &p)| {
+            let (mut index, mut buffers) = (0, Buffers::default());
             for (bank, spectrum) in banks.iter().zip(&spectra) {
-                let part = &mut acted[at..at + samples(bank)];
+                let part = &mut kernel_products[index..index + samples(bank)];
                 Kernel::new(bank.kernel(p)).times(spectrum, part, &mut buffers);
                 part.reverse();
-                at += part.len();
+                index += part.len();
             }
         });
-        let sound = products.iter().chain(&acted).all(|v| v.abs() < MAX_SAFE_MAGNITUDE) && target.is_finite();
-        sound.then_some(TailoredVector { vector, products, target, transposed_products: acted })
+        let is_finite =
+            products.iter().chain(&kernel_products).all(|v| v.abs() < MAX_SAFE_MAGNITUDE) && target.is_finite();
+        is_finite.then_some(TailoredVector { vector, products, target, transposed_products: kernel_products })
     }
 
     /// Return true if some vector proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit. The vector
@@ -177,7 +178,7 @@ impl TailoredVectors {
         memory: &mut NormCache,
     ) -> bool {
         let limit = self.rounding_bounds.norm_threshold(limit);
-        let NormCache { own, last_vector: last, norms: near } = memory;
+        let NormCache { own, last_vector: last, norms: cache } = memory;
         let (mut rounding, mut length) = (self.rounding_bounds.target_rounding, self.max_vector_norm());
         own.clear();
         for (&p, &c) in terms.iter().zip(coefficients) {
@@ -188,38 +189,38 @@ impl TailoredVectors {
             }
         }
         let rounding_error = self.rounding_bounds.unit * length;
-        let allowed = |which: usize| {
-            let fitted = &self.vectors[which];
+        let max_norm = |index: usize| {
+            let fitted = &self.vectors[index];
             let response =
                 terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, &c)| sum - c * fitted.products[p]);
             (response.abs() - rounding) / limit - rounding_error
         };
         let pair: [Weighted; MAX_CACHED_OWN_TERMS] =
             std::array::from_fn(|n| own.get(n).copied().unwrap_or((NO_INDEX, 0.0)));
-        let mut place = None;
-        if let (Some(near), 1..=MAX_CACHED_OWN_TERMS) = (near, own.len()) {
-            near.resize(NORM_CACHE_ENTRIES, None);
-            let at = pair[0].0.wrapping_mul(97).wrapping_add(pair[1].0) % NORM_CACHE_ENTRIES;
-            let cached = &mut near[at];
-            if cached.is_some_and(|cached| cached.own[0].0 != pair[0].0 || cached.own[1].0 != pair[1].0) {
-                *cached = None;
+        let mut cache_index = None;
+        if let (Some(cache), 1..=MAX_CACHED_OWN_TERMS) = (cache, own.len()) {
+            cache.resize(NORM_CACHE_ENTRIES, None);
+            let entry_index = pair[0].0.wrapping_mul(97).wrapping_add(pair[1].0) % NORM_CACHE_ENTRIES;
+            let entry = &mut cache[entry_index];
+            if entry.is_some_and(|entry| entry.own[0].0 != pair[0].0 || entry.own[1].0 != pair[1].0) {
+                *entry = None;
             }
-            if let Some(cached) = cached {
-                if cached.deviation_norms[0].is_nan() {
-                    self.compute_deviation_norms(cached);
+            if let Some(entry) = entry {
+                if entry.deviation_norms[0].is_nan() {
+                    self.compute_deviation_norms(entry);
                 }
-                *last = cached.vector;
-                if self.norm_upper_bound(cached, &pair) <= allowed(cached.vector) {
+                *last = entry.vector;
+                if self.norm_upper_bound(entry, &pair) <= max_norm(entry.vector) {
                     return true;
                 }
             }
-            place = Some(cached);
+            cache_index = Some(entry);
         }
-        for turn in 0..self.vectors.len() {
-            let which = (*last + turn) % self.vectors.len();
-            let Some(norm) = self.norm_up_to_limit(&self.vectors[which], own, allowed(which)) else { continue };
-            *last = which;
-            if let Some(place) = place {
+        for attempt in 0..self.vectors.len() {
+            let index = (*last + attempt) % self.vectors.len();
+            let Some(norm) = self.norm_up_to_limit(&self.vectors[index], own, max_norm(index)) else { continue };
+            *last = index;
+            if let Some(cache_index) = cache_index {
                 let lengths = |n: usize| {
                     terms
                         .iter()
@@ -227,13 +228,13 @@ impl TailoredVectors {
                         .map_or(0.0, |p| self.rounding_bounds.kernel_norms[*p])
                 };
                 let norm = norm + rounding_error;
-                *place = Some(match *place {
-                    Some(cached) if cached.vector == which => CachedNorm { own: pair, norm, ..cached },
+                *cache_index = Some(match *cache_index {
+                    Some(entry) if entry.vector == index => CachedNorm { own: pair, norm, ..entry },
                     _ => CachedNorm {
-                        vector: which,
+                        vector: index,
                         own: pair,
                         norm,
-                        share: 0.0,
+                        projection: 0.0,
                         deviation_norms: [f64::NAN; MAX_CACHED_OWN_TERMS],
                         slack: [lengths(0), lengths(1)],
                     },
@@ -247,12 +248,13 @@ impl TailoredVectors {
     /// Return an upper bound of ‖Dᵀt‖ for a candidate with the same output columns as the cached norm. D is the
     /// denominator of the candidate, and t the test vector of the cached norm.
     #[inline(always)]
-    fn norm_upper_bound(&self, cached: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
-        let off = [own[0].1 - cached.own[0].1, own[1].1 - cached.own[1].1];
+    fn norm_upper_bound(&self, cached: &CachedNorm, output_terms: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
+        let deviations = [output_terms[0].1 - cached.own[0].1, output_terms[1].1 - cached.own[1].1];
         let [first, second] = cached.deviation_norms;
-        let along = (off[0] + cached.share * off[1]).abs() * first + off[1].abs() * second;
-        let rounding = off[0].abs() * cached.slack[0] + off[1].abs() * cached.slack[1];
-        (cached.norm + along + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
+        let deviation_norm =
+            (deviations[0] + cached.projection * deviations[1]).abs() * first + deviations[1].abs() * second;
+        let rounding = deviations[0].abs() * cached.slack[0] + deviations[1].abs() * cached.slack[1];
+        (cached.norm + deviation_norm + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
     }
 
     /// Compute bounds of the change of ‖Dᵀt‖ per unit change of the coefficients, and store them in the cached norm. D
@@ -268,19 +270,20 @@ impl TailoredVectors {
         let (first, second) = (row(0), row(1));
         let (square, inner) = (simd::dot(first, first), simd::dot(&first[..second.len()], second));
         // The bound holds for any share.
-        let share = if square > 0.0 && (inner / square).abs() < MAX_SAFE_MAGNITUDE { inner / square } else { 0.0 };
-        cached.share = share;
-        cached.deviation_norms = [self.difference_norm(first, first, 0.0), self.difference_norm(second, first, share)];
-        cached.slack[1] += share.abs() * cached.slack[0];
+        let projection = if square > 0.0 && (inner / square).abs() < MAX_SAFE_MAGNITUDE { inner / square } else { 0.0 };
+        cached.projection = projection;
+        cached.deviation_norms =
+            [self.difference_norm(first, first, 0.0), self.difference_norm(second, first, projection)];
+        cached.slack[1] += projection.abs() * cached.slack[0];
     }
 
     /// Return the dual norm ‖a − share·b‖ of vectors whose length is a multiple of [`NORM_CHECK_SAMPLES`].
     #[inline(always)]
-    fn difference_norm(&self, a: &[f64], b: &[f64], share: f64) -> f64 {
+    fn difference_norm(&self, a: &[f64], b: &[f64], factor: f64) -> f64 {
         let mut all = [0.0_f64; LANE_COUNT];
         for (a, b) in a.chunks_exact(LANE_COUNT).zip(b.chunks_exact(LANE_COUNT)) {
             for n in 0..LANE_COUNT {
-                let value = a[n] - share * b[n];
+                let value = a[n] - factor * b[n];
                 all[n] = match self.rounding_bounds.norm {
                     Norm::L1 if value.abs() > all[n] => value.abs(),
                     Norm::L1 => all[n],
@@ -305,22 +308,24 @@ impl TailoredVectors {
     }
 
     /// Return the dual norm ‖t − Σ c Fᵀt‖, where t is a test vector. The sum is over the output columns, each with
-    /// convolution matrix F and coefficient c. `None` if it exceeds `most` or cannot be computed safely.
+    /// convolution matrix F and coefficient c. `None` if it exceeds `limit` or cannot be computed safely.
     #[inline(always)]
-    fn norm_up_to_limit(&self, fitted: &TailoredVector, own: &[Weighted], most: f64) -> Option<f64> {
+    fn norm_up_to_limit(&self, fitted: &TailoredVector, output_terms: &[Weighted], limit: f64) -> Option<f64> {
         // A NaN limit proves nothing. Products with coefficients below [`MAX_SAFE_MAGNITUDE`] do not overflow.
-        if most.is_nan() || most <= 0.0 || !own.iter().all(|(_, c)| c.abs() < MAX_SAFE_MAGNITUDE) {
+        if limit.is_nan() || limit <= 0.0 || !output_terms.iter().all(|(_, c)| c.abs() < MAX_SAFE_MAGNITUDE) {
             return None;
         }
         let length = fitted.vector.len();
-        let squares = most * most;
+        let squares = limit * limit;
         let mut all = [0.0_f64; LANE_COUNT];
-        for (at, vector) in (0..length).step_by(NORM_CHECK_SAMPLES).zip(fitted.vector.chunks_exact(NORM_CHECK_SAMPLES))
+        for (first, vector) in
+            (0..length).step_by(NORM_CHECK_SAMPLES).zip(fitted.vector.chunks_exact(NORM_CHECK_SAMPLES))
         {
             let mut sums = [0.0; NORM_CHECK_SAMPLES];
             sums.copy_from_slice(vector);
-            for &(row, c) in own {
-                let acted = &fitted.transposed_products[row * length + at..row * length + at + NORM_CHECK_SAMPLES];
+            for &(row, c) in output_terms {
+                let acted =
+                    &fitted.transposed_products[row * length + first..row * length + first + NORM_CHECK_SAMPLES];
                 for i in 0..NORM_CHECK_SAMPLES {
                     sums[i] -= c * acted[i];
                 }
@@ -335,7 +340,7 @@ impl TailoredVectors {
                 }
             }
             let is_beyond = match self.rounding_bounds.norm {
-                Norm::L1 => all.iter().any(|v| *v > most),
+                Norm::L1 => all.iter().any(|v| *v > limit),
                 Norm::L2 => all.iter().sum::<f64>() > squares,
             };
             if is_beyond {

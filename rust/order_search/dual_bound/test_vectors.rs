@@ -67,8 +67,8 @@ fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
         .flat_map(|&(window, full)| {
             let n = (full * count).div_ceil(MAX_TEST_VECTORS);
             (0..n).map(move |i| {
-                let share = if n > 1 { i as f64 / (n - 1) as f64 } else { 0.5 };
-                (window, MIN_CYCLES_PER_RECORD * libm::pow(highest / MIN_CYCLES_PER_RECORD, share))
+                let fraction = if n > 1 { i as f64 / (n - 1) as f64 } else { 0.5 };
+                (window, MIN_CYCLES_PER_RECORD * libm::pow(highest / MIN_CYCLES_PER_RECORD, fraction))
             })
         })
         .take(count)
@@ -140,12 +140,12 @@ impl Vector {
         }
     }
 
-    /// Compute the spectra of the test vector stored in `halves`. `which` is its index, and `size` its dual norm.
-    fn load_spectra(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
+    /// Compute the spectra of the test vector stored in `halves`. `number` is its index, and `size` its dual norm.
+    fn load_spectra(&mut self, number: usize, size: f64, buffers: &mut Buffers) {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
         }
-        (self.number, self.size, self.last_projection) = (which, size, None);
+        (self.number, self.size, self.last_projection) = (number, size, None);
     }
 
     /// Return the entries of [`divisor_effects`] for the next output column, with the distance from the previous column
@@ -169,7 +169,7 @@ impl Vector {
 /// distances of Fᵀt − g t between consecutive columns, from the first column on.
 pub(super) fn divisor_effects(
     bank: &Bank,
-    own: &[usize],
+    output_columns: &[usize],
     vectors: Vec<[Vec<f64>; 2]>,
     sizes: &[f64],
     (norm, unit): (Norm, f64),
@@ -177,13 +177,15 @@ pub(super) fn divisor_effects(
 ) -> Vec<[Wide; 4]> {
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / LANE_COUNT;
-    let mut out = vec![[[0.0; LANE_COUNT]; 4]; own.len() * groups];
+    let mut out = vec![[[0.0; LANE_COUNT]; 4]; output_columns.len() * groups];
     // Each thread needs its own vector, whose two spectra have as many bins as the record has samples.
     let threads = rayon::current_num_threads();
     let batch = (VECTOR_SPECTRA_BYTES / (32 * m.max(1))).max(threads).min(count.max(1));
     // As few blocks of columns as possible, of nearly equal size.
-    let block =
-        own.len().div_ceil(own.len().div_ceil((COLUMN_SPECTRA_BYTES / (16 * m.max(1))).max(threads)).max(1)).max(1);
+    let block = output_columns
+        .len()
+        .div_ceil(output_columns.len().div_ceil((COLUMN_SPECTRA_BYTES / (16 * m.max(1))).max(threads)).max(1))
+        .max(1);
     let kernels = |columns: &[usize]| -> Vec<(Kernel, f64)> {
         let kernel = |buffers: &mut Buffers, &column: &usize| {
             let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
@@ -212,11 +214,11 @@ pub(super) fn divisor_effects(
                 vector.load_spectra(start + i, sizes[start + i], buffers);
             },
         );
-        for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
+        for (first, columns) in output_columns.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
             if stop.is_set() {
                 return out;
             }
-            if block < own.len() || start == 0 {
+            if block < output_columns.len() || start == 0 {
                 spectra.clear();
                 spectra.extend(kernels(columns));
             }
@@ -231,18 +233,18 @@ pub(super) fn divisor_effects(
                     (vector.number, rows)
                 })
                 .collect();
-            for (which, rows) in effects {
+            for (vector_index, rows) in effects {
                 for (row, values) in (first..).zip(rows) {
                     for (half, value) in values.into_iter().enumerate() {
-                        out[row * groups + which / LANE_COUNT][half][which % LANE_COUNT] = value;
+                        out[row * groups + vector_index / LANE_COUNT][half][vector_index % LANE_COUNT] = value;
                     }
                 }
             }
         }
     }
-    for place in groups..out.len() {
-        let before = out[place - groups][3];
-        out[place][3].iter_mut().zip(before).for_each(|(way, before)| *way += before);
+    for group in groups..out.len() {
+        let previous = out[group - groups][3];
+        out[group][3].iter_mut().zip(previous).for_each(|(value, previous)| *value += previous);
     }
     out
 }
@@ -267,7 +269,7 @@ fn column_effect(
         squares += a * a + b * b;
     }
     let (g, h) = (x / squares, y / squares);
-    let apart = |(a, b): (&f64, &f64), (u, v): (f64, f64), g: f64, h: f64| {
+    let orthogonal_part = |(a, b): (&f64, &f64), (u, v): (f64, f64), g: f64, h: f64| {
         let (p, q) = (u - (g * a - h * b), v - (g * b + h * a));
         p * p + q * q
     };
@@ -281,18 +283,19 @@ fn column_effect(
         Norm::L1 => rounding,
         Norm::L2 => rounding * count,
     };
-    let rest = |t, (u, v): (&f64, &f64)| apart(t, (*u, *v), g, h);
-    let (rest, step) = match before {
-        None => (rows().fold(0.0, |sum, (t, u)| add(sum, rest(t, u))), 0.0),
+    let orthogonal_norm = |t, (u, v): (&f64, &f64)| orthogonal_part(t, (*u, *v), g, h);
+    let (orthogonal_norm, step) = match before {
+        None => (rows().fold(0.0, |sum, (t, u)| add(sum, orthogonal_norm(t, u))), 0.0),
         Some(([re, im], [g0, h0, lost0])) => {
-            let (rest, step) = rows().zip(re.iter().zip(im).rev()).fold((0.0, 0.0), |sums, ((t, (u, v)), (u0, v0))| {
-                let step = apart(t, (u - u0, v - v0), g - g0, h - h0);
-                (add(sums.0, rest(t, (u, v))), add(sums.1, step))
-            });
-            (rest, f64::sqrt(step) + rounding_error + lost0)
+            let (orthogonal_norm, step) =
+                rows().zip(re.iter().zip(im).rev()).fold((0.0, 0.0), |sums, ((t, (u, v)), (u0, v0))| {
+                    let step = orthogonal_part(t, (u - u0, v - v0), g - g0, h - h0);
+                    (add(sums.0, orthogonal_norm(t, (u, v))), add(sums.1, step))
+                });
+            (orthogonal_norm, f64::sqrt(step) + rounding_error + lost0)
         }
     };
-    [g, h, f64::sqrt(rest) + rounding_error, rounding_error, step]
+    [g, h, f64::sqrt(orthogonal_norm) + rounding_error, rounding_error, step]
 }
 
 /// Index of a column that does not belong to the output and therefore does not enter the denominator.
@@ -373,15 +376,16 @@ impl TestVectors {
         let unit = 16.0 * f64::EPSILON * m as f64;
         let sum = |x: &[f64]| x.iter().map(|v| v.abs()).sum::<f64>();
         let size_of_target = sum(target);
-        let own: Vec<usize> = (0..bank.len()).filter(|&p| output_error && !bank.kernel(p).is_empty()).collect();
+        let output_columns: Vec<usize> =
+            (0..bank.len()).filter(|&p| output_error && !bank.kernel(p).is_empty()).collect();
         let mut rows = vec![NO_INDEX; bank.len()];
-        own.iter().enumerate().for_each(|(row, &p)| rows[p] = row);
+        output_columns.iter().enumerate().for_each(|(row, &p)| rows[p] = row);
         let rounding = parallel::map(
             (0..bank.len()).collect(),
             || (),
             |(), p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target),
         );
-        let effects = divisor_effects(bank, &own, vectors, &sizes, (norm, unit), stop);
+        let effects = divisor_effects(bank, &output_columns, vectors, &sizes, (norm, unit), stop);
         let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * LANE_COUNT + n])).collect();
         Self {
             groups,
@@ -396,20 +400,21 @@ impl TestVectors {
         }
     }
 
-    /// Return the set with only the test vectors with the indices `which`, in this sequence. Their number is a multiple
-    /// of [`LANE_COUNT`].
-    pub(super) fn select_vectors(&self, which: &[usize]) -> Self {
-        let groups = which.len() / LANE_COUNT;
-        let pick = |source: &[Wide], g: usize| -> Wide {
+    /// Return the set with only the test vectors with the indices `indices`, in this sequence. Their number is a
+    /// multiple of [`LANE_COUNT`].
+    pub(super) fn select_vectors(&self, indices: &[usize]) -> Self {
+        let groups = indices.len() / LANE_COUNT;
+        let select_lanes = |source: &[Wide], g: usize| -> Wide {
             std::array::from_fn(|n| {
-                source[which[g * LANE_COUNT + n] / LANE_COUNT][which[g * LANE_COUNT + n] % LANE_COUNT]
+                source[indices[g * LANE_COUNT + n] / LANE_COUNT][indices[g * LANE_COUNT + n] % LANE_COUNT]
             })
         };
-        let part =
-            |rows: &[[Wide; 2]], half: usize, g: usize| pick(&rows.iter().map(|r| r[half]).collect::<Vec<_>>(), g);
+        let part = |rows: &[[Wide; 2]], half: usize, g: usize| {
+            select_lanes(&rows.iter().map(|r| r[half]).collect::<Vec<_>>(), g)
+        };
         let pairs = |rows: &[[Wide; 2]]| (0..groups).map(|g| [part(rows, 0, g), part(rows, 1, g)]).collect::<Vec<_>>();
         let fours = |rows: &[[Wide; 4]]| {
-            let part = |h: usize, g: usize| pick(&rows.iter().map(|r| r[h]).collect::<Vec<_>>(), g);
+            let part = |h: usize, g: usize| select_lanes(&rows.iter().map(|r| r[h]).collect::<Vec<_>>(), g);
             (0..groups).map(|g| std::array::from_fn(|h| part(h, g))).collect::<Vec<[Wide; 4]>>()
         };
         Self {
@@ -418,7 +423,7 @@ impl TestVectors {
             target: pairs(&self.target),
             rows: self.rows.clone(),
             effects: self.effects.chunks(self.groups).flat_map(fours).collect(),
-            size: (0..groups).map(|g| pick(&self.size, g)).collect(),
+            size: (0..groups).map(|g| select_lanes(&self.size, g)).collect(),
             rounding: self.rounding.clone(),
             target_rounding: self.target_rounding,
             unit: self.unit,
@@ -455,7 +460,7 @@ impl TestVectors {
         let [mut re, mut im] = self.target[group];
         let mut divisor = self.size[group];
         let (mut divisor_im, mut slack) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
-        let (mut own, mut count) = ([(0, 0.0); MAX_JOINT_OWN_COLUMNS], 0);
+        let (mut output_terms, mut count) = ([(0, 0.0); MAX_JOINT_OWN_COLUMNS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             let [a, b] = &self.products[p * self.groups + group];
             for n in 0..LANE_COUNT {
@@ -471,7 +476,7 @@ impl TestVectors {
                     slack[n] += c.abs() * rest[n];
                 }
                 if count < MAX_JOINT_OWN_COLUMNS {
-                    own[count] = (row, c);
+                    output_terms[count] = (row, c);
                 }
                 count += 1;
             }
@@ -484,7 +489,7 @@ impl TestVectors {
             }
         }
         if (2..=MAX_JOINT_OWN_COLUMNS).contains(&count) {
-            let together = self.joint_slack(group, &mut own[..count]);
+            let together = self.joint_slack(group, &mut output_terms[..count]);
             for n in 0..LANE_COUNT {
                 slack[n] = if together[n] < slack[n] { together[n] } else { slack[n] };
             }
@@ -501,41 +506,41 @@ impl TestVectors {
     }
 
     /// Return an upper bound of ‖Σ c (Fᵀt − g t)‖ for each test vector t of a group. The sum is over output columns
-    /// with convolution matrix F and coefficient c, and g is the projection of Fᵀt on t. `own` lists row and
+    /// with convolution matrix F and coefficient c, and g is the projection of Fᵀt on t. `output_terms` lists row and
     /// coefficient of each column. Coefficients of opposite sign partly cancel in this bound.
     ///
     /// By summation by parts, the sum of all coefficients multiplies the norm of the first column. Each partial sum
     /// multiplies the path length to the next column.
     #[inline(always)]
-    fn joint_slack(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
-        for i in 1..own.len() {
-            let mut at = i;
-            while at > 0 && own[at - 1].0 > own[at].0 {
-                own.swap(at - 1, at);
-                at -= 1;
+    fn joint_slack(&self, group: usize, output_terms: &mut [(usize, f64)]) -> Wide {
+        for i in 1..output_terms.len() {
+            let mut position = i;
+            while position > 0 && output_terms[position - 1].0 > output_terms[position].0 {
+                output_terms.swap(position - 1, position);
+                position -= 1;
             }
         }
         let (mut remainder, mut all) = (0.0, 0.0);
-        for (_, c) in own.iter() {
+        for (_, c) in output_terms.iter() {
             remainder += c;
             all += c.abs();
         }
-        let [.., first, mut before] = self.effects[own[0].0 * self.groups + group];
-        let [.., last] = &self.effects[own[own.len() - 1].0 * self.groups + group];
-        let mut most = [0.0; LANE_COUNT];
+        let [.., first, mut before] = self.effects[output_terms[0].0 * self.groups + group];
+        let [.., last] = &self.effects[output_terms[output_terms.len() - 1].0 * self.groups + group];
+        let mut max_norm = [0.0; LANE_COUNT];
         for n in 0..LANE_COUNT {
             // Partial sums lose accuracy in proportion to the sum of the moduli.
-            most[n] = remainder.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
+            max_norm[n] = remainder.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
         }
-        for at in 1..own.len() {
-            remainder -= own[at - 1].1;
-            let [.., way] = self.effects[own[at].0 * self.groups + group];
+        for position in 1..output_terms.len() {
+            remainder -= output_terms[position - 1].1;
+            let [.., norms] = self.effects[output_terms[position].0 * self.groups + group];
             for n in 0..LANE_COUNT {
-                most[n] += remainder.abs() * (way[n] - before[n]);
+                max_norm[n] += remainder.abs() * (norms[n] - before[n]);
             }
-            before = way;
+            before = norms;
         }
-        most
+        max_norm
     }
 }
 

@@ -78,7 +78,7 @@ pub fn has_unstable_zeros(record: &Record, equation: &Equation, norm: Norm, limi
 pub(crate) struct UnstableZeros {
     norm: Norm,
     /// True for the regressor columns that are integrals of the output.
-    own: Vec<bool>,
+    is_output_column: Vec<bool>,
     records: Vec<PathSums>,
 }
 
@@ -138,28 +138,30 @@ fn path_sums(
     let (mut response, mut slack) =
         (vec![0.0; series.len() * 2 * (PATH_SEGMENT_COUNT + 1)], vec![0.0; series.len() * PATH_SEGMENT_COUNT]);
     for lo in (0..m).step_by(SAMPLES_PER_BLOCK) {
-        let shares: Vec<f64> = (lo..m.min(lo + SAMPLES_PER_BLOCK)).map(|k| k as f64 / samples).collect();
+        let times: Vec<f64> = (lo..m.min(lo + SAMPLES_PER_BLOCK)).map(|k| k as f64 / samples).collect();
         let powers: Vec<Vec<f64>> = nodes
             .iter()
             .flat_map(|(re, im)| {
-                let power = |share: &f64| {
-                    let (sin, cos) = libm::sincos(-im * share);
-                    let size = libm::exp(-re * share);
+                let power = |time: &f64| {
+                    let (sin, cos) = libm::sincos(-im * time);
+                    let size = libm::exp(-re * time);
                     (size * cos, size * sin)
                 };
-                let (re, im): (Vec<f64>, Vec<f64>) = shares.iter().map(power).unzip();
+                let (re, im): (Vec<f64>, Vec<f64>) = times.iter().map(power).unzip();
                 [re, im]
             })
             .collect();
-        let allowed: Vec<Vec<f64>> = slowest
+        let decays: Vec<Vec<f64>> = slowest
             .iter()
             .zip(&bends)
-            .map(|(slowest, bend)| shares.iter().map(|k| (bend * k * k + unit) * libm::exp(-slowest * k)).collect())
+            .map(|(slowest, bend)| times.iter().map(|k| (bend * k * k + unit) * libm::exp(-slowest * k)).collect())
             .collect();
-        for (of, by, sums) in [(series, &powers, &mut response), (moduli, &allowed, &mut slack)] {
-            let of: Vec<&[f64]> = of.iter().map(|x| &x[lo..lo + shares.len()]).collect();
-            let by: Vec<&[f64]> = by.iter().map(Vec::as_slice).collect();
-            sums.iter_mut().zip(dense::inner_products(&of, &by, &Stop::default())).for_each(|(sum, x)| *sum += x);
+        for (values, factors, sums) in [(series, &powers, &mut response), (moduli, &decays, &mut slack)] {
+            let values: Vec<&[f64]> = values.iter().map(|x| &x[lo..lo + times.len()]).collect();
+            let factors: Vec<&[f64]> = factors.iter().map(Vec::as_slice).collect();
+            sums.iter_mut()
+                .zip(dense::inner_products(&values, &factors, &Stop::default()))
+                .for_each(|(sum, x)| *sum += x);
         }
     }
     let row = |p: usize| {
@@ -204,7 +206,7 @@ impl PathSums {
         }
     }
 
-    /// Return the number of zeros that a weighted sum of columns plus the constant `one` has inside a path. It is the
+    /// Return the number of zeros that a weighted sum of columns plus the constant `unit` has inside a path. It is the
     /// winding number of the values of the sum along the path. `left_out` bounds the omitted part: a constant, and a
     /// multiple of |z^M| for M samples. `None` if the sum may be 0 on the path.
     #[inline(always)]
@@ -212,12 +214,12 @@ impl PathSums {
         &self,
         path: usize,
         columns: impl Iterator<Item = (usize, f64)>,
-        one: f64,
+        unit: f64,
         left_out: [f64; 2],
     ) -> Option<i32> {
         let width = self.sums.len();
         let (mut re, mut im, mut slack) =
-            ([one; PADDED_NODE_COUNT], [0.0; PADDED_NODE_COUNT], [0.0; PATH_SEGMENT_COUNT]);
+            ([unit; PADDED_NODE_COUNT], [0.0; PADDED_NODE_COUNT], [0.0; PATH_SEGMENT_COUNT]);
         for (slack, tail) in slack.iter_mut().zip(&self.tails[path]) {
             *slack = left_out[0] + left_out[1] * tail;
         }
@@ -231,21 +233,21 @@ impl PathSums {
                 slack[j] += c.abs() * rest[j];
             }
         }
-        let (mut turns, mut near) = ([0_i32; LANE_COUNT], [false; LANE_COUNT]);
+        let (mut windings, mut is_near_zero) = ([0_i32; LANE_COUNT], [false; LANE_COUNT]);
         for j in (0..PATH_SEGMENT_COUNT).step_by(LANE_COUNT) {
             for n in 0..LANE_COUNT {
                 let (a, b, c, d) = (re[j + n], im[j + n], re[j + n + 1], im[j + n + 1]);
                 let middle = ((a + c) * (a + c) + (b + d) * (b + d)).sqrt();
                 let half = ((c - a) * (c - a) + (d - b) * (d - b)).sqrt();
                 // NaN counts as a value that may be 0.
-                near[n] |= !(middle - half > 2.0 * slack[j + n] && middle < f64::MAX);
+                is_near_zero[n] |= !(middle - half > 2.0 * slack[j + n] && middle < f64::MAX);
                 // A crossing of the imaginary axis by the half path counts as one turn, because the mirrored half adds
                 // a second half turn.
-                let crossed = i32::from((a < 0.0) != (c < 0.0));
-                turns[n] += crossed * if a * d > b * c { 1 } else { -1 };
+                let crosses_axis = i32::from((a < 0.0) != (c < 0.0));
+                windings[n] += crosses_axis * if a * d > b * c { 1 } else { -1 };
             }
         }
-        (!near.contains(&true)).then(|| turns.iter().sum())
+        (!is_near_zero.contains(&true)).then(|| windings.iter().sum())
     }
 }
 
@@ -265,10 +267,10 @@ impl UnstableZeros {
 
     /// Compute the tables of all records. `targets` is the measured output of each record.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
-        let own =
+        let is_output_column =
             banks.first().map_or(Vec::new(), |bank| (0..bank.len()).map(|p| !bank.kernel(p).is_empty()).collect());
         let records = banks.iter().zip(targets).map(|(bank, target)| PathSums::new(bank, target)).collect();
-        Self { norm, own, records }
+        Self { norm, is_output_column, records }
     }
 
     /// Return true if some path proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit. The path
@@ -287,21 +289,21 @@ impl UnstableZeros {
                 Norm::L2 => limit.sqrt() * record.samples.sqrt(),
             };
             let size = record.output_modulus + error * (1.0 + record.unit);
-            let (mut length, mut driven) = (0.0, 0.0);
+            let (mut length, mut input_norm) = (0.0, 0.0);
             for (&p, &c) in terms.iter().zip(coefficients) {
-                *(if self.own[p] { &mut length } else { &mut driven }) += c.abs() * record.sums[p];
+                *(if self.is_output_column[p] { &mut length } else { &mut input_norm }) += c.abs() * record.sums[p];
             }
-            let rounding = record.unit * (driven + (1.0 + length) * size);
-            let of = |own: bool| {
+            let rounding = record.unit * (input_norm + (1.0 + length) * size);
+            let terms_of = |is_output: bool| {
                 let all = terms.iter().copied().zip(coefficients.iter().copied());
-                all.filter(move |&(p, _)| self.own[p] == own)
+                all.filter(move |&(p, _)| self.is_output_column[p] == is_output)
             };
-            for turn in 0..record.paths {
-                let path = (*last + turn) % record.paths;
-                let divisor = of(true).map(|(p, c)| (p, -c));
+            for path_index in 0..record.paths {
+                let path = (*last + path_index) % record.paths;
+                let divisor = terms_of(true).map(|(p, c)| (p, -c));
                 let Some(most @ 1..) = record.count_zeros(path, divisor, 1.0, [record.unit, 0.0]) else { continue };
                 let left_out = [rounding, length * size];
-                if record.count_zeros(path, of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
+                if record.count_zeros(path, terms_of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
                     *last = path;
                     return true;
                 }

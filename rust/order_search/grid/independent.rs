@@ -3,9 +3,9 @@
 //!
 //! The combinations of orders of one signal are counted, and found by rank, without being stored.
 
-use crate::equation::{tidy, ORDER_GRAIN};
+use crate::equation::{round_order, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
-use crate::fractional::kernels::{MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
+use crate::fractional::kernels::{MAX_ORDER, MAX_ORDER_EXCESS, MIN_INPUT_ORDER};
 
 /// Maximum number of candidates of one search. Such a search takes about one hour with dual bounds and pruning.
 pub const MAX_CANDIDATES: u128 = 10_000_000_000;
@@ -78,7 +78,7 @@ impl OrderGrid {
         for (k, term) in terms.iter().enumerate() {
             check_finite(&format!("orders of term {k}"), &term.values)?;
         }
-        let mut alphas: Vec<f64> = alphas.iter().map(|&a| tidy(a)).collect();
+        let mut alphas: Vec<f64> = alphas.iter().map(|&a| round_order(a)).collect();
         alphas.sort_by(f64::total_cmp);
         alphas.dedup();
         if let Some(&bad) = alphas.iter().find(|&&a| !(a > 0.0 && a <= MAX_ORDER)) {
@@ -104,20 +104,20 @@ impl OrderGrid {
                 members(signal).iter().map(|&k| values(&terms[k], lowest)).collect()
             })
             .collect();
-        let only = alphas.len() == 1;
+        let is_alpha_fixed = alphas.len() == 1;
         // First axis position in range, per α, signal and term.
         let firsts: Vec<Vec<Vec<usize>>> = alphas
             .iter()
             .map(|&alpha| {
                 // Varied orders stay at or below alpha. A fixed order with a single alpha may exceed it.
-                let highest = |own: bool, count: usize| match (own, only && count == 1) {
+                let highest = |is_output: bool, count: usize| match (is_output, is_alpha_fixed && count == 1) {
                     (true, _) => alpha - ORDER_GRAIN,
                     (false, false) => alpha + ORDER_GRAIN,
-                    (false, true) => alpha + MAX_EXCESS - ORDER_GRAIN,
+                    (false, true) => alpha + MAX_ORDER_EXCESS - ORDER_GRAIN,
                 };
-                let first = |own: bool, axis: &Vec<f64>| {
-                    let highest = highest(own, axis.len());
-                    axis.partition_point(|&v| if own { v >= highest } else { v > highest })
+                let first = |is_output: bool, axis: &Vec<f64>| {
+                    let highest = highest(is_output, axis.len());
+                    axis.partition_point(|&v| if is_output { v >= highest } else { v > highest })
                 };
                 let group = |(axes, &s): (&Vec<Vec<f64>>, &usize)| axes.iter().map(|a| first(s == output, a)).collect();
                 axes.iter().zip(&signals).map(group).collect()
@@ -214,7 +214,8 @@ fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> 
 
 /// Return the distinct orders of an axis that are at least `lowest`, in descending order.
 fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
-    let mut values: Vec<f64> = term.values.iter().map(|&v| tidy(v)).filter(|&v| v >= lowest - ORDER_GRAIN).collect();
+    let mut values: Vec<f64> =
+        term.values.iter().map(|&v| round_order(v)).filter(|&v| v >= lowest - ORDER_GRAIN).collect();
     values.sort_by(|a, b| b.total_cmp(a));
     values.dedup();
     values
@@ -234,7 +235,7 @@ pub(crate) struct Group {
     pub(crate) axes: Vec<Vec<f64>>,
     /// Pairs of orders that are allowed. The set `allowed[b][a][i]` contains the orders of term b that are allowed with
     /// order number i of term a, a < b.
-    allowed: Vec<Vec<Vec<Bits>>>,
+    allowed: Vec<Vec<Vec<BitSet>>>,
 }
 
 /// Combinations of the orders of one signal that are allowed for one order α of the equation.
@@ -252,9 +253,9 @@ pub(crate) struct GroupTuples {
 
 /// Set of positions in an axis (list of orders), as a bit set of 64-bit words.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Bits(pub(super) Vec<u64>);
+pub(super) struct BitSet(pub(super) Vec<u64>);
 
-impl Bits {
+impl BitSet {
     /// Return the set of positions below `len` for which `member` is true.
     fn from(len: usize, member: impl Fn(usize) -> bool) -> Self {
         let mut words = vec![0u64; len.div_ceil(64)];
@@ -267,10 +268,10 @@ impl Bits {
         self.0[i / 64] >> (i % 64) & 1 == 1
     }
 
-    /// Return the smallest position in the set that is at least `from`. `None` if there is none.
-    pub(super) fn next(&self, from: usize) -> Option<usize> {
-        let mut word = from / 64;
-        let mut bits = *self.0.get(word)? & (!0 << (from % 64));
+    /// Return the smallest position in the set that is at least `start`. `None` if there is none.
+    pub(super) fn next(&self, start: usize) -> Option<usize> {
+        let mut word = start / 64;
+        let mut bits = *self.0.get(word)? & (!0 << (start % 64));
         loop {
             if bits != 0 {
                 return Some(word * 64 + bits.trailing_zeros() as usize);
@@ -280,18 +281,18 @@ impl Bits {
         }
     }
 
-    /// Return the number of consecutive positions in the set from `from` on.
-    pub(super) fn run(&self, from: usize) -> usize {
-        let mut at = from;
-        while let Some(&word) = self.0.get(at / 64) {
-            let remaining = 64 - at % 64;
-            let run_length = (!word >> (at % 64)).trailing_zeros() as usize;
+    /// Return the number of consecutive positions in the set from `start` on.
+    pub(super) fn run(&self, start: usize) -> usize {
+        let mut position = start;
+        while let Some(&word) = self.0.get(position / 64) {
+            let remaining = 64 - position % 64;
+            let run_length = (!word >> (position % 64)).trailing_zeros() as usize;
             if run_length < remaining {
-                return at + run_length - from;
+                return position + run_length - start;
             }
-            at += remaining;
+            position += remaining;
         }
-        at - from
+        position - start
     }
 
     /// Return the position in the set with `rank` smaller positions in the set. `None` if there is none.
@@ -316,20 +317,21 @@ impl Group {
     /// for interchangeable terms.
     pub(super) fn new(signal: usize, terms: Vec<usize>, axes: Vec<Vec<f64>>, swappable: &[bool]) -> Self {
         // Orders descend within an axis.
-        let holds = |axis: &[f64], value: f64| axis.binary_search_by(|v| value.total_cmp(v)).is_ok();
+        let contains = |axis: &[f64], value: f64| axis.binary_search_by(|v| value.total_cmp(v)).is_ok();
         let allowed = (0..terms.len())
             .map(|b| {
                 (0..b)
                     .map(|a| {
                         let swappable = swappable[a] && swappable[b];
-                        let twins: Vec<bool> = axes[b].iter().map(|&y| swappable && holds(&axes[a], y)).collect();
+                        let is_shared: Vec<bool> =
+                            axes[b].iter().map(|&y| swappable && contains(&axes[a], y)).collect();
                         let completions = |&x: &f64| {
-                            let twin = holds(&axes[b], x);
+                            let is_shared_value = contains(&axes[b], x);
                             // Of two combinations that differ by an interchange, only the one with the larger order
                             // first is a candidate.
-                            Bits::from(axes[b].len(), |j| {
+                            BitSet::from(axes[b].len(), |j| {
                                 let y = axes[b][j];
-                                (x - y).abs() > ORDER_GRAIN && !(twin && twins[j] && x < y)
+                                (x - y).abs() > ORDER_GRAIN && !(is_shared_value && is_shared[j] && x < y)
                             })
                         };
                         axes[a].iter().map(completions).collect()
@@ -348,11 +350,11 @@ impl Group {
     /// Write the axis positions of all orders but the last to `digits`, for combination number `prefix`. `first` gives
     /// the first axis position in range for each order.
     pub(super) fn decode(&self, first: &[usize], prefix: usize, digits: &mut [usize]) {
-        let mut rest = prefix;
+        let mut remaining = prefix;
         for a in (0..self.last()).rev() {
             let len = self.axes[a].len() - first[a];
-            digits[a] = first[a] + rest % len;
-            rest /= len;
+            digits[a] = first[a] + remaining % len;
+            remaining /= len;
         }
     }
 

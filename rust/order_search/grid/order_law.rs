@@ -1,8 +1,8 @@
 //! Order grid under an order law: a few free orders determine the orders of all coupled equations.
 
-use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
+use crate::equation::{alpha_fits, order_fits, round_order, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
-use crate::fractional::kernels::MAX_EXCESS;
+use crate::fractional::kernels::MAX_ORDER_EXCESS;
 
 /// Maximum number of combinations of values of the free orders. The cost of a search depends on the distinct orders of
 /// its equations.
@@ -68,7 +68,7 @@ impl OrderLawGrid {
         let axes: Vec<Vec<f64>> = axes
             .iter()
             .map(|axis| {
-                let mut axis: Vec<f64> = axis.iter().map(|&v| tidy(v)).collect();
+                let mut axis: Vec<f64> = axis.iter().map(|&v| round_order(v)).collect();
                 axis.sort_by(f64::total_cmp);
                 axis.dedup();
                 axis
@@ -126,7 +126,7 @@ impl OrderLawGrid {
     /// wraps around.
     #[must_use]
     pub fn free(&self, index: u64) -> Vec<f64> {
-        let mut rest = index;
+        let mut remaining = index;
         let mut free: Vec<f64> = self
             .axes
             .iter()
@@ -134,8 +134,8 @@ impl OrderLawGrid {
             .map(|axis| {
                 let len = axis.len() as u64;
                 #[allow(clippy::cast_possible_truncation)]
-                let value = axis[(rest % len) as usize];
-                rest /= len;
+                let value = axis[(remaining % len) as usize];
+                remaining /= len;
                 value
             })
             .collect();
@@ -152,7 +152,7 @@ impl OrderLawGrid {
             .iter()
             .map(|equation| {
                 let orders: Vec<f64> = equation.laws().map(|law| law.at(&free)).collect();
-                self.fits(equation, &orders).then(|| {
+                self.are_valid_orders(equation, &orders).then(|| {
                     let terms = equation.terms.iter().zip(&orders[1..]);
                     let terms = terms.map(|(&(signal, _), &order)| Term { signal, order }).collect();
                     Structure { output: equation.output, order: orders[0], terms }
@@ -168,16 +168,16 @@ impl OrderLawGrid {
 
     /// Return true if α and the orders of the terms are valid, and the orders of each signal are distinct. `orders`
     /// contains α, then one order per term.
-    pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
+    pub(crate) fn are_valid_orders(&self, equation: &LawEquation, orders: &[f64]) -> bool {
         let alpha = orders[0];
         let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
         let fit = |k: usize, signal: usize, order: f64| {
-            let own = signal == equation.output;
-            order_fits(alpha, order, own, input(signal))
-                || !own
+            let is_output = signal == equation.output;
+            order_fits(alpha, order, is_output, input(signal))
+                || !is_output
                     && !input(signal)
                     && order > alpha
-                    && order < alpha + MAX_EXCESS - ORDER_GRAIN
+                    && order < alpha + MAX_ORDER_EXCESS - ORDER_GRAIN
                     && self.fixed_coefficient_terms.contains(&(equation.output, k))
         };
         alpha_fits(alpha)

@@ -4,7 +4,7 @@
 //! The first candidates of a low-discrepancy sequence, however many, are evenly distributed over the grid.
 
 use crate::equation::{Structure, Term};
-use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
+use crate::order_search::grid::independent::{BitSet, OrderGrid, PREFIX_STRIDE};
 
 impl OrderGrid {
     /// Return the structure of a candidate. An index beyond the end gives the last candidate.
@@ -33,7 +33,7 @@ pub(crate) struct Cursor<'a> {
     /// For each group, the number of the combination of all its orders but the last.
     prefixes: Vec<usize>,
     /// For each group, the axis positions of its last order that are allowed with its other orders.
-    completions: Vec<Bits>,
+    completions: Vec<BitSet>,
     /// Axis position of the order of each term, by group.
     digits: Vec<Vec<usize>>,
 }
@@ -48,14 +48,14 @@ impl<'a> Cursor<'a> {
             grid,
             block,
             prefixes: vec![0; groups],
-            completions: vec![Bits(Vec::new()); groups],
+            completions: vec![BitSet(Vec::new()); groups],
             digits: grid.groups.iter().map(|g| vec![0; g.terms.len()]).collect(),
         };
-        let mut rest = index - grid.blocks[block].start;
+        let mut remaining = index - grid.blocks[block].start;
         for g in (0..groups).rev() {
             let count = grid.blocks[block].tuples[g].count;
-            cursor.seek(g, rest % count);
-            rest /= count;
+            cursor.seek(g, remaining % count);
+            remaining /= count;
         }
         cursor
     }
@@ -94,16 +94,16 @@ impl<'a> Cursor<'a> {
     fn seek(&mut self, g: usize, rank: u64) {
         let (group, slice) = (&self.grid.groups[g], &self.grid.blocks[self.block].tuples[g]);
         let block = slice.cumulative_counts.partition_point(|&b| b <= rank).saturating_sub(1);
-        let mut rest = rank - slice.cumulative_counts[block];
+        let mut remaining = rank - slice.cumulative_counts[block];
         for prefix in block * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
             let completions = group.count_completions(&slice.first, &self.digits[g]);
-            if rest < completions {
+            if remaining < completions {
                 self.enter(g, prefix);
-                self.digits[g][group.last()] = self.completions[g].select(rest).unwrap_or(0);
+                self.digits[g][group.last()] = self.completions[g].select(remaining).unwrap_or(0);
                 return;
             }
-            rest -= completions;
+            remaining -= completions;
         }
     }
 
@@ -153,8 +153,9 @@ impl<'a> Cursor<'a> {
         let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
         let group = &self.grid.groups[g];
         let digit = self.digits[g][group.last()];
-        let whole = digit + len <= group.axes[group.last()].len();
-        (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
+        let is_within = digit + len <= group.axes[group.last()].len();
+        (is_within && (digit..digit + len).all(|i| self.completions[g].has(i)))
+            .then(|| (group.terms[group.last()], digit))
     }
 
     /// Return the term whose order alone changes over the next candidates, its axis position, and the number of these
@@ -204,12 +205,12 @@ impl<'a> Cursor<'a> {
         self.block
     }
 
-    /// Call `take(term, axis position)` for each order of group `from` and all later groups. The terms of one signal
-    /// form a group.
+    /// Call `visit(term, axis position)` for each order of group `first_term` and all later groups. The terms of one
+    /// signal form a group.
     #[inline(always)]
-    pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
-        for (group, digits) in self.grid.groups[from..].iter().zip(&self.digits[from..]) {
-            group.terms.iter().zip(digits).for_each(|(&term, &digit)| take(term, digit));
+    pub(crate) fn for_each_term(&self, first_term: usize, mut visit: impl FnMut(usize, usize)) {
+        for (group, digits) in self.grid.groups[first_term..].iter().zip(&self.digits[first_term..]) {
+            group.terms.iter().zip(digits).for_each(|(&term, &digit)| visit(term, digit));
         }
     }
 
@@ -250,17 +251,17 @@ pub(crate) struct GridSlice {
 impl OrderGrid {
     /// Return the first axis position of a term whose order is in range for the order α of a block.
     pub(crate) fn first_in_range(&self, block: usize, term: usize) -> usize {
-        let place = self.groups.iter().zip(&self.blocks[block].tuples);
-        let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
+        let pairs = self.groups.iter().zip(&self.blocks[block].tuples);
+        let mut all = pairs.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
         all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
     }
 
     /// Return an upper bound of the number of candidates of any slice that lies in the same block as `slice` and varies
     /// the same two terms.
     pub(crate) fn max_slice_candidates(&self, slice: &GridSlice) -> u64 {
-        let whole = self.groups.iter().find(|group| group.terms.contains(&slice.outer));
-        let axis =
-            whole.map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slice.block, slice.outer));
+        let outer_group = self.groups.iter().find(|group| group.terms.contains(&slice.outer));
+        let axis = outer_group
+            .map_or(0, |group| group.axes[group.last()].len() - self.first_in_range(slice.block, slice.outer));
         (axis * slice.len) as u64
     }
 
@@ -279,7 +280,7 @@ impl OrderGrid {
         let len = fast.axes[0].len() - first;
         let rows = cursor.completions(outer);
         let mut digits = vec![0; self.width()];
-        cursor.each(0, |term, digit| digits[term] = digit);
+        cursor.for_each_term(0, |term, digit| digits[term] = digit);
         let (u, v) = (slow.terms[slow.last()], fast.terms[0]);
         let before = rows.iter().position(|&row| row == digits[u])? * len + (digits[v] - first);
         let lo = index - before as u64;

@@ -27,7 +27,7 @@ use crate::regressors::Record;
 
 /// Ratio of the score limit to the best score of an equation in the first pass. The first pass evaluates the equations
 /// one after the other.
-const FIRST_LIMIT: f64 = 4.0;
+const SCORE_LIMIT_FACTOR: f64 = 4.0;
 /// Minimum number of candidates of one equation that are evaluated between two updates of the best score of this
 /// equation. The first update follows after 256 candidates.
 const CANDIDATES_PER_UPDATE: usize = 4096;
@@ -162,13 +162,13 @@ impl<'a> CoupledSearch<'a> {
         budget.add_layout(join.bytes());
         for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
             check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
-            let mut needed = RequiredRegressors::new(&options.initial);
+            let mut required = RequiredRegressors::new(&options.initial);
             for &id in &used {
                 let structure = candidates.structure(id);
-                needed.add_alpha(structure.order);
-                structure.terms.iter().for_each(|term| needed.add_term(structure.order, term.signal, term.order));
+                required.add_alpha(structure.order);
+                structure.terms.iter().for_each(|term| required.add_term(structure.order, term.signal, term.order));
             }
-            let index = needed.into_index();
+            let index = required.into_index();
             budget.add(records, equations[e].output, &index, options, Bound::MAX_TEST_VECTORS);
             indices.push((index, candidates, used));
         }
@@ -188,7 +188,7 @@ impl<'a> CoupledSearch<'a> {
             join,
             entries: search.tables.iter().map(|t| vec![UNEVALUATED_ENTRY; t.candidates.len()]).collect(),
             pass: (0, 0, f64::INFINITY),
-            limit_factor: FIRST_LIMIT,
+            limit_factor: SCORE_LIMIT_FACTOR,
             pending_spans: Vec::new(),
             total: search.tables.iter().map(|t| t.used.len() as u64).sum(),
             best_rows: Vec::new(),
@@ -217,12 +217,13 @@ impl<'a> CoupledSearch<'a> {
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut requests = Vec::new();
         for &Span { equation, first, last, limit } in spans {
-            let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
+            let used_ids = self.tables.get(equation).map_or(&[][..], |table| &table.used);
             // Candidates that occur for no combination of free orders have no regressors.
-            let is_evaluated =
-                first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
+            let is_evaluated = first < last
+                && last - first <= used_ids.len()
+                && (first..last).all(|id| used_ids.binary_search(&id).is_ok());
             if !is_evaluated || limit.is_nan() {
-                let count = used.len();
+                let count = used_ids.len();
                 let what = format!("candidates {first} to {last} of equation {equation} are not among its {count}");
                 return Err(mismatch_error(what));
             }
@@ -342,11 +343,11 @@ impl SearchState {
     ) -> Result<()> {
         self.check(search)?;
         let count: usize = self.pending_spans.iter().map(|span| span.last - span.first).sum();
-        let sound = |verdict: &Verdict| match *verdict {
+        let is_valid = |verdict: &Verdict| match *verdict {
             Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
             Verdict::Failed(_) => true,
         };
-        if verdicts.len() != count || !verdicts.iter().all(sound) {
+        if verdicts.len() != count || !verdicts.iter().all(is_valid) {
             return Err(mismatch_error(format!("{} results do not match {count} candidates", verdicts.len())));
         }
         let first_pass = self.pass.0 < search.tables.len();
@@ -371,7 +372,7 @@ impl SearchState {
             let (equation, start, best) = self.pass;
             if start < used.len() {
                 let end = used.len().min(start + if start == 0 { 256 } else { CANDIDATES_PER_UPDATE.max(start / 2) });
-                let limit = if search.options.pruning { FIRST_LIMIT * best } else { f64::INFINITY };
+                let limit = if search.options.pruning { SCORE_LIMIT_FACTOR * best } else { f64::INFINITY };
                 self.pending_spans = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
                 self.pass.1 = end;
                 return Ok(());
@@ -381,9 +382,10 @@ impl SearchState {
         let top = search.options.top;
         let states = self.states();
         self.best_rows = self.join.best(&states, &self.entries, top, pool, control)?;
-        let worst = if self.best_rows.len() == top { self.best_rows[top - 1].0 } else { f64::INFINITY };
-        self.pending_spans = self.join.unresolved_spans(&states, &self.entries, worst, self.limit_factor, control)?;
-        self.limit_factor *= FIRST_LIMIT;
+        let worst_score = if self.best_rows.len() == top { self.best_rows[top - 1].0 } else { f64::INFINITY };
+        self.pending_spans =
+            self.join.unresolved_spans(&states, &self.entries, worst_score, self.limit_factor, control)?;
+        self.limit_factor *= SCORE_LIMIT_FACTOR;
         self.total += self.pending_spans.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
         control.total.store(self.total, Ordering::Relaxed);
         Ok(())

@@ -17,7 +17,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::equation::{grains, tidy, Structure, Term};
+use crate::equation::{grains, round_order, Structure, Term};
 use crate::error::{Error, Result};
 use crate::order_search::control::Control;
 use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
@@ -104,37 +104,37 @@ fn split_free_orders(
 ) -> Result<Vec<usize>> {
     let axes: Vec<usize> = (0..grid.axes().len()).collect();
     let size = |axes: &[usize]| axes.iter().map(|&a| grid.axes()[a].len() as u128).product::<u128>();
-    let several: Vec<usize> =
+    let shared_axes: Vec<usize> =
         axes.iter().copied().filter(|&a| grid.axes()[a].len() > 1).take(MAX_SPLIT_ORDERS).collect();
-    let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << several.len())
+    let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << shared_axes.len())
         .map(|mask| {
-            let own: Vec<usize> =
-                several.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, &axis)| axis).collect();
-            let other: Vec<usize> = axes.iter().copied().filter(|axis| !own.contains(axis)).collect();
-            (size(&own) + size(&other), own, other)
+            let private_axes: Vec<usize> =
+                shared_axes.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, &axis)| axis).collect();
+            let other: Vec<usize> = axes.iter().copied().filter(|axis| !private_axes.contains(axis)).collect();
+            (size(&private_axes) + size(&other), private_axes, other)
         })
         .collect();
     plans.sort();
-    let (mut least, mut best) = (u128::MAX, Vec::new());
-    for (floor, own, other) in plans {
+    let (mut min_size, mut best) = (u128::MAX, Vec::new());
+    for (floor, private_axes, other) in plans {
         control.check_stop()?;
-        if floor >= least {
+        if floor >= min_size {
             break;
         }
-        let limit = |size: u128| usize::try_from((least / size).min(MAX_HALF_ROWS)).unwrap_or(usize::MAX);
-        let Some(first) = rows[0].distinct_sums(grid, &other, limit(size(&own)), control)? else { continue };
-        let Some(second) = rows[1].distinct_sums(grid, &own, limit(size(&other)), control)? else { continue };
-        let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
-        if count < least {
-            (least, best) = (count, own);
+        let limit = |size: u128| usize::try_from((min_size / size).min(MAX_HALF_ROWS)).unwrap_or(usize::MAX);
+        let Some(first) = rows[0].distinct_sums(grid, &other, limit(size(&private_axes)), control)? else { continue };
+        let Some(second) = rows[1].distinct_sums(grid, &private_axes, limit(size(&other)), control)? else { continue };
+        let count = size(&private_axes) * first.len() as u128 + size(&other) * second.len() as u128;
+        if count < min_size {
+            (min_size, best) = (count, private_axes);
         }
     }
-    if least > MAX_HALF_ROWS {
-        return Err(Error::OrderGridTooLarge { count: least.min(u128::from(grid.product())), limit: MAX_HALF_ROWS });
+    if min_size > MAX_HALF_ROWS {
+        return Err(Error::OrderGridTooLarge { count: min_size.min(u128::from(grid.product())), limit: MAX_HALF_ROWS });
     }
-    let (bytes, limit) = (BYTES_PER_HALF_ROW * least, u128::from(memory));
+    let (bytes, limit) = (BYTES_PER_HALF_ROW * min_size, u128::from(memory));
     if bytes > limit {
-        return Err(Error::Memory { what: format!("{least} rows of the layout of the order law"), bytes, limit });
+        return Err(Error::Memory { what: format!("{min_size} rows of the layout of the order law"), bytes, limit });
     }
     Ok(best)
 }
@@ -153,24 +153,24 @@ impl Join {
         let count = candidates.len();
         let ranges = [0..count.min(1), count.min(1)..count];
         let rows = ranges.clone().map(|range| OrderLawSums::new(grid, range));
-        let own = split_free_orders(grid, &rows, memory, control)?;
-        let other: Vec<usize> = (0..grid.axes().len()).filter(|axis| !own.contains(axis)).collect();
+        let private_axes = split_free_orders(grid, &rows, memory, control)?;
+        let other: Vec<usize> = (0..grid.axes().len()).filter(|axis| !private_axes.contains(axis)).collect();
         let full = |axes: &[usize], rows: &OrderLawSums| {
             rows.distinct_sums(grid, axes, usize::MAX, control)?
                 .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
         };
-        let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
+        let addends = [full(&other, &rows[0])?, full(&private_axes, &rows[1])?];
         let stride = addends[1].len() as u64;
         let mut halves = Vec::with_capacity(2);
-        for (h, axes) in [&own, &other].into_iter().enumerate() {
+        for (h, axes) in [&private_axes, &other].into_iter().enumerate() {
             let equations = ranges[h].clone();
             let mut half = Half { equations: equations.clone(), combinations: Vec::new(), rows: Vec::new() };
             let mut ids_by_key: HashMap<Box<[u32]>, u32> = HashMap::new();
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
-            rows[h].for_each_choice(grid, axes, &rows[1 - h], |index, sums, theirs| {
+            rows[h].for_each_choice(grid, axes, &rows[1 - h], |index, sums, other_sums| {
                 control.check_stop()?;
-                let Some(named) = addends[1 - h].find(theirs) else { return Ok(()) };
-                for (number_of_addend, addend) in addends[h].each().enumerate() {
+                let Some(named) = addends[1 - h].find(other_sums) else { return Ok(()) };
+                for (number_of_addend, addend) in addends[h].iter().enumerate() {
                     if number_of_addend % ROWS_PER_STOP_CHECK == ROWS_PER_STOP_CHECK - 1 {
                         control.check_stop()?;
                     }
@@ -179,8 +179,8 @@ impl Join {
                     }
                     let combination =
                         combination(grid, candidates, &mut half, &mut ids_by_key, &orders, &mut key, &mut ids)?;
-                    let (mine, named) = (number_of_addend as u64, u64::from(named));
-                    let bucket_id = if h == 0 { mine * stride + named } else { named * stride + mine };
+                    let (addend_index, named) = (number_of_addend as u64, u64::from(named));
+                    let bucket_id = if h == 0 { addend_index * stride + named } else { named * stride + addend_index };
                     half.rows.push(HalfRow { bucket_id, index, combination });
                 }
                 Ok(())
@@ -265,11 +265,11 @@ fn combination(
     ids: &mut Vec<u32>,
 ) -> Result<u32> {
     ids.clear();
-    let mut rest = orders;
+    let mut remaining_orders = orders;
     for e in half.equations.clone() {
-        let (mine, others) = rest.split_at(grid.equations()[e].terms.len() + 1);
-        ids.push(candidates[e].id(mine, key)?);
-        rest = others;
+        let (equation_orders, other_orders) = remaining_orders.split_at(grid.equations()[e].terms.len() + 1);
+        ids.push(candidates[e].id(equation_orders, key)?);
+        remaining_orders = other_orders;
     }
     match ids_by_key.entry(ids.as_slice().into()) {
         Slot::Occupied(slot) => Ok(*slot.get()),
@@ -461,7 +461,7 @@ impl DistinctSums {
     }
 
     /// Iterate over the vectors of contributions in the sequence of their numbers.
-    pub(super) fn each(&self) -> impl Iterator<Item = &[f64]> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[f64]> {
         (0..self.count).map(|i| &self.values[i * self.width..(i + 1) * self.width])
     }
 }
@@ -503,7 +503,7 @@ impl OrderLawSums {
         distinct.insert(&vec![0.0; width]);
         for &axis in axes {
             let mut next = DistinctSums::of(width);
-            for sums in distinct.each() {
+            for sums in distinct.iter() {
                 for (i, value) in grid.axes()[axis].iter().enumerate() {
                     if i % ROWS_PER_STOP_CHECK == 0 {
                         control.check_stop()?;
@@ -522,7 +522,8 @@ impl OrderLawSums {
 
     /// Call `take(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is its
     /// contribution to the index of a combination of all free orders. `sums` are the values of the order laws of these
-    /// equations, with constants. `other_sums` are the contributions to the order laws of `others`, without constants.
+    /// equations, with constants. `other_sums` are the contributions to the order laws of `other_rows`, without
+    /// constants.
     ///
     /// # Errors
     /// The first error of `take`.
@@ -530,13 +531,13 @@ impl OrderLawSums {
         &self,
         grid: &OrderLawGrid,
         axes: &[usize],
-        others: &Self,
+        other_rows: &Self,
         mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
     ) -> Result<()> {
         let strides: Vec<u64> =
             axes.iter().map(|&axis| grid.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
         let mut digits = vec![0usize; axes.len()];
-        let (mut sums, mut theirs) = (Vec::new(), Vec::new());
+        let (mut sums, mut other_sums) = (Vec::new(), Vec::new());
         loop {
             let value = |i: usize| grid.axes()[axes[i]][digits[i]];
             let add = |base: &[f64], weights: &[Vec<f64>], out: &mut Vec<f64>| {
@@ -547,9 +548,9 @@ impl OrderLawSums {
                 }
             };
             add(&self.constants, &self.weights, &mut sums);
-            add(&vec![0.0; others.constants.len()], &others.weights, &mut theirs);
+            add(&vec![0.0; other_rows.constants.len()], &other_rows.weights, &mut other_sums);
             let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
-            take(index, &sums, &theirs)?;
+            take(index, &sums, &other_sums)?;
             let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < grid.axes()[axes[i]].len()) else {
                 return Ok(());
             };
@@ -561,12 +562,12 @@ impl OrderLawSums {
     /// Write the orders `sums` + `addend` of these equations to `orders`. Return true if all orders are valid.
     pub(super) fn orders(&self, grid: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
-        orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));
-        let mut rest = &orders[..];
+        orders.extend(sums.iter().zip(addend).map(|(s, a)| round_order(s + a)));
+        let mut remaining_orders = &orders[..];
         grid.equations()[self.equations.clone()].iter().all(|equation| {
-            let (mine, others) = rest.split_at(equation.terms.len() + 1);
-            rest = others;
-            grid.fits(equation, mine)
+            let (equation_orders, other_orders) = remaining_orders.split_at(equation.terms.len() + 1);
+            remaining_orders = other_orders;
+            grid.are_valid_orders(equation, equation_orders)
         })
     }
 }

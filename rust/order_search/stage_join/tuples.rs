@@ -14,24 +14,24 @@ use crate::order_search::stage_join::join::{spans, Bucket, Class, HalfRow, Join,
 const SCORE_TOLERANCE: f64 = 1e-12;
 
 impl Join {
-    /// Return the smallest score of each half of the join among those rows of a bucket whose class satisfies `passes`.
-    /// `None` if a half has no such row with a finite score.
+    /// Return the smallest score of each half of the join among those rows of a bucket whose class satisfies
+    /// `includes`. `None` if a half has no such row with a finite score.
     fn least_scores(
         &self,
         bucket: &Bucket,
         states: &[Vec<ScoreEntry>; 2],
-        passes: impl Fn(Class) -> bool,
+        includes: impl Fn(Class) -> bool,
     ) -> Option<[f64; 2]> {
-        let mut least = [f64::INFINITY; 2];
+        let mut min_scores = [f64::INFINITY; 2];
         for h in 0..2 {
             for row in &self.halves[h].rows[bucket.rows[h].clone()] {
                 let state = states[h][row.combination as usize];
-                if passes(state.class) && state.value < least[h] {
-                    least[h] = state.value;
+                if includes(state.class) && state.value < min_scores[h] {
+                    min_scores[h] = state.value;
                 }
             }
         }
-        least.iter().all(|v| v.is_finite()).then_some(least)
+        min_scores.iter().all(|v| v.is_finite()).then_some(min_scores)
     }
 
     /// Return the sum of the scores of all equations, for one combination of candidates per half of the join. Scores
@@ -57,7 +57,8 @@ impl Join {
         let exact = |class: Class| class == Class::Exact;
         let mut order: Vec<(f64, usize, [f64; 2])> = pool.install(|| {
             let candidates = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
-                self.least_scores(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
+                self.least_scores(bucket, states, exact)
+                    .map(|min_scores| (min_scores[0] + min_scores[1], i, min_scores))
             });
             let mut order: Vec<_> = candidates.collect();
             order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -65,7 +66,7 @@ impl Join {
         });
         order.dedup_by_key(|o| o.1);
         let mut best_pairs: Vec<(f64, u64)> = Vec::new();
-        let trim = |best_pairs: &mut Vec<(f64, u64)>| {
+        let truncate_rows = |best_pairs: &mut Vec<(f64, u64)>| {
             best_pairs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             best_pairs.truncate(top);
             if best_pairs.len() == top {
@@ -74,55 +75,55 @@ impl Join {
                 f64::INFINITY
             }
         };
-        let mut worst = f64::INFINITY;
+        let mut worst_score = f64::INFINITY;
         let room = top.max(512).saturating_mul(2);
-        for (bound, i, least) in order {
+        for (bound, i, min_scores) in order {
             control.check_stop()?;
-            if bound > worst {
+            if bound > worst_score {
                 break;
             }
             let rows: [Vec<(f64, HalfRow)>; 2] = std::array::from_fn(|h| {
                 let rows_of_bucket = self.halves[h].rows[self.buckets[i].rows[h].clone()].iter();
                 let mut rows: Vec<(f64, HalfRow)> = rows_of_bucket
                     .map(|&row| (states[h][row.combination as usize], row))
-                    .filter(|(state, _)| exact(state.class) && state.value + least[1 - h] <= worst)
+                    .filter(|(state, _)| exact(state.class) && state.value + min_scores[1 - h] <= worst_score)
                     .map(|(state, row)| (state.value, row))
                     .collect();
                 rows.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.index.cmp(&b.1.index)));
                 rows
             });
             for (a, first) in &rows[0] {
-                if a + least[1] > worst {
+                if a + min_scores[1] > worst_score {
                     break;
                 }
                 for (b, second) in &rows[1] {
-                    if a + b > worst {
+                    if a + b > worst_score {
                         break;
                     }
                     let pair = [first.combination, second.combination];
                     best_pairs.push((self.score(scores, pair), first.index + second.index));
                     if best_pairs.len() >= room {
-                        worst = trim(&mut best_pairs);
+                        worst_score = truncate_rows(&mut best_pairs);
                     }
                 }
             }
-            if worst == f64::INFINITY && best_pairs.len() >= top {
-                worst = trim(&mut best_pairs);
+            if worst_score == f64::INFINITY && best_pairs.len() >= top {
+                worst_score = truncate_rows(&mut best_pairs);
             }
         }
-        trim(&mut best_pairs);
+        truncate_rows(&mut best_pairs);
         Ok(best_pairs)
     }
 
     /// Return the candidates whose scores are only lower bounds and that may still belong to a row of the result table.
-    /// Each has a limit of the score for its next evaluation. `worst` is the score of the last row, infinite if the
-    /// table is not full. In that case the limit is `raise` times the lower bound.
+    /// Each has a limit of the score for its next evaluation. `worst_score` is the score of the last row, infinite if
+    /// the table is not full. In that case the limit is `limit_factor` times the lower bound.
     pub(super) fn unresolved_spans(
         &self,
         states: &[Vec<ScoreEntry>; 2],
         scores: &ScoreTables,
-        worst: f64,
-        raise: f64,
+        worst_score: f64,
+        limit_factor: f64,
         control: &Control,
     ) -> Result<Vec<Span>> {
         let mut limits: Vec<Vec<f64>> = scores.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
@@ -130,14 +131,14 @@ impl Join {
             control.check_stop()?;
             // `None` if all candidates of one half have failed.
             let Some(least) = self.least_scores(bucket, states, |class| !class.is_failed()) else { continue };
-            if least[0] + least[1] > worst * (1.0 + SCORE_TOLERANCE) {
+            if least[0] + least[1] > worst_score * (1.0 + SCORE_TOLERANCE) {
                 continue;
             }
             for (h, half) in self.halves.iter().enumerate() {
                 for row in &half.rows[bucket.rows[h].clone()] {
                     let state = states[h][row.combination as usize];
                     let open = matches!(state.class, Class::Bounded | Class::Open);
-                    if !open || state.value + least[1 - h] > worst * (1.0 + SCORE_TOLERANCE) {
+                    if !open || state.value + least[1 - h] > worst_score * (1.0 + SCORE_TOLERANCE) {
                         continue;
                     }
                     for (e, &id) in half.equations.clone().zip(half.ids(row.combination)) {
@@ -147,16 +148,16 @@ impl Join {
                         }
                         // If the table is not full, any tuple may enter it. The limit is then a multiple of the lower
                         // bound.
-                        let limit = if worst.is_finite() {
-                            worst - least[1 - h] - (state.value - entry.value)
+                        let limit = if worst_score.is_finite() {
+                            worst_score - least[1 - h] - (state.value - entry.value)
                         } else {
-                            raise * entry.value
+                            limit_factor * entry.value
                         };
                         // If the limit is not above the lower bound because of rounding, the candidate must be
                         // evaluated completely.
                         let limit = if limit > entry.value { limit } else { f64::INFINITY };
-                        let old = &mut limits[e][id as usize];
-                        *old = old.max(limit);
+                        let span_limit = &mut limits[e][id as usize];
+                        *span_limit = span_limit.max(limit);
                     }
                 }
             }

@@ -16,7 +16,7 @@ use crate::estimation::joint_fit::progress::FitProgress;
 use crate::estimation::joint_fit::{
     Candidate, FitProblem, Initialization, JointFit, Loss, OptimizationResult, OptimumStatistics, OutputScale, Settings,
 };
-use crate::python::convert::{matrix, stack_rows, List};
+use crate::python::convert::{matrix, stack_rows, to_vectors, List};
 use crate::python::estimation::status;
 use crate::python::order_search::watch::{run_with_progress, Stop};
 use crate::python::recording::{recordings, Recording};
@@ -42,22 +42,22 @@ pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Reco
 
 /// Run the multistart of a joint fit and return its candidates. `progress` is called with (steps done, all steps).
 #[pyfunction]
-#[pyo3(signature = (problem, runs, means, progress=None, stop=None))]
+#[pyo3(signature = (problem, runs, resources, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value)]
 pub fn joint_multistart(
     py: Python<'_>,
     problem: &JointProblem,
     runs: List<Py<Recording>>,
-    means: FitResources,
+    resources: FitResources,
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<JointMultistart> {
-    let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
+    let (free, (threads, memory)) = (Arc::clone(&problem.inner), resources);
     let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let candidates = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
-        let starts = OrderGrids::new(&source, threads, memory, stop);
-        let sizes = OutputScale::of_recordings(&source)?;
-        let fit_problem = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        let order_grids = OrderGrids::new(&source, threads, memory, stop);
+        let output_scale = OutputScale::of_recordings(&source)?;
+        let fit_problem = FitProblem { free: &free, source: &source, starts: &order_grids, sizes: &output_scale, stop };
         fit_problem.run_multistart(threads, &mut FitProgress::new(&report))
     })?;
     Ok(JointMultistart { inner: Arc::new(candidates) })
@@ -65,30 +65,32 @@ pub fn joint_multistart(
 
 /// Warm start from an earlier fit: (values of the free parameters, noise standard deviation of each output, pulses per
 /// sampling interval).
-type NearArg = (List<f64>, List<f64>, usize);
+type WarmStartArg = (List<f64>, List<f64>, usize);
 
 /// Fit a structure to its runs and return the result as a dictionary. None if the simulation overflows for every
 /// initial guess.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
+#[pyo3(signature = (
+    problem, runs, guesses, initial_guess, warm_start, candidates, huber, refine, resources, progress=None, stop=None,
+))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn joint_fit<'py>(
     py: Python<'py>,
     problem: &JointProblem,
     runs: List<Py<Recording>>,
-    known: List<List<f64>>,
-    start: Option<List<f64>>,
-    near: Option<NearArg>,
+    guesses: List<List<f64>>,
+    initial_guess: Option<List<f64>>,
+    warm_start: Option<WarmStartArg>,
     candidates: Option<&JointMultistart>,
     huber: bool,
     refine: bool,
-    means: FitResources,
+    resources: FitResources,
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<Option<Bound<'py, PyDict>>> {
-    let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
+    let (free, (threads, memory)) = (Arc::clone(&problem.inner), resources);
     let candidates = candidates.map(|fit| Vec::clone(&fit.inner));
-    let initialization = match (near, start) {
+    let initialization = match (warm_start, initial_guess) {
         (Some((values, noise, pulses_per_sample)), _) => Initialization::WarmStart {
             values: values.into(),
             noise: noise.into(),
@@ -96,16 +98,16 @@ pub fn joint_fit<'py>(
             candidates: candidates.unwrap_or_default(),
         },
         (None, Some(values)) => Initialization::InitialGuess(values.into()),
-        (None, None) => Initialization::Multistart { known: crate::python::convert::to_vectors(known), candidates },
+        (None, None) => Initialization::Multistart { known: to_vectors(guesses), candidates },
     };
     let loss = if huber { Loss::Huber } else { Loss::Squares };
     let settings = Settings { loss, refine, threads };
     let size = free.problem.size();
     let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let fit = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
-        let starts = OrderGrids::new(&source, threads, memory, stop);
-        let sizes = OutputScale::of_recordings(&source)?;
-        let fit_problem = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
+        let order_grids = OrderGrids::new(&source, threads, memory, stop);
+        let output_scale = OutputScale::of_recordings(&source)?;
+        let fit_problem = FitProblem { free: &free, source: &source, starts: &order_grids, sizes: &output_scale, stop };
         fit::fit(fit_problem, initialization, settings, report)
     })?;
     fit.map(|fit| fit_to_dict(py, fit, size)).transpose()
@@ -116,44 +118,44 @@ fn tables<'py>(py: Python<'py>, runs: &[Vec<Vec<f64>>]) -> PyResult<Vec<Table<'p
     runs.iter().map(|run| stack_rows(py, run)).collect()
 }
 
-fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'_, PyDict>> {
-    let JointFit { optimum, candidates, stability } = found;
+fn fit_to_dict(py: Python<'_>, fit: JointFit, size: usize) -> PyResult<Bound<'_, PyDict>> {
+    let JointFit { optimum, candidates, stability } = fit;
     let OptimumStatistics {
         attempt,
         weights,
-        pulses_per_sample: every,
+        pulses_per_sample,
         estimate,
-        step_converged: settled,
+        step_converged,
         covariance,
         noise,
         residuals,
         robust,
         prior_fractions,
     } = optimum;
-    let OptimizationResult { iterate: place, cost, initial, .. } = &attempt;
+    let OptimizationResult { iterate, cost, initial, .. } = &attempt;
     let dict = PyDict::new(py);
-    dict.set_item("shares", weights.robust_weights.map(|shares| tables(py, &shares)).transpose()?)?;
-    dict.set_item("every", every)?;
+    dict.set_item("robust_weights", weights.robust_weights.map(|runs| tables(py, &runs)).transpose()?)?;
+    dict.set_item("pulses_per_sample", pulses_per_sample)?;
     dict.set_item("estimate", estimate)?;
-    dict.set_item("settled", settled)?;
+    dict.set_item("step_converged", step_converged)?;
     dict.set_item("covariance", matrix(py, covariance, size)?)?;
     dict.set_item("noise", noise)?;
-    dict.set_item("left", tables(py, &residuals)?)?;
+    dict.set_item("residuals", tables(py, &residuals)?)?;
     dict.set_item("robust", robust.map(|robust| (robust.reduced_weight_count, robust.outliers, robust.samples)))?;
     dict.set_item("prior_fractions", prior_fractions)?;
     dict.set_item("on_grid", PyArray1::from_vec(py, attempt.values()))?;
-    dict.set_item("states", &place.states)?;
+    dict.set_item("states", &iterate.states)?;
     dict.set_item("cost", cost)?;
     dict.set_item("status", status(attempt.status))?;
     dict.set_item("initial_terms", initial.iter().flatten().map(Vec::len).sum::<usize>())?;
-    let starts = candidates.iter().flat_map(|candidate| {
+    let origins = candidates.iter().flat_map(|candidate| {
         std::iter::once(&candidate.origin)
             .chain(&candidate.duplicates)
             .map(|origin| (candidate.cost_per_residual(), origin.clone()))
     });
-    dict.set_item("starts", starts.collect::<Vec<_>>())?;
+    dict.set_item("starts", origins.collect::<Vec<_>>())?;
     let survivors = select_survivors(&candidates).into_iter().map(|c| (c.cost_per_residual(), c.result.values()));
     dict.set_item("survivors", survivors.collect::<Vec<_>>())?;
-    dict.set_item("growth", stability.map(|c| (c.keeps_unstable, c.residual_excess, c.at_stability_limit)))?;
+    dict.set_item("unstable_optimum", stability.map(|c| (c.keeps_unstable, c.residual_excess, c.at_stability_limit)))?;
     Ok(dict)
 }

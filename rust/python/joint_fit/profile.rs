@@ -22,31 +22,31 @@ use crate::python::recording::Recording;
 type SurfaceTuple<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 
 /// State of a fit, from a dictionary with these fields as keys. `estimate` holds the parameters extrapolated to zero
-/// step, and `on_grid` the parameters at the shortest step. `weights` holds the weights of the outputs, and `shares`
-/// the robust weights of the samples by run. `every` is the number of pulses per sampling interval. `settled` is true
-/// if the step has converged. If `steady` is true, no step of an optimization leads from a stable model to an unstable
-/// one.
+/// step, and `on_grid` the parameters at the shortest step. `weights` holds the weights of the outputs, and
+/// `robust_weights` those of the samples by run. `pulses_per_sample` belongs to the shortest step. `step_converged` is
+/// true if the estimate no longer changes with the step. If `requires_stability` is true, no step of an optimization
+/// leads from a stable model to an unstable one.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct FitArg<'py> {
     estimate: PyReadonlyArray1<'py, f64>,
     on_grid: PyReadonlyArray1<'py, f64>,
     weights: List<f64>,
-    shares: Option<List<PyReadonlyArray2<'py, f64>>>,
-    every: usize,
-    settled: bool,
-    steady: bool,
+    robust_weights: Option<List<PyReadonlyArray2<'py, f64>>>,
+    pulses_per_sample: usize,
+    step_converged: bool,
+    requires_stability: bool,
 }
 
-fn state(fit: FitArg<'_>) -> PyResult<FitState> {
-    let shares = fit.shares.map(|shares| shares.iter().map(rows).collect::<PyResult<_>>()).transpose()?;
+fn fit_state(fit: FitArg<'_>) -> PyResult<FitState> {
+    let robust_weights = fit.robust_weights.map(|runs| runs.iter().map(rows).collect::<PyResult<_>>()).transpose()?;
     Ok(FitState {
         estimate: vector("estimate", &fit.estimate)?,
         on_grid: vector("values on the grid", &fit.on_grid)?,
-        weights: Weights { outputs: fit.weights.into(), robust_weights: shares },
-        pulses_per_sample: fit.every,
-        step_converged: fit.settled,
-        requires_stability: fit.steady,
+        weights: Weights { outputs: fit.weights.into(), robust_weights },
+        pulses_per_sample: fit.pulses_per_sample,
+        step_converged: fit.step_converged,
+        requires_stability: fit.requires_stability,
     })
 }
 
@@ -88,14 +88,17 @@ pub fn profile_intervals<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     check_parameters(problem, parameters.as_deref().map_or(&[], Vec::as_slice))?;
     check_finite("half-width of the intervals", &[width])?;
-    let (free, fit) = (Arc::clone(&problem.inner), state(fit)?);
+    let (free, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
     let source = source(&free, &runs)?;
     let settings = ProfileSettings { parameters: parameters.map(Vec::from), width, budget, threads };
     let result = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         search_intervals(ProfileLikelihood::new((&free, &source, stop), &fit, evaluations)?, &settings, report)
     })?;
     let dict = PyDict::new(py);
-    let intervals = result.intervals.into_iter().map(|(i, one)| (i, one.low, one.high, one.points, one.evaluations));
+    let intervals = result
+        .intervals
+        .into_iter()
+        .map(|(i, interval)| (i, interval.low, interval.high, interval.points, interval.evaluations));
     dict.set_item("intervals", intervals.collect::<Vec<_>>())?;
     dict.set_item("lower_optimum", result.lower_optimum.map(|values| PyArray1::from_vec(py, values)))?;
     dict.set_item("lower_on_finer_grid", result.lower_on_finer_grid)?;
@@ -120,10 +123,10 @@ fn check_surface_points(points: usize) -> Result<(), Error> {
 /// Return the sums of squares of a fit over two parameters as (smallest sum, values of the first parameter, values of
 /// the second parameter, sums of squares).
 ///
-/// Each row of the sums of squares belongs to one value of the second parameter. `halves` holds the distances of the
-/// outermost values from the optimum. With `refit`, all other parameters follow by one linear step.
+/// Each row of the sums of squares belongs to one value of the second parameter. `half_widths` holds the distances of
+/// the outermost values from the optimum. With `refit`, all other parameters follow by one linear step.
 #[pyfunction]
-#[pyo3(signature = (problem, runs, fit, pair, halves, points, *, refit=true, evaluations=20, stop=None))]
+#[pyo3(signature = (problem, runs, fit, pair, half_widths, points, *, refit=true, evaluations=20, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn cost_surface<'py>(
     py: Python<'py>,
@@ -131,7 +134,7 @@ pub fn cost_surface<'py>(
     runs: List<Py<Recording>>,
     fit: FitArg<'py>,
     pair: [usize; 2],
-    halves: [f64; 2],
+    half_widths: [f64; 2],
     points: usize,
     refit: bool,
     evaluations: usize,
@@ -139,13 +142,13 @@ pub fn cost_surface<'py>(
 ) -> PyResult<SurfaceTuple<'py>> {
     check_parameters(problem, &pair)?;
     check_surface_points(points)?;
-    let (free, fit) = (Arc::clone(&problem.inner), state(fit)?);
+    let (free, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
     let source = source(&free, &runs)?;
-    let (least, [first, second], scores) = run_with_progress(py, stop, None, move |stop, _| {
+    let (minimum, [first, second], scores) = run_with_progress(py, stop, None, move |stop, _| {
         let surface = CostSurface::new((&free, &source, stop), &fit, pair, refit, evaluations)?;
-        let axes = [0, 1].map(|k| surface.axis(k, halves[k], points));
+        let axes = [0, 1].map(|k| surface.axis(k, half_widths[k], points));
         let scores = surface.scores(&axes[0], &axes[1])?;
         Ok((surface.least(), axes, scores))
     })?;
-    Ok((least, PyArray1::from_vec(py, first), PyArray1::from_vec(py, second), matrix(py, scores, points)?))
+    Ok((minimum, PyArray1::from_vec(py, first), PyArray1::from_vec(py, second), matrix(py, scores, points)?))
 }

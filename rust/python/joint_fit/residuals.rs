@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use crate::estimation::generalized_least_squares;
-use crate::estimation::joint_fit::covariance as spread;
+use crate::estimation::joint_fit::covariance as covariance_estimators;
 use crate::python::convert::{copy_vector, matrix, rows, vector, List};
 use crate::python::errors::run_attached;
 use crate::python::order_search::watch::run_interruptible;
@@ -29,14 +29,15 @@ pub fn covariance_of<'py>(
 ) -> PyResult<Table<'py>> {
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let covariance =
-        run_interruptible(py, points, None, move |_| spread::covariance_of_residuals(&jacobian, &series, squares, 0))?;
+    let covariance = run_interruptible(py, points, None, move |_| {
+        covariance_estimators::covariance_of_residuals(&jacobian, &series, squares, 0)
+    })?;
     matrix(py, covariance, size)
 }
 
 /// Return the covariance of the parameters of a fit from a Jacobian with one row per parameter, and the residuals of
-/// each run and output. `robust_weights` has one weight per column; None for a squared loss. The last `priors` columns are
-/// the derivatives of the residuals of priors.
+/// each run and output. `robust_weights` has one weight per column; None for a squared loss. The last `priors` columns
+/// are the derivatives of the residuals of priors.
 #[pyfunction]
 #[pyo3(signature = (jacobian, series, robust_weights, priors=0))]
 #[allow(clippy::needless_pass_by_value)]
@@ -51,7 +52,7 @@ pub fn fit_covariance<'py>(
     let robust_weights = robust_weights.map(|weights| vector("robust weights", &weights)).transpose()?;
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
     let covariance = run_interruptible(py, points, None, move |_| {
-        spread::robust_covariance(&jacobian, series, robust_weights.as_deref(), priors)
+        covariance_estimators::robust_covariance(&jacobian, series, robust_weights.as_deref(), priors)
     })?;
     matrix(py, covariance, size)
 }
@@ -66,7 +67,8 @@ pub fn long_run_covariance<'py>(
 ) -> PyResult<Table<'py>> {
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let covariance = run_interruptible(py, points, None, move |_| spread::long_run_covariance(&jacobian, &series))?;
+    let covariance =
+        run_interruptible(py, points, None, move |_| covariance_estimators::long_run_covariance(&jacobian, &series))?;
     matrix(py, covariance, size)
 }
 
@@ -84,7 +86,7 @@ pub fn prediction_ratio(
     most: usize,
 ) -> PyResult<f64> {
     let (few, many, residuals) = (rows(&few)?, rows(&many)?, copy_vector("residuals", &residuals)?);
-    let outputs: Vec<Vec<_>> = blocks.iter().map(|places| places.iter().map(|&(a, b)| a..b.max(a)).collect()).collect();
+    let outputs: Vec<Vec<_>> = blocks.iter().map(|ranges| ranges.iter().map(|&(a, b)| a..b.max(a)).collect()).collect();
     let points = residuals.len().saturating_mul((few.len() + many.len() + most).max(1));
     run_interruptible(py, points, None, move |stop| {
         generalized_least_squares::prediction_ratio(&few, &many, &residuals, &outputs, most, stop)

@@ -222,7 +222,7 @@ pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
 /// Convert a partial result to Python tuples.
-pub fn part_of(part: Part) -> PartArg {
+pub fn part_to_tuple(part: Part) -> PartArg {
     let c = part.counts;
     (
         part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), to_lists(r.initial))).collect(),
@@ -252,8 +252,9 @@ pub fn part_of(part: Part) -> PartArg {
 }
 
 /// Convert a partial result from Python tuples.
-pub fn part((rows, counts, failures): PartArg) -> Part {
-    let (candidates, retained, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
+pub fn part_from_tuple((rows, counts, failures): PartArg) -> Part {
+    let (candidates, table_rows, beaten, excluded_by_bound, stopped, singular, diverged, excluded_by_box) = match counts
+    {
         CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
         CountsArg::Boxed(all) => all,
     };
@@ -269,10 +270,10 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
             .collect(),
         counts: Counts {
             candidates,
-            table_rows: retained,
+            table_rows,
             beaten,
-            excluded_by_bound: bounded,
-            excluded_by_box: boxed,
+            excluded_by_bound,
+            excluded_by_box,
             stopped,
             singular,
             diverged,
@@ -285,21 +286,23 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
 }
 
 /// Convert a checkpoint from Python tuples.
-pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
+pub fn checkpoint_from_tuple(
+    ((batch, evaluated_count, end, size, limit, order), replaces_previous, part): CheckpointArg,
+) -> Checkpoint {
     Checkpoint {
-        place: BatchPosition { batch: round, evaluated_count: followed, end, size, limit, order },
-        replaces_previous: anew,
-        part: part(found),
+        position: BatchPosition { batch, evaluated_count, end, size, limit, order },
+        replaces_previous,
+        part: part_from_tuple(part),
     }
 }
 
 /// Convert a checkpoint to Python tuples.
-pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
-    let p = checkpoint.place;
+pub fn checkpoint_to_tuple(checkpoint: Checkpoint) -> CheckpointArg {
+    let p = checkpoint.position;
     (
         (p.batch, p.evaluated_count, p.end, p.size, p.limit, p.order),
         checkpoint.replaces_previous,
-        part_of(checkpoint.part),
+        part_to_tuple(checkpoint.part),
     )
 }
 
@@ -308,13 +311,13 @@ pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
 pub type SpanArg = (usize, usize, usize, f64);
 
 /// Convert a block of candidates from a Python tuple.
-pub fn span((equation, first, last, limit): SpanArg) -> Span {
+pub fn span_from_tuple((equation, first, last, limit): SpanArg) -> Span {
     Span { equation, first, last, limit }
 }
 
 /// Serialize outcomes of candidates. Return the raw sums Σ|e| or Σe² as little-endian doubles, and the kinds of outcome
 /// as one byte each.
-pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
+pub fn verdicts_to_bytes(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     let pairs = verdicts.iter().map(|verdict| match *verdict {
         Verdict::Score(raw) => (raw, 0),
         Verdict::Bounded(raw) => (raw, 1),
@@ -326,9 +329,9 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     (values.concat(), kinds)
 }
 
-/// Deserialize outcomes from [`verdicts_of`]. Return an error for an unknown kind or for different numbers of values
-/// and kinds.
-pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
+/// Deserialize outcomes from [`verdicts_to_bytes`]. Return an error for an unknown kind or for different numbers of
+/// values and kinds.
+pub fn verdicts_from_bytes(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
     let decoded = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));
         match kind {

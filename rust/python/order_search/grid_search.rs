@@ -7,20 +7,20 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::arguments::{
-    checkpoint, counts_to_dict, failure_name, part, part_of, CheckpointArg, OrdersArg, PartArg, SearchInputs,
-    SettingsArg,
+    checkpoint_from_tuple, counts_to_dict, failure_name, part_from_tuple, part_to_tuple, CheckpointArg, OrdersArg,
+    PartArg, SearchInputs, SettingsArg,
 };
 use super::watch::{run_checkpointed, run_watched};
 use crate::error::check_length;
 use crate::order_search::batches;
 use crate::order_search::certificate::{self, CertificateOptions, Range, Region};
 use crate::order_search::control::mismatch_error;
-use crate::order_search::given_points::{Point, Points as PointsOf};
+use crate::order_search::given_points::{Point, Points as GivenPoints};
 use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Counts, Outcome, Part, Row};
 use crate::parallel::pool;
-use crate::python::convert::{check_size, columns, records, InitialArg, List, RecordArg};
+use crate::python::convert::{check_size, column_count, records, InitialArg, List, RecordArg};
 use crate::python::errors::run_detached;
 
 #[pyfunction]
@@ -136,7 +136,7 @@ pub fn search_join<'py>(
         let grid = orders.grid(&inputs)?;
         let mut all = Part::default();
         for argument in parts {
-            let part = part(argument);
+            let part = part_from_tuple(argument);
             let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
             if let Some(index) = index.filter(|&i| i >= grid.count()) {
                 return Err(mismatch_error(format!("a row has index {index} among {} candidates", grid.count())));
@@ -214,9 +214,9 @@ impl OrderSearch {
     ) -> PyResult<PartArg> {
         let result = run_checkpointed(py, progress.as_ref(), save.as_ref(), |control| {
             let pool = pool(threads)?;
-            self.evaluator.evaluate_batches(first, last, &seed, start.map(checkpoint), &pool, control)
+            self.evaluator.evaluate_batches(first, last, &seed, start.map(checkpoint_from_tuple), &pool, control)
         })?;
-        Ok(part_of(result))
+        Ok(part_to_tuple(result))
     }
 }
 
@@ -249,7 +249,7 @@ pub fn certify<'py>(
     let certificate =
         run_watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &options, control))?;
     let dict = PyDict::new(py);
-    dict.set_item("at_least", certificate.lower_bound)?;
+    dict.set_item("lower_bound", certificate.lower_bound)?;
     dict.set_item("best", certificate.best)?;
     dict.set_item("alpha", certificate.order)?;
     dict.set_item("orders", certificate.orders)?;
@@ -261,7 +261,7 @@ pub fn certify<'py>(
 /// Evaluation of candidates with given orders and coefficients.
 #[pyclass(module = "ftlm._core")]
 pub struct Points {
-    inner: PointsOf,
+    inner: GivenPoints,
     width: usize,
 }
 
@@ -280,7 +280,7 @@ impl Points {
         let width = signals.len();
         let norm = if squares { Norm::L2 } else { Norm::L1 };
         let (records, signals, inputs) = (records(&runs)?, signals.into(), inputs.into());
-        Ok(Self { inner: run_detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
+        Ok(Self { inner: run_detached(py, || GivenPoints::new(records, output, signals, inputs, norm))?, width })
     }
 
     /// Return the error of each candidate. A row of `candidates` holds alpha, the orders and the coefficients. An error
@@ -296,7 +296,7 @@ impl Points {
         let Self { inner, width } = self;
         let size = 1 + 2 * *width;
         check_size(&candidates)?;
-        check_length("a candidate", size, columns(&candidates))?;
+        check_length("a candidate", size, column_count(&candidates))?;
         let values: Vec<f64> = candidates.as_array().iter().copied().collect();
         let errors = run_watched(py, None, |control| {
             let point = |row: &[f64]| {

@@ -7,7 +7,8 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
 use super::arguments::{
-    counts_to_dict, failure_name, law_grid, span, verdicts, verdicts_of, LawArg, SearchInputs, SettingsArg, SpanArg,
+    counts_to_dict, failure_name, law_grid, span_from_tuple, verdicts_from_bytes, verdicts_to_bytes, LawArg,
+    SearchInputs, SettingsArg, SpanArg,
 };
 use super::watch::run_watched;
 use crate::error::Error;
@@ -161,9 +162,9 @@ impl StageSearch {
         threads: usize,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
-        let requests: Vec<_> = spans.into_iter().map(span).collect();
+        let requests: Vec<_> = spans.into_iter().map(span_from_tuple).collect();
         let (values, kinds) = run_watched(py, progress.as_ref(), |control| {
-            Ok(verdicts_of(&self.search.evaluate(&requests, &pool(threads)?, control)?))
+            Ok(verdicts_to_bytes(&self.search.evaluate(&requests, &pool(threads)?, control)?))
         })?;
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
@@ -171,8 +172,8 @@ impl StageSearch {
     /// Add the outcomes of the pending candidates to the search state, in the sequence of `pending_spans`.
     fn record_outcomes(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         run_watched(py, None, |control| {
-            let decoded = verdicts(values, kinds)?;
-            self.with_state(|state| state.record_verdicts(&self.search, &decoded, &pool(threads)?, control))
+            let verdicts = verdicts_from_bytes(values, kinds)?;
+            self.with_state(|state| state.record_verdicts(&self.search, &verdicts, &pool(threads)?, control))
         })
     }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pyo3::prelude::*;
 
-use super::arguments::checkpoint_of;
+use super::arguments::checkpoint_to_tuple;
 use crate::error::Error;
 use crate::order_search::control::Control;
 use crate::parallel;
@@ -46,24 +46,24 @@ pub fn run_checkpointed<T: Send>(
             });
             let mut raised: Option<PyErr> = None;
             while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(SIGNAL_POLL_INTERVAL) {
-                let look = Python::attach(|py| {
+                let callbacks = Python::attach(|py| {
                     py.check_signals()?;
                     if let Some(progress) = progress {
-                        progress.call1(py, state(&control))?;
+                        progress.call1(py, progress_counts(&control))?;
                     }
                     if let Some(save) = save {
-                        save.call1(py, (control.take_checkpoint().map(checkpoint_of),))?;
+                        save.call1(py, (control.take_checkpoint().map(checkpoint_to_tuple),))?;
                     }
                     Ok::<_, PyErr>(())
                 });
-                if let Err(error) = look {
+                if let Err(error) = callbacks {
                     control.stop.set();
                     raised.get_or_insert(error);
                 }
             }
             let result = worker
                 .join()
-                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread ended without a result".into() }));
+                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread result without a result".into() }));
             match raised {
                 Some(error) => Err(error),
                 None => result.map_err(PyErr::from),
@@ -71,7 +71,7 @@ pub fn run_checkpointed<T: Send>(
         })
     })?;
     if let Some(progress) = progress {
-        progress.call1(py, state(&control))?;
+        progress.call1(py, progress_counts(&control))?;
     }
     Ok(result)
 }
@@ -137,7 +137,7 @@ pub fn run_interruptible<T: Send + 'static>(
                     stop.check()?;
                 }
                 Err(RecvTimeoutError::Disconnected) => {
-                    let what = "a computing thread ended without a result".into();
+                    let what = "a computing thread result without a result".into();
                     return Err(Error::Internal { what }.into());
                 }
             }
@@ -147,8 +147,8 @@ pub fn run_interruptible<T: Send + 'static>(
 
 /// Message of a computing thread: its progress (steps done, all steps), or its result.
 enum WorkerMessage<T> {
-    Progresses(usize, usize),
-    Ends(Result<T, Error>),
+    Progress(usize, usize),
+    Result(Result<T, Error>),
 }
 
 /// Progress callback with the arguments (steps done, all steps).
@@ -170,19 +170,19 @@ pub fn run_with_progress<T: Send + 'static>(
         let stop_copy = stop.clone();
         // If the call has returned early, there is no receiver.
         std::thread::spawn(move || {
-            let report = |count, of| send.send(WorkerMessage::Progresses(count, of)).map_err(|_| Error::Interrupted);
-            let ended = catch_panic(|| work(&stop_copy, &report));
-            drop(send.send(WorkerMessage::Ends(ended)));
+            let report = |count, of| send.send(WorkerMessage::Progress(count, of)).map_err(|_| Error::Interrupted);
+            let result = catch_panic(|| work(&stop_copy, &report));
+            drop(send.send(WorkerMessage::Result(result)));
         });
         loop {
             let outcome = match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
-                Ok(WorkerMessage::Ends(result)) => return result.map_err(PyErr::from),
-                Ok(WorkerMessage::Progresses(count, of)) => {
+                Ok(WorkerMessage::Result(result)) => return result.map_err(PyErr::from),
+                Ok(WorkerMessage::Progress(count, of)) => {
                     Python::attach(|py| progress.map_or(Ok(()), |progress| progress.call1(py, (count, of)).map(drop)))
                 }
                 Err(RecvTimeoutError::Timeout) => Python::attach(|py| py.check_signals()),
                 Err(RecvTimeoutError::Disconnected) => {
-                    let what = "a computing thread ended without a result".into();
+                    let what = "a computing thread result without a result".into();
                     return Err(Error::Internal { what }.into());
                 }
             };
@@ -196,7 +196,7 @@ pub fn run_with_progress<T: Send + 'static>(
 }
 
 /// Return the progress of a search: (candidates done, total, pruned).
-fn state(control: &Control) -> (u64, u64, u64) {
+fn progress_counts(control: &Control) -> (u64, u64, u64) {
     let read = |x: &AtomicU64| x.load(Ordering::Relaxed);
     (read(&control.finished_count), read(&control.total), read(&control.pruned))
 }

@@ -18,7 +18,7 @@ use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
 use crate::equation::{Equation, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::expression::Values;
-use crate::fractional::kernels::{kernel, MAX_EXCESS};
+use crate::fractional::kernels::{kernel, MAX_ORDER_EXCESS};
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
 use crate::regressors::Record;
@@ -51,11 +51,11 @@ struct NonlinearTerm {
 }
 
 /// Contribution of a source to a state channel. A source is a state channel, a non-linear term or a friction force.
-/// `at` holds the indices of the equation and of the term in it.
+/// `term` holds the indices of the equation and of the term in it.
 #[derive(Debug, Clone, Copy)]
 struct Contribution {
     source: usize,
-    at: (usize, usize),
+    term: (usize, usize),
     weight: f64,
 }
 
@@ -66,11 +66,11 @@ struct KernelContributions {
     contributions: Vec<Contribution>,
 }
 
-/// Contribution of an input to a state channel. `at` holds the indices of the equation and of the term in it.
+/// Contribution of an input to a state channel. `term` holds the indices of the equation and of the term in it.
 struct InputContribution {
     state: usize,
     kernel: usize,
-    at: (usize, usize),
+    term: (usize, usize),
     signal: usize,
 }
 
@@ -93,7 +93,7 @@ pub(super) struct Operators {
     gains: Vec<f64>,
     /// True if the value of a non-linear term depends on itself in the same pulse, because it enters a state channel
     /// without integration.
-    algebraic: bool,
+    is_algebraic: bool,
     /// Dry friction of the bodies; None without friction.
     contact: Option<ContactOperators>,
     /// Jumps of the forces on bodies with friction that occur within pulses.
@@ -113,28 +113,28 @@ pub(super) struct LinearizedRun {
 }
 
 /// Early end of a simulation: index of the pulse that has no solution, and the reason.
-pub(super) struct End {
+pub(super) struct EarlyEnd {
     pub(super) index: usize,
-    pub(super) why: String,
+    pub(super) reason: String,
     pub(super) is_overflow: bool,
 }
 
-impl End {
+impl EarlyEnd {
     pub(super) fn error(self, step: f64) -> Error {
         #[allow(clippy::cast_precision_loss)]
         let time = (self.index as f64 + 0.5) * step;
         if self.is_overflow {
             Error::Diverged { what: format!("simulation (at {time:.4} s)"), index: self.index }
         } else {
-            Error::NoSolution { time, index: self.index, why: self.why }
+            Error::NoSolution { time, index: self.index, why: self.reason }
         }
     }
 }
 
 /// Return the index of a kernel in a list. A kernel that is not in the list is appended.
 fn kernel_index(kernels: &mut Vec<IntegralKernel>, order: f64, at_ends: bool) -> usize {
-    let is_same = |known: &IntegralKernel| known.at_ends == at_ends && (known.order - order).abs() < ORDER_GRAIN;
-    kernels.iter().position(is_same).unwrap_or_else(|| {
+    let is_equal = |entry: &IntegralKernel| entry.at_ends == at_ends && (entry.order - order).abs() < ORDER_GRAIN;
+    kernels.iter().position(is_equal).unwrap_or_else(|| {
         kernels.push(IntegralKernel { order, at_ends });
         kernels.len() - 1
     })
@@ -143,7 +143,7 @@ fn kernel_index(kernels: &mut Vec<IntegralKernel>, order: f64, at_ends: bool) ->
 impl Operators {
     pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Result<Self> {
         let (m, step, states) = (record.m(), record.step(), system.state_channels());
-        let find = |channel: StateChannel| states.iter().position(|state| state.is_same(channel));
+        let state_index = |channel: StateChannel| states.iter().position(|state| state.is_same(channel));
         let mut known: Vec<((usize, f64), Vec<f64>)> = Vec::new();
         let mut terms: Vec<NonlinearTerm> = Vec::new();
         for (i, equation) in system.equations.iter().enumerate() {
@@ -152,7 +152,7 @@ impl Operators {
                 let mut arguments = Vec::new();
                 for &(signal, order) in &system.derived[signal].channels {
                     let output = system.output_index(i, signal);
-                    let state = output.and_then(|equation| find(StateChannel::Mean { equation, order }));
+                    let state = output.and_then(|equation| state_index(StateChannel::Mean { equation, order }));
                     arguments.push(match state {
                         Some(state) => ExpressionArgument::State(state),
                         None => ExpressionArgument::Known(known_index(&mut known, (signal, order), record)?),
@@ -162,9 +162,9 @@ impl Operators {
             }
         }
         // The optimizer shortens its step after this error.
-        let beyond = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
+        let order_too_high = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
         let (mut integrals, mut groups, mut inputs) = (Vec::new(), Vec::<KernelContributions>::new(), Vec::new());
-        let mut algebraic = false;
+        let mut is_algebraic = false;
         for (state, &channel) in states.iter().enumerate() {
             let (j, rho, at_ends) = (channel.equation(), channel.order(), channel.is_at_ends());
             let add = |groups: &mut Vec<KernelContributions>, kernel: usize, contribution: Contribution| match groups
@@ -178,47 +178,47 @@ impl Operators {
             for (k, (term, &weight)) in structure.terms.iter().zip(coefficients).enumerate() {
                 let eta = structure.order - term.order;
                 let (source, kernel) = if let Some(l) = system.output_index(j, term.signal) {
-                    if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_EXCESS } {
-                        return Err(beyond());
+                    if eta < if l == j { MIN_INTEGRATION_ORDER } else { MIN_INTEGRATION_ORDER - MAX_ORDER_EXCESS } {
+                        return Err(order_too_high());
                     }
                     if at_ends && system.couples_by_means(j, l, eta) {
                         let mean = StateChannel::Mean { equation: l, order: 0.0 };
-                        (find(mean), kernel_index(&mut integrals, eta - 1.0, true))
+                        (state_index(mean), kernel_index(&mut integrals, eta - 1.0, true))
                     } else {
-                        (find(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
+                        (state_index(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
                     }
                 } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
-                    let driven =
+                    let has_input =
                         terms[q].arguments.iter().any(|argument| matches!(argument, ExpressionArgument::Known(_)));
-                    let left = eta - rho;
-                    let least = if at_ends { MAX_FEEDTHROUGH_ORDER } else { -ORDER_GRAIN };
-                    if left < least || (driven && eta < MIN_INTEGRATION_ORDER) {
-                        return Err(beyond());
+                    let remaining_order = eta - rho;
+                    let min_remaining_order = if at_ends { MAX_FEEDTHROUGH_ORDER } else { -ORDER_GRAIN };
+                    if remaining_order < min_remaining_order || (has_input && eta < MIN_INTEGRATION_ORDER) {
+                        return Err(order_too_high());
                     }
-                    algebraic |= left < MIN_INTEGRATION_ORDER
+                    is_algebraic |= remaining_order < MIN_INTEGRATION_ORDER
                         && !terms[q].arguments.iter().all(|p| matches!(p, ExpressionArgument::Known(_)));
-                    (Some(states.len() + q), kernel_index(&mut integrals, left.max(0.0), at_ends))
+                    (Some(states.len() + q), kernel_index(&mut integrals, remaining_order.max(0.0), at_ends))
                 } else {
-                    let left = eta - rho;
-                    if (left < -ORDER_GRAIN && !at_ends) || eta < MIN_INTEGRATION_ORDER {
-                        return Err(beyond());
+                    let remaining_order = eta - rho;
+                    if (remaining_order < -ORDER_GRAIN && !at_ends) || eta < MIN_INTEGRATION_ORDER {
+                        return Err(order_too_high());
                     }
-                    let left = if at_ends { left } else { left.max(0.0) };
-                    let kernel = kernel_index(&mut integrals, left, at_ends);
-                    inputs.push(InputContribution { state, kernel, at: (j, k), signal: term.signal });
+                    let remaining_order = if at_ends { remaining_order } else { remaining_order.max(0.0) };
+                    let kernel = kernel_index(&mut integrals, remaining_order, at_ends);
+                    inputs.push(InputContribution { state, kernel, term: (j, k), signal: term.signal });
                     continue;
                 };
                 if let Some(source) = source {
-                    add(&mut groups, kernel, Contribution { source, at: (j, k), weight });
+                    add(&mut groups, kernel, Contribution { source, term: (j, k), weight });
                 }
             }
             if let Some(friction) = system.frictions.iter().position(|friction| friction.0 == j) {
                 if structure.order - rho < if at_ends { MAX_FEEDTHROUGH_ORDER } else { MIN_INTEGRATION_ORDER } {
-                    return Err(beyond());
+                    return Err(order_too_high());
                 }
                 let kernel = kernel_index(&mut integrals, structure.order - rho, at_ends);
                 let source = states.len() + terms.len() + friction;
-                add(&mut groups, kernel, Contribution { source, at: (j, structure.terms.len()), weight: -1.0 });
+                add(&mut groups, kernel, Contribution { source, term: (j, structure.terms.len()), weight: -1.0 });
             }
         }
         let kernels: Vec<ConvolutionKernel> = integrals.iter().map(|integral| integral.kernel(m, step)).collect();
@@ -226,12 +226,12 @@ impl Operators {
         let mut gains = vec![0.0; states.len() * count];
         for group in &groups {
             let first = kernels[group.kernel].values().first().copied().unwrap_or(0.0);
-            for part in &group.contributions {
-                gains[group.state * count + part.source] += first * part.weight;
+            for contribution in &group.contributions {
+                gains[group.state * count + contribution.source] += first * contribution.weight;
             }
         }
         let bodies = system.frictions.iter().filter_map(|&(equation, law)| {
-            find(StateChannel::EndVelocity { equation }).map(|velocity| (law, (equation, velocity)))
+            state_index(StateChannel::EndVelocity { equation }).map(|velocity| (law, (equation, velocity)))
         });
         let (laws, channels): (Vec<FrictionLaw>, Vec<(usize, usize)>) = bodies.unzip();
         let contact =
@@ -249,7 +249,7 @@ impl Operators {
             kernel_contributions: groups,
             inputs,
             gains,
-            algebraic,
+            is_algebraic,
             contact,
             jumps: ForceJumps::new(system, record),
         })
@@ -268,14 +268,15 @@ impl Operators {
     /// of t in the output of each equation. Return an error if a power has no finite mean over the first pulse.
     pub(super) fn initial_forcing(&self, system: &NonlinearSystem, powers: &[Vec<(f64, f64)>]) -> Result<ForcingTerms> {
         let links = &system.links();
-        let mut out = ForcingTerms { channels: vec![vec![0.0; self.m]; self.states.len()], starts: Vec::new() };
+        let mut out = ForcingTerms { channels: vec![vec![0.0; self.m]; self.states.len()], initial_motion: Vec::new() };
         let at_ends = match &self.contact {
             Some(_) => {
-                let of = |(i, row): (usize, &Vec<Link>)| {
-                    let by_end_velocity = |link: &&Link| !system.couples_by_means(i, link.output, link.integration);
-                    row.iter().filter(by_end_velocity).copied().collect()
+                let end_velocity_links = |(i, row): (usize, &Vec<Link>)| {
+                    let is_end_velocity_link =
+                        |link: &&Link| !system.couples_by_means(i, link.output, link.integration);
+                    row.iter().filter(is_end_velocity_link).copied().collect()
                 };
-                let links: Vec<Vec<Link>> = links.iter().enumerate().map(of).collect();
+                let links: Vec<Vec<Link>> = links.iter().enumerate().map(end_velocity_links).collect();
                 Some(EndVelocityForcing::new(powers, &links, self.m, self.step)?)
             }
             None => None,
@@ -294,8 +295,9 @@ impl Operators {
             }
         }
         if let (Some(at_ends), Some(contact)) = (&at_ends, &self.contact) {
-            let of = |&equation: &usize| (at_ends.initial_outputs[equation], at_ends.initial_velocities[equation]);
-            out.starts = contact.outputs().iter().map(of).collect();
+            let initial_motion =
+                |&equation: &usize| (at_ends.initial_outputs[equation], at_ends.initial_velocities[equation]);
+            out.initial_motion = contact.outputs().iter().map(initial_motion).collect();
         }
         Ok(out)
     }
@@ -305,7 +307,7 @@ impl Operators {
         for (signal, inputs) in self.inputs_by_signal() {
             let spectrum = Kernel::new(record.signal(signal));
             for input in inputs {
-                let weight = system.equations[input.at.0].coefficients[input.at.1];
+                let weight = system.equations[input.term.0].coefficients[input.term.1];
                 let part = self.integrate(&spectrum, input.kernel, self.kernels[input.kernel].values());
                 forcing.channels[input.state].iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
             }
@@ -343,7 +345,7 @@ impl Operators {
     ///
     /// The second result is None for a complete run. If the simulation ends early, it holds the pulse and the reason,
     /// and the run consists of the pulses before it.
-    pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<End>) {
+    pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<EarlyEnd>) {
         let (states, count) = (self.states.len(), self.sources());
         let width = states + self.known.len();
         let mut run = LinearizedRun {
@@ -369,20 +371,20 @@ impl Operators {
                 None => pulse.solve(),
             };
             if let Err(failure) = solved {
-                let (why, is_overflow) = match failure {
+                let (reason, is_overflow) = match failure {
                     PulseFailure::Overflow => (String::new(), true),
                     PulseFailure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
                     PulseFailure::Contact => ("no friction force is consistent with the motion".into(), false),
                     // Without algebraic terms, short pulses have a solution unless a value grows without bound in one.
-                    PulseFailure::Newton(why) => (why.into(), !self.algebraic),
+                    PulseFailure::Newton(reason) => (reason.into(), !self.is_algebraic),
                 };
-                return (run, Some(End { index: k, why, is_overflow }));
+                return (run, Some(EarlyEnd { index: k, reason, is_overflow }));
             }
-            let positive = pulse.determinant > 0.0;
-            if *sign.get_or_insert(positive) != positive {
-                let why =
+            let is_positive = pulse.determinant > 0.0;
+            if *sign.get_or_insert(is_positive) != is_positive {
+                let reason =
                     "the Jacobian of the equations is singular, and they have no solution beyond this point".into();
-                return (run, Some(End { index: k, why, is_overflow: !self.algebraic }));
+                return (run, Some(EarlyEnd { index: k, reason, is_overflow: !self.is_algebraic }));
             }
             let values = pulse.z.iter().chain(&pulse.values);
             run.sources.iter_mut().zip(values).for_each(|(row, v)| row.push(*v));
@@ -392,8 +394,9 @@ impl Operators {
                 run.contacts.push(motion.advance(&pulse.z));
             }
             for (group, convolution) in self.kernel_contributions.iter().zip(&mut convolutions) {
-                let of = |part: &Contribution| part.weight * pulse.source(part.source);
-                convolution.push(group.contributions.iter().map(of).sum());
+                let weighted_value =
+                    |contribution: &Contribution| contribution.weight * pulse.source(contribution.source);
+                convolution.push(group.contributions.iter().map(weighted_value).sum());
             }
         }
         (run, None)
@@ -403,24 +406,24 @@ impl Operators {
 /// Return the index of an input, or of a derivative of an input, in `known`. A new entry is computed from the record
 /// and appended.
 fn known_index(known: &mut Vec<((usize, f64), Vec<f64>)>, channel: (usize, f64), record: &Record) -> Result<usize> {
-    if let Some(at) = known.iter().position(|(of, _)| *of == channel) {
-        return Ok(at);
+    if let Some(index) = known.iter().position(|(entry, _)| *entry == channel) {
+        return Ok(index);
     }
     known.push((channel, derivative(record.signal(channel.0), channel.1, record.step())?));
     Ok(known.len() - 1)
 }
 
 /// Return the pulse means of the derivative of a signal from its pulse means. Return [`Error::OutOfRange`] for an order
-/// above [`MAX_EXCESS`].
+/// above [`MAX_ORDER_EXCESS`].
 fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     if order < ORDER_GRAIN {
         return Ok(means.to_vec());
     }
-    if order > MAX_EXCESS {
+    if order > MAX_ORDER_EXCESS {
         return Err(Error::OutOfRange {
             name: "order of a derivative of an input in a non-linear term".into(),
             value: order,
-            range: format!("[0, {MAX_EXCESS}]"),
+            range: format!("[0, {MAX_ORDER_EXCESS}]"),
             remedy: "measure the derivative as a signal".into(),
         });
     }
@@ -436,7 +439,7 @@ struct Pulse<'a> {
     fixed: Vec<Option<f64>>,
     /// For each state channel, whether it was fixed when `inverse` was computed. Without non-linear terms, the inverse
     /// depends on these flags only.
-    inverted_for: Vec<bool>,
+    fixed_in_inverse: Vec<bool>,
     known: Vec<f64>,
     z: Vec<f64>,
     /// Values of the non-linear terms at `z`, followed by the friction forces.
@@ -446,10 +449,10 @@ struct Pulse<'a> {
     determinant: f64,
     residual: Vec<f64>,
     /// Sum of the magnitudes of the terms in the equation of each state channel.
-    sizes: Vec<f64>,
+    magnitudes: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
-    before: Vec<f64>,
+    previous: Vec<f64>,
     fault: Option<(&'static str, f64)>,
     arguments: Vec<f64>,
     work: Values,
@@ -463,7 +466,7 @@ impl<'a> Pulse<'a> {
             system,
             free: vec![0.0; states],
             fixed: vec![None; states],
-            inverted_for: Vec::new(),
+            fixed_in_inverse: Vec::new(),
             known: vec![0.0; known],
             z: vec![0.0; states],
             values: vec![0.0; values],
@@ -471,10 +474,10 @@ impl<'a> Pulse<'a> {
             inverse: vec![0.0; states * states],
             determinant: 1.0,
             residual: vec![0.0; states],
-            sizes: vec![0.0; states],
+            magnitudes: vec![0.0; states],
             matrix: vec![0.0; states * states],
             step: vec![0.0; states],
-            before: vec![0.0; states],
+            previous: vec![0.0; states],
             fault: None,
             arguments: Vec::new(),
             work: Values::default(),
@@ -500,23 +503,23 @@ impl<'a> Pulse<'a> {
             self.values[q] = self.system.derived[term.signal].expression.evaluate(&self.arguments, &mut self.work);
             self.fault = self.fault.or(self.work.fault());
             for (argument, slope) in term.arguments.iter().zip(self.work.slopes()) {
-                let at = match *argument {
+                let column = match *argument {
                     ExpressionArgument::State(state) => state,
                     ExpressionArgument::Known(known) => states + known,
                 };
-                self.slopes[q * width + at] += slope;
+                self.slopes[q * width + column] += slope;
             }
         }
         let count = self.operators.sources();
         let mut norm: f64 = 0.0;
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
-            let own: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
-            let sizes = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| (g * x).abs());
-            self.sizes[a] = sizes.sum::<f64>() + self.z[a].abs() + self.free[a].abs();
+            let same_pulse_sum: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
+            let magnitudes = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| (g * x).abs());
+            self.magnitudes[a] = magnitudes.sum::<f64>() + self.z[a].abs() + self.free[a].abs();
             self.residual[a] = match self.fixed[a] {
                 Some(value) => self.z[a] - value,
-                None => self.z[a] - self.free[a] - own,
+                None => self.z[a] - self.free[a] - same_pulse_sum,
             };
             norm = norm.hypot(self.residual[a]);
         }
@@ -528,7 +531,7 @@ impl<'a> Pulse<'a> {
     fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {
-                [.., before, last] => 2.0 * last - before,
+                [.., previous, last] => 2.0 * last - previous,
                 [last] => *last,
                 [] => *free,
             };
@@ -540,10 +543,10 @@ impl<'a> Pulse<'a> {
     fn linearize(&mut self) -> bool {
         let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
         let is_fixed = self.fixed.iter().map(Option::is_some);
-        if self.is_linear() && is_fixed.clone().eq(self.inverted_for.iter().copied()) {
+        if self.is_linear() && is_fixed.clone().eq(self.fixed_in_inverse.iter().copied()) {
             return true;
         }
-        self.inverted_for = is_fixed.collect();
+        self.fixed_in_inverse = is_fixed.collect();
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             for b in 0..states {
@@ -551,9 +554,9 @@ impl<'a> Pulse<'a> {
                     self.matrix[a * states + b] = f64::from(u8::from(a == b));
                     continue;
                 }
-                let through: f64 =
+                let nonlinear_gain: f64 =
                     gains[states..].iter().enumerate().map(|(q, g)| g * self.slopes[q * width + b]).sum();
-                self.matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - through;
+                self.matrix[a * states + b] = f64::from(u8::from(a == b)) - gains[b] - nonlinear_gain;
             }
         }
         if let [a] = self.matrix[..] {
@@ -571,13 +574,13 @@ impl<'a> Pulse<'a> {
             return Err(PulseFailure::Newton("its linearization is singular"));
         }
         let (states, count) = (self.z.len(), self.operators.sources());
-        for (a, right) in self.residual.iter_mut().enumerate() {
+        for (a, rhs) in self.residual.iter_mut().enumerate() {
             let gains = &self.operators.gains[a * count + states..(a + 1) * count];
-            let driven = || self.free[a] + gains.iter().zip(&self.values).map(|(g, x)| g * x).sum::<f64>();
-            *right = self.fixed[a].unwrap_or_else(driven);
+            let forced_value = || self.free[a] + gains.iter().zip(&self.values).map(|(g, x)| g * x).sum::<f64>();
+            *rhs = self.fixed[a].unwrap_or_else(forced_value);
         }
         for (z, row) in self.z.iter_mut().zip(self.inverse.chunks(states)) {
-            *z = row.iter().zip(&self.residual).map(|(v, right)| v * right).sum();
+            *z = row.iter().zip(&self.residual).map(|(v, rhs)| v * rhs).sum();
         }
         if self.z.iter().all(|z| z.is_finite()) {
             Ok(())
@@ -610,24 +613,24 @@ impl<'a> Pulse<'a> {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
                 // A channel with small terms receives the rounding errors of channels with large terms.
-                let rounding: f64 = row.iter().zip(&self.sizes).map(|(v, size)| (v * size).abs()).sum();
-                let tolerance = NEWTON_TOLERANCE * self.sizes[a] + ROUNDING_RATIO * rounding;
+                let rounding: f64 = row.iter().zip(&self.magnitudes).map(|(v, magnitude)| (v * magnitude).abs()).sum();
+                let tolerance = NEWTON_TOLERANCE * self.magnitudes[a] + ROUNDING_RATIO * rounding;
                 is_small &= self.step[a].abs() <= tolerance;
             }
-            self.before.clone_from(&self.z);
-            let (mut share, mut left) = (1.0, MAX_STEP_HALVINGS);
+            self.previous.clone_from(&self.z);
+            let (mut step_fraction, mut halvings_left) = (1.0, MAX_STEP_HALVINGS);
             loop {
-                let steps = self.before.iter().zip(&self.step);
-                self.z.iter_mut().zip(steps).for_each(|(z, (from, d))| *z = from - share * d);
-                let there = self.evaluate();
-                if there.is_finite() && (there <= norm || is_small) {
-                    norm = there;
+                let steps = self.previous.iter().zip(&self.step);
+                self.z.iter_mut().zip(steps).for_each(|(z, (start, d))| *z = start - step_fraction * d);
+                let next_norm = self.evaluate();
+                if next_norm.is_finite() && (next_norm <= norm || is_small) {
+                    norm = next_norm;
                     break;
                 }
-                if left == 0 {
-                    return Err(if there.is_finite() { NO_DESCENT } else { self.describe_fault() });
+                if halvings_left == 0 {
+                    return Err(if next_norm.is_finite() { NO_DESCENT } else { self.describe_fault() });
                 }
-                (share, left) = (0.5 * share, left - 1);
+                (step_fraction, halvings_left) = (0.5 * step_fraction, halvings_left - 1);
             }
             if is_small {
                 return Ok(());
@@ -638,7 +641,7 @@ impl<'a> Pulse<'a> {
 
     fn describe_fault(&self) -> PulseFailure {
         match self.fault {
-            Some((name, argument)) if argument.abs() < OVERFLOW_SIZE => PulseFailure::Domain(name, argument),
+            Some((name, argument)) if argument.abs() < MIN_OVERFLOW_ARGUMENT => PulseFailure::Domain(name, argument),
             _ => PulseFailure::Overflow,
         }
     }
@@ -666,7 +669,7 @@ impl PulseEquations for Pulse<'_> {
 
 /// Magnitude of an argument at or above which a function without a finite value is reported as an overflow. For smaller
 /// arguments, the argument is reported as outside the domain of the function.
-const OVERFLOW_SIZE: f64 = 1e60;
+const MIN_OVERFLOW_ARGUMENT: f64 = 1e60;
 /// Failure of a pulse in which no Newton step reduces the residual, or whose iteration does not converge.
 const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");
 
@@ -677,7 +680,7 @@ pub(super) struct SensitivityCache<'a> {
     run: &'a LinearizedRun,
     spectra: Vec<Option<Kernel>>,
     slopes: Vec<Option<Vec<f64>>>,
-    found: std::collections::BTreeMap<(usize, usize, bool), Vec<f64>>,
+    convolutions: std::collections::BTreeMap<(usize, usize, bool), Vec<f64>>,
     contacts: Option<ContactResponses>,
 }
 
@@ -685,7 +688,7 @@ impl<'a> SensitivityCache<'a> {
     pub(super) fn new(operators: &'a Operators, run: &'a LinearizedRun) -> Self {
         let spectra = (0..operators.sources()).map(|_| None).collect();
         let slopes = vec![None; operators.integrals.len()];
-        Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new(), contacts: None }
+        Self { operators, run, spectra, slopes, convolutions: std::collections::BTreeMap::new(), contacts: None }
     }
 
     /// Compute the responses to friction forces unless they are cached.
@@ -705,9 +708,9 @@ impl<'a> SensitivityCache<'a> {
 
     /// Return the convolution of a source (a state channel, a non-linear term or a friction force) with a kernel. If
     /// `is_slope`, use the derivative of the kernel with respect to its order.
-    fn of(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
+    fn convolution(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
         let key = (kernel, source, is_slope);
-        if !self.found.contains_key(&key) {
+        if !self.convolutions.contains_key(&key) {
             if self.spectra[source].is_none() {
                 self.spectra[source] = Some(Kernel::new(&self.run.sources[source]));
             }
@@ -722,9 +725,9 @@ impl<'a> SensitivityCache<'a> {
             if let Some(spectrum) = &self.spectra[source] {
                 spectrum.apply(series, &mut out, &mut Buffers::default());
             }
-            self.found.insert(key, out);
+            self.convolutions.insert(key, out);
         }
-        &self.found[&key]
+        &self.convolutions[&key]
     }
 }
 
@@ -746,23 +749,31 @@ impl Operators {
             row.iter_mut().zip(part).for_each(|(sum, v)| *sum += weight * v);
         };
         for group in &self.kernel_contributions {
-            for part in &group.contributions {
-                let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
+            for contribution in &group.contributions {
+                let (coefficient, order) = derivatives.terms[contribution.term.0][contribution.term.1];
                 if coefficient != 0.0 {
-                    add(&mut forcing[group.state], coefficient, cache.of(group.kernel, part.source, false));
+                    add(
+                        &mut forcing[group.state],
+                        coefficient,
+                        cache.convolution(group.kernel, contribution.source, false),
+                    );
                 }
-                if order != 0.0 && part.weight != 0.0 {
-                    add(&mut forcing[group.state], order * part.weight, cache.of(group.kernel, part.source, true));
+                if order != 0.0 && contribution.weight != 0.0 {
+                    add(
+                        &mut forcing[group.state],
+                        order * contribution.weight,
+                        cache.convolution(group.kernel, contribution.source, true),
+                    );
                 }
             }
         }
         for (signal, inputs) in self.inputs_by_signal() {
-            let moved =
+            let input_change =
                 derivatives.inputs.iter().find(|input| input.signal == signal).map(|input| Kernel::new(&input.means));
             let mut spectrum = None;
             for input in inputs {
-                let (coefficient, order) = derivatives.terms[input.at.0][input.at.1];
-                let weight = system.equations[input.at.0].coefficients[input.at.1];
+                let (coefficient, order) = derivatives.terms[input.term.0][input.term.1];
+                let weight = system.equations[input.term.0].coefficients[input.term.1];
                 if coefficient != 0.0 || order != 0.0 {
                     let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
                     if coefficient != 0.0 {
@@ -774,16 +785,16 @@ impl Operators {
                         add(&mut forcing[input.state], order * weight, &part);
                     }
                 }
-                if let Some(moved) = &moved {
-                    let part = self.integrate(moved, input.kernel, self.kernels[input.kernel].values());
+                if let Some(input_change) = &input_change {
+                    let part = self.integrate(input_change, input.kernel, self.kernels[input.kernel].values());
                     add(&mut forcing[input.state], weight, &part);
                 }
             }
         }
         let mut known = Vec::new();
-        for (at, ((signal, order), _)) in self.known.iter().enumerate() {
+        for (index, ((signal, order), _)) in self.known.iter().enumerate() {
             if let Some(input) = derivatives.inputs.iter().find(|input| input.signal == *signal) {
-                known.push((at, derivative(&input.means, *order, self.step)?));
+                known.push((index, derivative(&input.means, *order, self.step)?));
             }
         }
         let bodies = match &self.contact {
@@ -803,10 +814,11 @@ impl Operators {
         let mut out = vec![0.0; self.gains.len()];
         for group in &self.kernel_contributions {
             let first = self.kernels[group.kernel].values().first().copied().unwrap_or(0.0);
-            for part in &group.contributions {
-                let (coefficient, order) = derivatives.terms[part.at.0][part.at.1];
+            for contribution in &group.contributions {
+                let (coefficient, order) = derivatives.terms[contribution.term.0][contribution.term.1];
                 let slope = if order == 0.0 { 0.0 } else { cache.kernel_slope(group.kernel)[0] };
-                out[group.state * count + part.source] += coefficient * first + part.weight * order * slope;
+                out[group.state * count + contribution.source] +=
+                    coefficient * first + contribution.weight * order * slope;
             }
         }
         out
@@ -842,7 +854,7 @@ impl Operators {
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];
             x[states..].fill(0.0);
             for q in 0..terms {
-                x[states + q] = known.iter().map(|(at, means)| slopes[q * width + states + at] * means[k]).sum();
+                x[states + q] = known.iter().map(|(index, means)| slopes[q * width + states + index] * means[k]).sum();
             }
             if !known.is_empty() {
                 for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
@@ -857,15 +869,17 @@ impl Operators {
             }
             if let (Some((contact, motion, bodies)), Some(responses)) = (&mut bodies, responses) {
                 let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, derivatives));
-                let at = (&run.contacts, responses, k);
-                contact.add_friction_derivatives(at, intervals, bodies, motion, &mut x);
+                let pulse_context = (&run.contacts, responses, k);
+                contact.add_friction_derivatives(pulse_context, intervals, bodies, motion, &mut x);
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();
             }
             out.iter_mut().zip(&x).for_each(|(row, v)| row.push(*v));
             for (group, convolution) in self.kernel_contributions.iter().zip(&mut convolutions) {
-                convolution.push(group.contributions.iter().map(|part| part.weight * x[part.source]).sum());
+                convolution.push(
+                    group.contributions.iter().map(|contribution| contribution.weight * x[contribution.source]).sum(),
+                );
             }
         }
         Ok(out)
