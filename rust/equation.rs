@@ -460,7 +460,7 @@ impl AffineOrder {
             return Ok(());
         }
         Err(Error::OutOfRange {
-            name: "size of an order within its bounds".into(),
+            name: "largest magnitude of an order within its bounds".into(),
             value: magnitude,
             range: format!("[0, {MAX_REACHED_ORDER}]"),
             remedy: format!("bound free orders by {MIN_INPUT_ORDER} and {MAX_ORDER}"),

@@ -385,7 +385,7 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
         .collect()
 }
 
-/// Return the stability margin of the block-pulse scheme at the Nyquist frequency. `own_terms` holds (coefficient c,
+/// Return the stability margin of the block-pulse scheme at the Nyquist frequency. `output_terms` holds (coefficient c,
 /// integration order η = α − ν) of the terms of the output, and `step` is the pulse length h \[s\].
 ///
 /// The scheme divides by 1 − Σ c F^η, where F^η is the power series of I^η. At z = −1 the divisor is 1 − Σ c h^η
@@ -398,8 +398,8 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
 /// assert!((margin - 0.75).abs() < 1e-12);
 /// ```
 #[must_use]
-pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
-    1.0 - own_terms
+pub fn nyquist_margin(output_terms: &[(f64, f64)], step: f64) -> f64 {
+    1.0 - output_terms
         .iter()
         .map(|&(c, eta)| c * libm::pow(step, eta) * alternating_sum(eta) / libm::tgamma(eta + 2.0))
         .sum::<f64>()

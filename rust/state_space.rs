@@ -1,5 +1,5 @@
-//! Equations of integer orders in state space, and their exact discretization for inputs that are held or linear
-//! between samples.
+//! Equations of integer orders in state space, and their exact discretization for inputs with a zero-order hold or a
+//! first-order hold.
 //!
 //! An equation y = Σ c_k I^{η_k} s_k + Σ a_e t^e with integers η = α − ν and e is a chain of integrators. State j is
 //! the integrand of the j-th integral: w_j′ = w_{j+1} + Σ c_k s_k over the terms with η_k = j. A term with η = 0 acts
@@ -453,8 +453,8 @@ impl Recursion<'_> {
 }
 
 impl Channel<'_> {
-    /// Write the values of the input in the rows from `first_row` on to `values`. The last sample is held beyond the
-    /// record.
+    /// Write the values of the input in the rows from `first_row` on to `values`. The last sample is repeated beyond
+    /// the record.
     fn write_values(&self, first_row: usize, values: &mut [f64]) {
         let last_value = self.samples.last().copied().unwrap_or(0.0);
         let before_record =

@@ -116,8 +116,8 @@ impl Innovation {
 /// use ftlm::estimation::multi_innovation::{closed_form, recursion, Innovation, Prior, RowBasis};
 /// use ftlm::regressors::Record;
 /// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
-/// let driven = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 64], input.clone()]), None)?;
-/// let output = driven.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
+/// let excitation = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 64], input.clone()]), None)?;
+/// let output = excitation.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
 /// let run = [Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?];
 /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
 /// let innovation = Innovation { length: 4, prior: Prior::WEAK, row_basis: RowBasis::Time };

@@ -225,7 +225,7 @@ pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], 
     }
 }
 
-/// Do the work of [`solve_lanes`] for k unknowns.
+/// Solve the systems as [`solve_lanes`] does, with the number of unknowns k as a constant for the compiler.
 #[inline(always)]
 fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], required: usize) -> [bool; L] {
     let (gram, rhs) = (&mut gram[..packed_index(k, 0)], &mut rhs[..k]);

@@ -100,9 +100,9 @@ impl Points {
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
     /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
     /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
-    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α is left out.
+    /// // D^α y = c D^ν u: y satisfies it with α = 0.8, ν = 0, c = 1. Orders ν above α are invalid.
     /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
-    /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };
+    /// let point = |order: f64, input_order: f64| Point { order, orders: vec![input_order], coefficients: vec![1.0] };
     /// let errors = points.scores(&[point(0.8, 0.0), point(0.8, 0.9)], f64::INFINITY, 1, &Control::default())?;
     /// assert!(errors[0] < 1e-9 && errors[1].is_infinite());
     /// # Ok::<(), ftlm::error::Error>(())

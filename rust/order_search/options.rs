@@ -219,19 +219,19 @@ impl Budget {
     /// Add the memory of the data that the candidates of one equation share, with at most `vectors` test vectors.
     pub(crate) fn add(&mut self, records: &[Record], output: usize, index: &Index, options: &Options, vectors: usize) {
         let width = index.keys().len() as u128;
-        let own = Bank::output_integral_count(index, output) as u128;
+        let output_integrals = Bank::output_integral_count(index, output) as u128;
         let refined = options.refines();
         let bounded = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
         let mut largest = 0;
         for record in records {
             let m = record.m();
-            let bank = BYTES_PER_VALUE * m as u128 * (width + own);
+            let bank = BYTES_PER_VALUE * m as u128 * (width + output_integrals);
             largest = bank.max(largest);
             // Add the target.
             self.bytes += bank + BYTES_PER_VALUE * m as u128;
             if refined {
                 let spectrum = (size_of::<Bin>() * (fast_length(2 * m) / 2 + 1)) as u128;
-                self.bytes += spectrum * (width + own + 1);
+                self.bytes += spectrum * (width + output_integrals + 1);
                 // The dual bound uses D e = w with denominator D, output error e and equation error w. It requires
                 // integrals of the measured output, which need another bank.
                 if bounded && options.criterion == Criterion::OutputError {
@@ -242,7 +242,7 @@ impl Budget {
                 // Products of real and imaginary parts with every column and the target are stored twice while they are
                 // regrouped. Further memory is for four numbers per output column and for the vectors.
                 let vectors = vectors as u128;
-                self.bytes += BYTES_PER_VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
+                self.bytes += BYTES_PER_VALUE * vectors * (4 * (width + 1) + 4 * output_integrals + 2 * m as u128);
             }
         }
         // Inner products of all columns and the target: per record for the initial terms, summed over records, and
@@ -267,8 +267,8 @@ impl Budget {
         if self.bytes <= limit {
             return Ok(());
         }
-        let layout = if self.join_bytes > 0 { " and the layout of the order law" } else { "" };
-        let what = format!("{} regressors of all runs, their products and test vectors{layout}", self.columns);
+        let join = if self.join_bytes > 0 { " and the join of coupled equations" } else { "" };
+        let what = format!("{} regressors of all runs, their products and test vectors{join}", self.columns);
         Err(Error::Memory { what, bytes: self.bytes, limit })
     }
 }

@@ -187,9 +187,9 @@ impl TopRows {
         self.rows.get(position).is_some_and(|r| r.index == row.index)
     }
 
-    /// Lower the limit to the score of the worst row if pruning is enabled (`stopping`) and the table is full.
-    pub(crate) fn lower_limit(&mut self, stopping: bool) {
-        if stopping && self.rows.len() == self.top {
+    /// Lower the limit to the score of the worst row if `prunes` is true and the table is full.
+    pub(crate) fn lower_limit(&mut self, prunes: bool) {
+        if prunes && self.rows.len() == self.top {
             self.limit = self.limit.min(self.rows[self.top - 1].score);
         }
     }

@@ -258,15 +258,15 @@ pub fn status(status: output_error::Status) -> &'static str {
     }
 }
 
-/// Return true if s^alpha minus the terms c s^order of (c, order) in `own_terms` has a zero in the closed right
+/// Return true if s^alpha minus the terms c s^order of (c, order) in `output_terms` has a zero in the closed right
 /// half-plane.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
+pub fn has_unstable_pole(py: Python<'_>, alpha: f64, output_terms: List<(f64, f64)>) -> PyResult<bool> {
     run_detached(py, || {
         check_finite("alpha", &[alpha])?;
-        own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
-        Ok(output_error::stability::is_unstable(alpha, &own_terms))
+        output_terms.iter().try_for_each(|&(c, order)| check_finite("output terms", &[c, order]))?;
+        Ok(output_error::stability::is_unstable(alpha, &output_terms))
     })
 }
 

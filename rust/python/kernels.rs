@@ -72,7 +72,7 @@ impl Batch {
     }
 }
 
-/// Number of rows interpolation two checks for a stop request.
+/// Number of rows between two checks for a stop request.
 const MAX_BLOCK_ROWS: usize = 64;
 
 /// Return the kernels of fractional integrals of several orders as rows of `m` values. With `derivative`, return their

@@ -106,8 +106,8 @@ pub fn trace_errors<'py>(
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn nyquist_margin(py: Python<'_>, own_terms: List<(f64, f64)>, step: f64) -> PyResult<f64> {
-    run_detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
+pub fn nyquist_margin(py: Python<'_>, output_terms: List<(f64, f64)>, step: f64) -> PyResult<f64> {
+    run_detached(py, || Ok(simulate::nyquist_margin(&output_terms, step)))
 }
 
 #[pyfunction]

@@ -13,7 +13,7 @@ pub enum Role {
     Input(Intersample),
     /// Output, linear between samples.
     Output,
-    /// Signal computed from other signals and held between samples. Its values at single times are not known.
+    /// Signal computed from other signals, with a zero-order hold. Its values at single times are not known.
     Derived,
 }
 

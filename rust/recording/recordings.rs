@@ -109,7 +109,7 @@ impl Recordings {
         self.runs.iter().map(|run| run.experiment(sampling)).collect()
     }
 
-    /// Return the behavior of each input between samples: a hold if the input is held in any run. None for other
+    /// Return the behavior of each input between samples: a zero-order hold if it has one in any run. None for other
     /// signals.
     ///
     /// ```

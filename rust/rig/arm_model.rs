@@ -364,7 +364,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
                     let what = format!("an equation of the arm contains a current with derivative order {order}");
                     return Err(Error::Structure {
                         what,
-                        remedy: "use order 0 for currents, which are held between samples".into(),
+                        remedy: "use order 0 for currents, which have a zero-order hold".into(),
                     });
                 }
                 input[row][signal - 4] += c;

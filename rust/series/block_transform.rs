@@ -26,7 +26,7 @@ struct Factors {
     shift: Square,
     /// Conjugates of `shift` divided by 64.
     inverse_shift: Square,
-    /// Twiddle factors e^{2πi jk/64} twiddles the two passes.
+    /// Twiddle factors e^{2πi jk/64} between the two passes.
     twiddles: Square,
 }
 

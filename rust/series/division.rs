@@ -43,7 +43,7 @@ fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_T
     }
 }
 
-/// Do the work of [`subtract_product`] for L terms, whose sums stay in processor registers.
+/// Subtract a product from L remaining terms as in [`subtract_product`], with the sums in processor registers.
 #[inline(always)]
 fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut sums = [0.0; L];
@@ -372,7 +372,7 @@ impl Division {
         self.subtract_contributions(&series);
     }
 
-    /// Do the first half of [`Division::advance`]: solve the next block of the quotients by forward substitution.
+    /// Compute the next block of the quotients by forward substitution, the first step of [`Division::advance`].
     pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let lo = self.solved_count;
         let hi = (lo + BLOCK_TERMS).min(self.m);
@@ -380,7 +380,7 @@ impl Division {
         self.solved_count = hi;
     }
 
-    /// Do the second half of [`Division::advance`]: subtract the contributions of solved blocks from later terms.
+    /// Subtract the contributions of solved blocks from later terms, the second step of [`Division::advance`].
     pub fn subtract_contributions<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let (n, hi) = (self.n, self.solved_count);
         if hi == self.m {

@@ -1,8 +1,8 @@
 //! Block-pulse coefficients: means of samples over pulses, delays, and interpolation back to nonuniform sample times.
 //!
-//! Row j of a record is the sample at t = jh, where h is the sampling interval. An input command is held over [jh,
-//! (j+1)h). A measured signal is linear between its samples. Estimates from samples in place of pulse means would be
-//! biased.
+//! Sample j of a signal belongs to the time t = jh, where h is the sampling interval. An input command has a zero-order
+//! hold: it is constant over [jh, (j+1)h). A measured signal is linear between its samples. Estimates from samples in
+//! place of pulse means would be biased.
 //!
 //! Four pulse means around a sample time determine the value of a smooth signal with fourth-order accuracy. This value
 //! is the slope of the quartic polynomial through the integral of the signal at the five pulse edges. After a jump of a
@@ -15,13 +15,13 @@ use crate::error::{check_finite, check_points, Error, Result};
 /// Inter-sample behavior of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Intersample {
-    /// Zero-order hold, for commands: row j is held until row j + 1.
+    /// Zero-order hold, for commands: constant from each sample to the next.
     Hold,
-    /// First-order hold, for measured signals: linear between rows.
+    /// First-order hold, for measured signals: linear between samples.
     Linear,
 }
 
-/// Means of one signal over equal pulses. The type keeps them apart from samples, so that conversions are explicit.
+/// Means of one signal over equal pulses. The type distinguishes them from samples, so that conversions are explicit.
 ///
 /// ```compile_fail,E0308
 /// use ftlm::regressors::Record;
@@ -167,8 +167,8 @@ fn slice_integral(samples: &[f64], intersample: Intersample, j: usize, a: f64, b
 
 /// Delay samples u_j by `delay` = d + φ steps, with an integer d and 0 ≤ φ < 1: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
 ///
-/// The result gives exact means of a held command after this delay. `before` is the value before the record. With a
-/// negative delay, the last sample is repeated at the end of the record.
+/// For a zero-order-hold input, the result contains the exact means after this delay. `before` is the value before the
+/// record. With a negative delay, the last sample is repeated at the end of the record.
 ///
 /// # Errors
 /// [`Error::NotFinite`] for a delay, a sample or a value `before` that is not finite.
@@ -227,7 +227,7 @@ const STENCIL_PULSES: usize = 4;
 /// error decreases with the square of the step, like all other errors of the scheme.
 const KINK_RANGE_PULSES: f64 = 16.0;
 
-/// Jump of a held signal near a sample time. All lengths are in pulses.
+/// Jump of a zero-order-hold signal near a sample time. All lengths are in pulses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct NearbyJump {
     /// Time from the jump to the sample; negative for a jump after the sample.
@@ -247,7 +247,7 @@ pub struct SampleInterpolation {
     positions: Vec<f64>,
 }
 
-/// Jumps of one held signal near each sample time.
+/// Jumps of one zero-order-hold signal near each sample time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jumps {
     starts: Vec<usize>,
@@ -319,8 +319,8 @@ impl SampleInterpolation {
         self.first.iter().zip(&self.weights).map(value).collect()
     }
 
-    /// Return the jumps of a held signal near each sample time. `positions` holds the ascending positions of the jumps
-    /// in pulses, and `sizes` their sizes.
+    /// Return the jumps of a zero-order-hold signal near each sample time. `positions` holds the ascending positions of
+    /// the jumps in pulses, and `sizes` their sizes.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
     pub fn jumps(&self, positions: &[f64], sizes: &[f64]) -> Jumps {

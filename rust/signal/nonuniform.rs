@@ -1,7 +1,7 @@
 //! Signals at nonuniform sample times: values between samples, jumps of a zero-order hold, exact block-pulse means.
 //!
-//! A held signal keeps its value until the next sample. All other signals are linear between samples. Sample times
-//! ascend from 0.
+//! A signal with a zero-order hold is constant from each sample to the next. All other signals are linear between
+//! samples. Sample times ascend from 0.
 
 use std::borrow::Cow;
 
@@ -39,7 +39,7 @@ impl<'a> NonuniformSignal<'a> {
     }
 
     /// Return the signal after a delay \[s\]. `before` is the value before its first sample. With a negative delay, the
-    /// last value is held at the end.
+    /// last value is repeated at the end.
     #[must_use]
     pub fn with_delay(self, delay: f64, before: f64) -> Self {
         if delay == 0.0 {
@@ -67,8 +67,8 @@ impl<'a> NonuniformSignal<'a> {
     ///
     /// ```
     /// # use ftlm::signal::{block_pulse::Intersample, nonuniform::NonuniformSignal};
-    /// let held = NonuniformSignal::new(&[0.0, 0.5, 1.25], &[1.0, 3.0, 0.0], Intersample::Hold)?;
-    /// assert_eq!(held.means(2, 1.0)?.values(), [2.0, 0.75]);
+    /// let input = NonuniformSignal::new(&[0.0, 0.5, 1.25], &[1.0, 3.0, 0.0], Intersample::Hold)?;
+    /// assert_eq!(input.means(2, 1.0)?.values(), [2.0, 0.75]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     #[allow(clippy::cast_precision_loss)]

@@ -115,8 +115,8 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     }
 }
 
-/// Return the autocovariances of series at lags 0 to `max_lag`, and the number of sample pairs at each lag. O(most · N)
-/// for N samples.
+/// Return the autocovariances of series at lags 0 to `max_lag`, and the number of sample pairs at each lag. O(max_lag ·
+/// N) for N samples.
 ///
 /// NaN counts as a missing sample. Each series is centered on its own mean, and the results are pooled.
 #[must_use]

@@ -407,7 +407,7 @@ def test_more_points_than_memory_holds_are_refused():
 
 def test_an_order_that_is_no_number_does_not_turn_for_ever():
     for terms in ([(1.679, 1.526), (-1.0, np.inf)], [(np.nan, 0.5)]):
-        with pytest.raises(ftlm.DataError, match="own terms"):
+        with pytest.raises(ftlm.DataError, match="output terms"):
             _core.has_unstable_pole(1.135, terms)
 
 

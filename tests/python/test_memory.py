@@ -165,18 +165,18 @@ def test_a_layout_and_the_banks_of_all_its_equations_count_together(monkeypatch,
     run = plant("A").simulate(drive("A", samples=201), tolerance=1e-5)
     options = {"coefficients": "least-squares"}
     monkeypatch.setenv(MEMORY_VARIABLE, "1")
-    with pytest.raises(ModelError, match="rows of the layout of the order law need") as refused:
+    with pytest.raises(ModelError, match="rows of the join of coupled equations need") as refused:
         search(LAW, [run], **options)
     layout = int(re.search(r"need (\d+) bytes", str(refused.value))[1])
     monkeypatch.setenv(MEMORY_VARIABLE, str(layout))
     search(LAW, [run], **options)
     with pytest.raises(ModelError) as refused:
         search(LAW, [run] * 300, **options)
-    assert "and the layout of the order law need" in str(refused.value)
+    assert "and the join of coupled equations need" in str(refused.value)
     both = int(REFUSED.search(str(refused.value))[2])
     assert both > layout
     monkeypatch.setenv(MEMORY_VARIABLE, str(layout - 1))
-    with pytest.raises(ModelError, match=f"rows of the layout of the order law need {layout} bytes"):
+    with pytest.raises(ModelError, match=f"rows of the join of coupled equations need {layout} bytes"):
         search(LAW, [run], **options)
 
 

@@ -103,7 +103,7 @@ fn a_limit_that_is_no_number_and_coefficients_beyond_all_prove_nothing() {
     let other = equation(0, 1.5, &[(0, 0.4, 1.0), (1, 0.0, 1.0)]);
     let one = equation(0, 1.5, &[(0, 0.5, 1.0), (1, 0.0, 1.0)]);
     let error = excluded_by_linearized_vector(&record, &one, &other, Norm::L1, 1.0).unwrap_err();
-    assert!(error.to_string().contains("own terms"), "{error}");
+    assert!(error.to_string().contains("output terms"), "{error}");
 }
 
 #[test]

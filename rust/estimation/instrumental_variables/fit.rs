@@ -83,8 +83,8 @@ pub struct InstrumentalFit {
 /// let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
 /// let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
 /// let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();
-/// let driven = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; 400], input.clone()]), None)?;
-/// let output = simulate::respond(std::slice::from_ref(&plant), &driven, &[])?.remove(0);
+/// let excitation = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; 400], input.clone()]), None)?;
+/// let output = simulate::respond(std::slice::from_ref(&plant), &excitation, &[])?.remove(0);
 /// let measured = Record::new(0.02, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let run = iv::with_projections(measured, &[false, true], true, &Stop::default())?;
 /// let structures = [plant.structure.clone()];

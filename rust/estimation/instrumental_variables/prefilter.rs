@@ -171,7 +171,7 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &S
 /// Project a measured signal on the space of responses to the inputs, which removes most of its noise.
 ///
 /// The basis contains the first two integrals of each input and the responses of resonators to them, eight per decade.
-/// A basis of k directions passes the fraction k/m of the noise power in m samples, whatever the dynamics are. Unless
+/// A basis of k directions passes the fraction k/m of the noise power in m samples, for any dynamics. Unless
 /// `at_rest` is true, the basis also contains an offset and a ramp in time.
 ///
 /// # Errors

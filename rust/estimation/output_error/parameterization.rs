@@ -426,7 +426,8 @@ impl InputLaw {
 
     /// Return the jumps of a zero-order hold within pulses after the nonlinearity, each with its derivatives.
     ///
-    /// The second of each pair contains the derivatives of `fraction`, `before` and `after` by the parameter.
+    /// The second of each pair contains the derivatives of `fraction`, `before` and `after` with respect to the
+    /// parameter.
     /// Saturation and dead zone act on both values of each of `jumps`. A delay ignores `jumps`: the input is assumed to
     /// jump at pulse edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
     ///

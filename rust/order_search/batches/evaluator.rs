@@ -112,10 +112,10 @@ impl<'a> BatchEvaluator<'a> {
             return Ok(Self { candidate_index, boxes: None, limit: f64::INFINITY });
         }
         let uses_boxes = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&candidate_index);
-        let may_use_close_bounds = uses_close_bounds(count, options);
-        let InitialIncumbent { mut top_rows, mut evaluated, needs_close_bounds, selected_vectors: selected } =
+        let may_use_expensive_bounds = uses_expensive_bounds(count, options);
+        let InitialIncumbent { mut top_rows, mut evaluated, needs_expensive_bounds, selected_vectors: selected } =
             BatchEvaluation::new(&candidate_index, None, pool, control)
-                .find_incumbent(uses_boxes, may_use_close_bounds)?;
+                .find_incumbent(uses_boxes, may_use_expensive_bounds)?;
         if let Some(selected) = selected {
             let problem = &mut candidate_index.problem;
             problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&selected));
@@ -149,7 +149,7 @@ impl<'a> BatchEvaluator<'a> {
             }
         }
         let limit = top_rows.limit;
-        if needs_close_bounds {
+        if needs_expensive_bounds {
             let spare_bytes = candidate_index.spare_bytes;
             candidate_index.spare_bytes -= pool.install(|| candidate_index.problem.add_unstable_zeros(spare_bytes));
             let linearized_vectors =
@@ -164,7 +164,7 @@ impl<'a> BatchEvaluator<'a> {
         control.check_stop()?;
         // Boxes and tailored test vectors may fail to exclude the candidates of the initial sample that are still to be
         // simulated.
-        if needs_close_bounds
+        if needs_expensive_bounds
             && boxes.is_some()
             && !BatchEvaluation::new(&candidate_index, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
         {
@@ -332,7 +332,7 @@ pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
 /// Return true if a search over `candidates` candidates may use the expensive bounds (unstable zeros and linearized
 /// test vectors).
-pub(super) fn uses_close_bounds(candidates: u64, options: &Options) -> bool {
+pub(super) fn uses_expensive_bounds(candidates: u64, options: &Options) -> bool {
     candidates >= MIN_CLOSE_BOUND_CANDIDATES && options.ranks_by_simulation()
 }
 

@@ -39,7 +39,7 @@ pub(super) struct InitialIncumbent {
     pub(super) evaluated: HashSet<u64>,
     /// True if the bounds exclude so few candidates of the sample that the expensive bounds (unstable zeros and
     /// linearized test vectors) save time.
-    pub(super) needs_close_bounds: bool,
+    pub(super) needs_expensive_bounds: bool,
     /// Indices of the selected test vectors, the best first. `None` if all are used.
     pub(super) selected_vectors: Option<Vec<usize>>,
 }
@@ -48,12 +48,12 @@ impl BatchEvaluation<'_> {
     /// Find an initial incumbent, and select the test vectors of the lower bounds that save time.
     ///
     /// If `searches_neighbors` is true, the neighbors of the best candidates are also evaluated. If
-    /// `may_use_close_bounds` is true, also decide whether the expensive bounds (by unstable zeros and by linearized
-    /// test vectors) save time.
+    /// `may_use_expensive_bounds` is true, also decide whether the expensive bounds (by unstable zeros and by
+    /// linearized test vectors) save time.
     pub(super) fn find_incumbent(
         &mut self,
         searches_neighbors: bool,
-        may_use_close_bounds: bool,
+        may_use_expensive_bounds: bool,
     ) -> Result<InitialIncumbent> {
         let candidate_index = self.candidate_index;
         let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
@@ -106,22 +106,22 @@ impl BatchEvaluation<'_> {
         let mut top_rows = TopRows::new(top, f64::INFINITY);
         self.simulate_open(&best_candidates, &mut top_rows, BatchPosition::start(0), false)?;
         let mut evaluated: HashSet<u64> = best_candidates.iter().map(|open| open.index).collect();
-        let leaves_many_open = |limit: f64| {
+        let has_many_open = |limit: f64| {
             let open_count = candidates
                 .iter()
                 .filter(|(_, vector_bounds)| !vector_bounds.iter().any(|bound| *bound > limit))
                 .count();
             open_count * HARD_SEARCH_OPEN_RATIO >= candidates.len()
         };
-        let mut needs_close_bounds = false;
+        let mut needs_expensive_bounds = false;
         if searches_neighbors {
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            needs_close_bounds = may_use_close_bounds && leaves_many_open(top_rows.limit);
-        } else if may_use_close_bounds && top_rows.rows.first().is_some_and(|best| leaves_many_open(best.score)) {
+            needs_expensive_bounds = may_use_expensive_bounds && has_many_open(top_rows.limit);
+        } else if may_use_expensive_bounds && top_rows.rows.first().is_some_and(|best| has_many_open(best.score)) {
             // In a small sample the best score is near the final limit. The score of the worst row of the table is far
             // above it.
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
-            needs_close_bounds = leaves_many_open(top_rows.limit);
+            needs_expensive_bounds = has_many_open(top_rows.limit);
         }
         let limit = top_rows.limit;
         // Without initial coefficients, all test vectors are used.
@@ -129,7 +129,7 @@ impl BatchEvaluation<'_> {
             let vector_bounds: Vec<Vec<f64>> = candidates.into_iter().map(|(_, vector_bounds)| vector_bounds).collect();
             select_test_vectors(&vector_bounds, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
-        Ok(InitialIncumbent { top_rows, evaluated, needs_close_bounds, selected_vectors })
+        Ok(InitialIncumbent { top_rows, evaluated, needs_expensive_bounds, selected_vectors })
     }
 }
 

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::order_search::batches::batch::BatchEvaluation;
 use crate::order_search::candidate::problem::SolvedCandidate;
-use crate::order_search::dual_bound::linearized_vectors::{LinearizedVector, LinearizedVectors, MAX_OWN_TERMS};
+use crate::order_search::dual_bound::linearized_vectors::{LinearizedVector, LinearizedVectors, MAX_OUTPUT_TERMS};
 use crate::order_search::dual_bound::tailored_vectors::TailoredVector;
 use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
@@ -101,10 +101,10 @@ impl BatchEvaluation<'_> {
         let (grid, problem) = (&*candidate_index.grid, &candidate_index.problem);
         let (mut trial_vectors, bytes) = problem.empty_tailored_vectors();
         let vector_count = problem.tailored_vectors.as_ref().map_or(0, |tailored| tailored.vectors.len() as u64);
-        let room =
+        let max_count =
             candidate_index.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(vector_count * bytes)) / bytes.max(1);
-        let room = usize::try_from(room).unwrap_or(MAX_TRIAL_VECTORS).min(MAX_TRIAL_VECTORS);
-        if room == 0 {
+        let max_count = usize::try_from(max_count).unwrap_or(MAX_TRIAL_VECTORS).min(MAX_TRIAL_VECTORS);
+        if max_count == 0 {
             return Ok(GeneratedVectors::default());
         }
         let (open, weight) = self.sample_open(limit, pass)?;
@@ -119,8 +119,8 @@ impl BatchEvaluation<'_> {
             candidate_index.positions(&Cursor::at(grid, index), &mut positions);
             positions
         };
-        let sample = subsample(&open, room);
-        let indices = best.into_iter().chain(sample.iter().map(|open| open.index)).take(room);
+        let sample = subsample(&open, max_count);
+        let indices = best.into_iter().chain(sample.iter().map(|open| open.index)).take(max_count);
         let candidate_columns: Vec<Vec<usize>> = open.iter().map(|open| columns(open.index)).collect();
         let mut exclusions: Vec<(TailoredVector, Vec<bool>)> = Vec::new();
         for index in indices {
@@ -200,17 +200,18 @@ impl BatchEvaluation<'_> {
         let (open, weight) = self.sample_grid(limit)?;
         let mut groups: BTreeMap<Vec<usize>, Vec<SolvedCandidate>> = BTreeMap::new();
         for (columns, coefficients) in open {
-            groups.entry(linearized_vectors.own_columns(&columns)).or_default().push((columns, coefficients));
+            groups.entry(linearized_vectors.output_columns(&columns)).or_default().push((columns, coefficients));
         }
         #[allow(clippy::cast_precision_loss)]
         groups.retain(|output_columns, open| {
-            (1..=MAX_OWN_TERMS).contains(&output_columns.len())
+            (1..=MAX_OUTPUT_TERMS).contains(&output_columns.len())
                 && open.len() as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS
         });
         let bytes =
             groups.keys().map(|output_columns| linearized_vectors.bytes(output_columns.len())).max().unwrap_or(1);
-        let room = self.candidate_index.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
-        let room = usize::try_from(room).unwrap_or(MAX_LINEARIZED_VECTORS).min(MAX_LINEARIZED_VECTORS);
+        let max_count =
+            self.candidate_index.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
+        let max_count = usize::try_from(max_count).unwrap_or(MAX_LINEARIZED_VECTORS).min(MAX_LINEARIZED_VECTORS);
         let new_vectors: Vec<(Vec<usize>, Vec<LinearizedVector>)> = self.pool.install(|| {
             groups
                 .into_iter()
@@ -221,7 +222,14 @@ impl BatchEvaluation<'_> {
                     let new_vectors = if self.is_stopped() {
                         Vec::new()
                     } else {
-                        self.generate_for_own_columns(&linearized_vectors, &output_columns, open, weight, limit, room)
+                        self.generate_for_output_columns(
+                            &linearized_vectors,
+                            &output_columns,
+                            open,
+                            weight,
+                            limit,
+                            max_count,
+                        )
                     };
                     (output_columns, new_vectors)
                 })
@@ -275,15 +283,15 @@ impl BatchEvaluation<'_> {
     /// Generate linearized test vectors for candidates with the same output columns `output_columns`. The first vector
     /// is built for the candidate at the median of the first output coefficient. The remaining candidates on each side
     /// of the median are then processed in the same way. `weight` is the number of candidates of the grid per sampled
-    /// candidate, `room` the maximum number of vectors.
-    fn generate_for_own_columns(
+    /// candidate, `max_count` the maximum number of vectors.
+    fn generate_for_output_columns(
         &self,
         linearized_vectors: &LinearizedVectors,
         output_columns: &[usize],
         mut open: Vec<SolvedCandidate>,
         weight: f64,
         limit: f64,
-        room: usize,
+        max_count: usize,
     ) -> Vec<LinearizedVector> {
         let problem = &self.candidate_index.problem;
         let first = |candidate: &SolvedCandidate| {
@@ -295,7 +303,7 @@ impl BatchEvaluation<'_> {
         #[allow(clippy::cast_precision_loss)]
         let is_worthwhile = |count: usize| count as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS;
         while let Some(mut part) = parts.pop() {
-            if !is_worthwhile(part.len()) || new_vectors.len() >= room || failure_count >= MAX_FAILED_VECTORS {
+            if !is_worthwhile(part.len()) || new_vectors.len() >= max_count || failure_count >= MAX_FAILED_VECTORS {
                 continue;
             }
             let middle = part.remove(part.len() / 2);

@@ -63,7 +63,7 @@ pub(super) struct RemainingColumns<'a> {
     pub(super) rounding: f64,
     /// Index in `columns` of a column of the output, if there is one. A varying column may also belong to the output.
     /// The coefficients of the two columns may then cancel.
-    pub(super) own_fixed_column: Option<usize>,
+    pub(super) fixed_output_column: Option<usize>,
 }
 
 impl RemainingColumns<'_> {
@@ -80,12 +80,12 @@ impl RemainingColumns<'_> {
     /// of the output column `column`, and g the projection of Fᵀt on t. Fₚ and gₚ are the same quantities of the
     /// fixed-order output column. The bound is 0 if `column` is not an output column or no fixed-order column is one.
     #[inline(always)]
-    fn distance_to_own_fixed_column(&self, record: usize, group: usize, column: usize) -> Wide {
+    fn distance_to_fixed_output_column(&self, record: usize, group: usize, column: usize) -> Wide {
         let test_vectors = &self.test_vectors[record];
         let (mut distance, row) = (ZERO_LANES, test_vectors.rows[column]);
-        if let Some(own_fixed_column) = self.own_fixed_column.filter(|_| row != NO_INDEX) {
+        if let Some(fixed_output_column) = self.fixed_output_column.filter(|_| row != NO_INDEX) {
             let effect = |row: usize| &test_vectors.effects[row * test_vectors.groups + group][3];
-            let (a, b) = (effect(row), effect(test_vectors.rows[self.columns[own_fixed_column]]));
+            let (a, b) = (effect(row), effect(test_vectors.rows[self.columns[fixed_output_column]]));
             for n in 0..LANE_COUNT {
                 distance[n] = (a[n] - b[n]).abs();
             }
@@ -179,19 +179,19 @@ impl AxisTable {
         let mut rests = Vec::with_capacity(n * groups);
         let mut finite_check = ZERO_LANES;
         let mut joint_coefficients = Vec::new();
-        if let Some(own_fixed_column) = remaining.own_fixed_column {
+        if let Some(fixed_output_column) = remaining.fixed_output_column {
             let inverse = normal.inverse();
             let are_output_columns = remaining
                 .test_vectors
                 .first()
                 .is_some_and(|test_vectors| columns.iter().all(|&p| test_vectors.rows[p] != NO_INDEX));
             joint_coefficients.extend(columns.iter().enumerate().map(|(i, &p)| {
-                let own_coefficient = if are_output_columns {
-                    scale[i] * inverse[p] / inverse[remaining.columns[own_fixed_column]]
+                let varying_coefficient = if are_output_columns {
+                    scale[i] * inverse[p] / inverse[remaining.columns[fixed_output_column]]
                 } else {
                     0.0
                 };
-                fixed_coefficients[i * k + own_fixed_column] - own_coefficient
+                fixed_coefficients[i * k + fixed_output_column] - varying_coefficient
             }));
         }
         let fixed_part: Vec<Vec<VectorProducts>> = remaining
@@ -215,7 +215,7 @@ impl AxisTable {
                 for column_products in &mut column_products {
                     column_products.iter_mut().for_each(|v| *v *= scale[i]);
                 }
-                let mut distance = remaining.distance_to_own_fixed_column(r, g, column);
+                let mut distance = remaining.distance_to_fixed_output_column(r, g, column);
                 orthogonal_norm.iter_mut().for_each(|v| *v *= scale[i]);
                 distance.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
                 for values in column_products.iter().chain([&orthogonal_norm, &distance]) {

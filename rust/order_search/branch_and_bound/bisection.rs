@@ -68,7 +68,7 @@ impl BranchAndBound {
             inverse: &[],
             trace: 0.0,
             rounding,
-            own_fixed_column: None,
+            fixed_output_column: None,
         };
         let (norm, ranks_equation_error) = (candidate_index.options.norm, problem.residual_sums.is_some());
         let common = SearchConstants::new(&remaining, norm, ranks_equation_error, problem.size(), weights.sqrt());
@@ -84,13 +84,13 @@ impl BranchAndBound {
         inverse: &'a [f64],
     ) -> Option<RemainingColumns<'a>> {
         let (k, test_vectors) = (columns.len(), test_vectors_of(&candidate_index.problem)?);
-        let own_fixed_column = test_vectors
+        let fixed_output_column = test_vectors
             .first()
             .and_then(|test_vectors| columns.iter().position(|&p| test_vectors.rows[p] != NO_INDEX));
         Some(RemainingColumns {
             normal: candidate_index.problem.box_equations()?,
             test_vectors,
-            own_fixed_column,
+            fixed_output_column,
             columns,
             inverse,
             trace: (0..k).map(|i| inverse[i * k + i]).sum::<f64>().max(1.0),
@@ -413,11 +413,11 @@ mod tests {
         let grain = [0.2, 0.05, 0.01, 0.002][case as usize % 4];
         let some = |from: f64, count: u32| (0..count).map(|i| from + grain * f64::from(i)).collect::<Vec<f64>>();
         let axis = |signal: usize, values: Vec<f64>| TermAxis { signal, values, interchangeable: true };
-        let own = some(0.1 * f64::from(case % 3), 7);
-        let mut axes = vec![axis(0, own.clone()), axis(1, some(0.2, 9))];
+        let output_orders = some(0.1 * f64::from(case % 3), 7);
+        let mut axes = vec![axis(0, output_orders.clone()), axis(1, some(0.2, 9))];
         match case % 5 {
-            0 | 1 => axes.insert(1, axis(0, own)),
-            // No own order varies.
+            0 | 1 => axes.insert(1, axis(0, output_orders)),
+            // The output term has a fixed order.
             2 => axes = vec![axis(0, vec![0.3]), axis(1, some(0.2, 9)), axis(2, some(0.1, 6))],
             _ => axes.push(axis(2, vec![0.4])),
         }

@@ -498,9 +498,9 @@ impl<'a> SliceTables<'a> {
             deviation_bounds[s] = cell.remainder([a, b]) + rounding;
         }
         let (mut sums, mut sum_deviation_bound) = ([0.0; 4], 0.0);
-        if let Some(own_fixed_column) = self.own_fixed_column() {
+        if let Some(fixed_output_column) = self.fixed_output_column() {
             for (c, (i, j)) in corners.into_iter().enumerate() {
-                sums[c] = (self.base_coefficients[own_fixed_column]
+                sums[c] = (self.base_coefficients[fixed_output_column]
                     - ps[c] * u.joint_coefficients[i]
                     - qs[c] * v.joint_coefficients[j])
                     .abs();
@@ -528,8 +528,8 @@ impl<'a> SliceTables<'a> {
     /// Return the index of a fixed-order column of the output if a varying column also belongs to the output. `None`
     /// otherwise. The coefficients of the two columns may cancel.
     #[inline(always)]
-    fn own_fixed_column(&self) -> Option<usize> {
-        self.remaining.own_fixed_column.filter(|_| self.output_side.is_some())
+    fn fixed_output_column(&self) -> Option<usize> {
+        self.remaining.fixed_output_column.filter(|_| self.output_side.is_some())
     }
 
     /// Return the index of the fixed-order output column if a joint bound with the varying output column is tighter for
@@ -542,20 +542,20 @@ impl<'a> SliceTables<'a> {
         moduli: &Moduli,
         group: usize,
     ) -> Option<usize> {
-        let own_fixed_column = self.own_fixed_column()?;
+        let fixed_output_column = self.fixed_output_column()?;
         let (k, groups) = (self.remaining.columns.len(), self.base.len());
         let [u, v] = &self.sides;
         let bu = &u.levels[su.level].nodes[su.position * groups + group].second_differences;
         let bv = &v.levels[sv.level].nodes[sv.position * groups + group].second_differences;
         let output_coefficients = if self.output_side == Some(0) { &cell.ps } else { &cell.qs };
-        let orthogonal_norms = &self.orthogonal_norms[group * k + own_fixed_column];
+        let orthogonal_norms = &self.orthogonal_norms[group * k + fixed_output_column];
         let (mut separate_slack, mut joint_slack) = (0.0, 0.0);
         for n in 0..LANE_COUNT {
-            separate_slack += moduli.fixed_columns[own_fixed_column][0] * orthogonal_norms[n]
+            separate_slack += moduli.fixed_columns[fixed_output_column][0] * orthogonal_norms[n]
                 + output_coefficients[0].abs() * (bu[2][n] + bv[2][n]);
             joint_slack += moduli.sums[0] * orthogonal_norms[n] + output_coefficients[0].abs() * (bu[3][n] + bv[3][n]);
         }
-        (joint_slack < separate_slack).then_some(own_fixed_column)
+        (joint_slack < separate_slack).then_some(fixed_output_column)
     }
 
     /// Compute inner products and denominators of one group of test vectors on one record, at the corners of a box of

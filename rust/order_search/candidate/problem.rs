@@ -233,14 +233,14 @@ impl Problem {
             };
             stop.check()?;
             unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
-            let own_squares: Vec<f64> = (0..width).map(|p| gram[p * (width + 2)]).collect();
-            squares.iter_mut().zip(&own_squares).for_each(|(s, g)| *s += g);
+            let diagonal: Vec<f64> = (0..width).map(|p| gram[p * (width + 2)]).collect();
+            squares.iter_mut().zip(&diagonal).for_each(|(s, g)| *s += g);
             if let Estimator::MultiInnovation(innovation) = options.estimator {
                 apply_innovation_weights(&mut gram, bank, target, innovation)?;
             }
             sum.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if options.initial != Initial::Rest {
-                parts.push(Normal::new(&gram, width, &precisions(&own_squares)));
+                parts.push(Normal::new(&gram, width, &precisions(&diagonal)));
             }
         }
         let weighted = matches!(options.estimator, Estimator::MultiInnovation(_));

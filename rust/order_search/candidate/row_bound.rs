@@ -116,7 +116,7 @@ impl<'a> CommonFactor<'a> {
         }
     }
 
-    /// Do the work of [`Self::append_open`] for `count` common terms.
+    /// Append the indices as [`Self::append_open`] does, with `count` common terms as a constant for the compiler.
     #[inline(always)]
     fn append_open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
         let mut start = 0;

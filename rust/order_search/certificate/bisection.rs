@@ -104,7 +104,7 @@ pub fn certify(
     region.check()?;
     if !(options.tolerance > 0.0 && options.tolerance < 1.0) {
         return Err(Error::OutOfRange {
-            name: "within".into(),
+            name: "tolerance".into(),
             value: options.tolerance,
             range: "(0, 1)".into(),
             remedy: "a tolerance of 0.05 requires a proof that no orders reduce the error by more than 5 %".into(),
@@ -112,7 +112,7 @@ pub fn certify(
     }
     if !(options.max_coefficient >= 1.0 && options.max_coefficient <= 1e9) {
         return Err(Error::OutOfRange {
-            name: "largest".into(),
+            name: "max_coefficient".into(),
             value: options.max_coefficient,
             range: "[1, 1e9]".into(),
             remedy: "a limit of 100 excludes terms that cancel to 1 % of their size".into(),
@@ -139,7 +139,10 @@ impl CellBisection<'_> {
         let mut cells = self.initial_cells()?;
         if cells.is_empty() {
             return Err(Error::EmptyOrderGrid {
-                why: format!("no orders in these intervals are {} below alpha and apart", self.region.min_separation),
+                why: format!(
+                    "no orders in these intervals differ by {} or more from alpha and from each other",
+                    self.region.min_separation
+                ),
             });
         }
         let (mut best, mut best_point) = (f64::INFINITY, Vec::new());

@@ -214,8 +214,8 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
 /// Return two lower bounds of Σε² over a cell (a box of orders), 0 without a proof. ε is the equation error with zero
 /// initial conditions. `terms` lists (signal, midpoint, half width) of the order of integration of each term.
 ///
-/// The first bound holds for any coefficients. The second is optimized to reach `goal`. It holds for coefficients for
-/// which the norms of the terms sum up to at most `largest` times the norm of the output.
+/// The first bound holds for any coefficients. The second is optimized to reach `target_bound`. It holds for
+/// coefficients for which the norms of the terms sum up to at most `max_coefficient` times the norm of the output.
 ///
 /// # Errors
 /// [`Error::Structure`] without records or terms, for too many terms, or for a signal that is missing or zero.
@@ -228,7 +228,7 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
-/// // y is the integral of order 0.8 of u: that order leaves nothing, orders near 0.5 leave something.
+/// // y is the integral of order 0.8 of u: the residual is 0 at this order, and positive near order 0.5.
 /// let proved = |middle: f64| cell_bounds(&[record.clone()], 0, &[(1, middle, 0.01)], (10.0, 1.0));
 /// assert!(proved(0.8)? == (0.0, 0.0) && proved(0.5)?.0 > 0.0 && proved(0.5)?.1 > 0.0);
 /// # Ok::<(), ftlm::error::Error>(())
@@ -237,7 +237,7 @@ pub fn cell_bounds(
     records: &[Record],
     output: usize,
     terms: &[(usize, f64, f64)],
-    (largest, goal): (f64, f64),
+    (max_coefficient, target_bound): (f64, f64),
 ) -> Result<(f64, f64)> {
     check_records(records, output, terms.iter().map(|t| t.0))?;
     for &(_, middle, half) in terms {
@@ -245,13 +245,13 @@ pub fn cell_bounds(
             return Err(Error::OutOfRange {
                 name: "half width".into(),
                 value: half,
-                range: format!("[0, {middle}], the middle of the orders"),
+                range: format!("[0, {middle}], the midpoint of the interval of orders"),
                 remedy: "give nonnegative orders of integration".into(),
             });
         }
     }
     let (local, span, square) = expand_cell(records, output, terms, &Stop::default())?;
-    Ok((local.bound().lower_bound * square, span.bound(largest, goal / square) * square))
+    Ok((local.bound().lower_bound * square, span.bound(max_coefficient, target_bound / square) * square))
 }
 
 /// Compute the inner products and the subspace of a cell (box of orders). `terms` lists (signal, midpoint, half width)

@@ -194,13 +194,13 @@ impl RegressorExpansion {
         }
         let inverse = 1.0 / size;
         columns.iter_mut().flatten().for_each(|v| *v *= inverse);
-        let mut left_out = rest.sqrt() * half.powi(4) / FACTORIAL_TABLE[4];
+        let mut remainder = rest.sqrt() * half.powi(4) / FACTORIAL_TABLE[4];
         for j in 0..EXPANSION_COLUMNS {
-            left_out += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL_TABLE[j];
+            remainder += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL_TABLE[j];
         }
         let rounding_factor = 1.0 + rounding_unit(columns[0].len());
         let sizes = std::array::from_fn(|j| dot(&columns[j], &columns[j]).sqrt() * rounding_factor);
-        Ok(Self { columns, sizes, remainder: left_out * inverse * rounding_factor })
+        Ok(Self { columns, sizes, remainder: remainder * inverse * rounding_factor })
     }
 }
 

@@ -11,7 +11,7 @@ use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPAN
 const SPANNED_DERIVATIVES: usize = 3;
 /// Maximum number of columns of a [`DerivativeSubspace`].
 const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
-/// Ridge parameter times the largest admissible sum of squared coefficients, relative to the goal of the bound. The
+/// Ridge parameter times the largest admissible sum of squared coefficients, relative to the target of the bound. The
 /// ridge limits the coefficients of nearly dependent columns.
 const RIDGE_TARGET_FRACTION: f64 = 0.05;
 /// Minimum ridge parameter of [`DerivativeSubspace::bound`].
@@ -90,13 +90,13 @@ impl DerivativeSubspace {
     }
 
     /// Return a lower bound of the squared residual over the cell (box of orders), relative to the squared norm of the
-    /// output y, 0 without a proof. It holds for all coefficients c with Σ‖c x‖ ≤ `largest`·‖y‖ over the columns x. The
-    /// ridge parameter is tuned to reach the bound `target_bound`.
-    pub(super) fn bound(&self, largest: f64, target_bound: f64) -> f64 {
+    /// output y, 0 without a proof. It holds for all coefficients c with Σ‖c x‖ ≤ `max_coefficient`·‖y‖ over the
+    /// columns x. The ridge parameter is tuned to reach the bound `target_bound`.
+    pub(super) fn bound(&self, max_coefficient: f64, target_bound: f64) -> f64 {
         if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || target_bound.is_nan() {
             return 0.0;
         }
-        let (n, all) = (self.count, largest / self.min_column_norm);
+        let (n, all) = (self.count, max_coefficient / self.min_column_norm);
         let powers = f64::from(u8::try_from(SPANNED_DERIVATIVES).unwrap_or(u8::MAX));
         let added = (RIDGE_TARGET_FRACTION * target_bound / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
         let coefficients = self.ridge_solution(added);

@@ -20,7 +20,7 @@ use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
 use crate::simd;
 
 /// Maximum number of output terms of a candidate with linearized test vectors.
-pub(crate) const MAX_OWN_TERMS: usize = 4;
+pub(crate) const MAX_OUTPUT_TERMS: usize = 4;
 /// Maximum ratio of the error to the limit on the samples that a test vector covers. For a candidate with a larger
 /// error, the vector covers only the first samples. The error on these samples is a lower bound of the error on all
 /// samples.
@@ -74,16 +74,16 @@ pub fn excluded_by_linearized_vector(
     let bank = Bank::new(&index, record, equation.structure.output)?;
     let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
     let mut linearized_vectors = LinearizedVectors::new(&banks, &targets, norm);
-    let output_columns = linearized_vectors.own_columns(&positions[0]);
-    if output_columns != linearized_vectors.own_columns(&positions[1])
+    let output_columns = linearized_vectors.output_columns(&positions[0]);
+    if output_columns != linearized_vectors.output_columns(&positions[1])
         || output_columns.is_empty()
-        || output_columns.len() > MAX_OWN_TERMS
+        || output_columns.len() > MAX_OUTPUT_TERMS
     {
         return Err(Error::OutOfRange {
-            name: "own terms".into(),
+            name: "output terms".into(),
             value: 0.0,
-            range: format!("1 to {MAX_OWN_TERMS} terms of the output, of the same orders in both equations"),
-            remedy: "give both equations these".into(),
+            range: format!("1 to {MAX_OUTPUT_TERMS} terms of the output, of the same orders in both equations"),
+            remedy: "give both equations such terms".into(),
         });
     }
     let vector = linearized_vectors.fit((&banks, &targets), &positions[0], &vector_equation.coefficients, limit);
@@ -142,10 +142,10 @@ pub(crate) struct LinearizedVectors {
 #[derive(Default)]
 pub(crate) struct VectorLookup {
     /// Regressor columns of the most recent candidate that are integrals of the output.
-    own: Vec<usize>,
+    output_columns: Vec<usize>,
     /// Regressor columns of the current candidate that are integrals of the output.
-    next_own: Vec<usize>,
-    /// Range of the vectors for the output columns `own`: first vector, and vector after the last one.
+    next_output_columns: Vec<usize>,
+    /// Range of the vectors for `output_columns`: first vector, and vector after the last one.
     range: (usize, usize),
     /// Index, within this range, of the vector that excluded the most recent candidate.
     last_vector: usize,
@@ -177,7 +177,7 @@ impl LinearizedVectors {
     }
 
     /// Return those columns of a candidate that are integrals of the output.
-    pub(crate) fn own_columns(&self, terms: &[usize]) -> Vec<usize> {
+    pub(crate) fn output_columns(&self, terms: &[usize]) -> Vec<usize> {
         terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX).collect()
     }
 
@@ -350,12 +350,12 @@ impl LinearizedVectors {
         limit: f64,
         lookup: &mut VectorLookup,
     ) -> bool {
-        let VectorLookup { own, next_own: next, range, last_vector: last } = lookup;
-        next.clear();
-        next.extend(terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX));
-        if next != own {
-            std::mem::swap(next, own);
-            *range = self.ranges.get(&own[..]).copied().unwrap_or((0, 0));
+        let VectorLookup { output_columns, next_output_columns, range, last_vector: last } = lookup;
+        next_output_columns.clear();
+        next_output_columns.extend(terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX));
+        if next_output_columns != output_columns {
+            std::mem::swap(next_output_columns, output_columns);
+            *range = self.ranges.get(&output_columns[..]).copied().unwrap_or((0, 0));
         }
         let count = range.1 - range.0;
         for attempt in 0..count {
@@ -381,7 +381,7 @@ impl LinearizedVectors {
         let (rounding_bounds, k) = (&self.rounding_bounds, linearized.center.len());
         let limit = rounding_bounds.norm_threshold(limit);
         let (mut rounding, mut length) = (rounding_bounds.target_rounding, 0.0);
-        let (mut output_coefficients, mut filled) = ([0.0; MAX_OWN_TERMS], 0);
+        let (mut output_coefficients, mut filled) = ([0.0; MAX_OUTPUT_TERMS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             rounding += c.abs() * rounding_bounds.rounding[p];
             length += c.abs() * rounding_bounds.kernel_norms[p];
@@ -391,7 +391,7 @@ impl LinearizedVectors {
             }
         }
         // Coordinates of the coefficient differences in the basis of the G_m.
-        let mut x = [0.0; MAX_OWN_TERMS];
+        let mut x = [0.0; MAX_OUTPUT_TERMS];
         for i in 0..k {
             let deviation = output_coefficients[i] - linearized.center[i];
             x[i] += deviation;

@@ -37,7 +37,7 @@ use crate::simd::LANE_COUNT;
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|.
+/// // y is the integral of order 0.8 of u. With c = 2 instead of 1, the output error is Σ|y|.
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
 /// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
 /// let proved = |c: f64| Ok::<_, ftlm::error::Error>(
@@ -72,7 +72,7 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// // y is the integral of order 0.8 of u: free coefficients fit it, a fixed one twice as large does not.
+/// // y is the integral of order 0.8 of u: a free coefficient fits it, a fixed coefficient of 2 does not.
 /// assert!(!is_infeasible(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
 /// assert!(is_infeasible(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
 /// # Ok::<(), ftlm::error::Error>(())
@@ -108,7 +108,7 @@ pub fn is_infeasible(
 /// # let output = Record::new(0.1, PulseMeans::from_signals(vec![input.clone()]), None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![output, input]), None)?;
 /// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
-/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|, three times by 2Σ|y|.
+/// // y is the integral of order 0.8 of u. With c = 2 the output error is Σ|y|, with c = 3 it is 2Σ|y|.
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
 /// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
 /// let proved = |limit: f64| excluded_by(&record, &equation(2.0), &equation(3.0), Norm::L1, limit);

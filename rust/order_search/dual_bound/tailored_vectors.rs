@@ -22,7 +22,7 @@ const NORM_CHECK_SAMPLES: usize = 8 * LANE_COUNT;
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
 /// Maximum number of output terms of a candidate for which norms are cached.
-const MAX_CACHED_OWN_TERMS: usize = 2;
+const MAX_CACHED_OUTPUT_TERMS: usize = 2;
 /// Number of entries of the cache of norms of one thread.
 const NORM_CACHE_ENTRIES: usize = 256;
 
@@ -49,23 +49,23 @@ struct CachedNorm {
     /// Index of the test vector.
     vector: usize,
     /// Output columns of the candidate (integrals of the output) and their coefficients.
-    own: [Weighted; MAX_CACHED_OWN_TERMS],
+    output_terms: [Weighted; MAX_CACHED_OUTPUT_TERMS],
     /// Dual norm ‖Dᵀt‖ plus its rounding-error bound, with the denominator D of the candidate and the test vector t.
     norm: f64,
-    /// Factor in a₂ = share·a₁ + r. Here a₁ and a₂ are the products Fᵀt of the test vector t with the convolution
-    /// matrices F of the two output columns. The remainder r is orthogonal to a₁.
+    /// Factor p in the decomposition a₂ = p·a₁ + r. Here a₁ and a₂ are the products Fᵀt of the test vector t with the
+    /// convolution matrices F of the two output columns. The remainder r is orthogonal to a₁.
     projection: f64,
-    /// Dual norms of a₁ and a₂ − share·a₁ as defined for `share`, NaN until they are computed.
-    deviation_norms: [f64; MAX_CACHED_OWN_TERMS],
+    /// Dual norms of a₁ and a₂ − p·a₁ as defined for `projection`, NaN until they are computed.
+    deviation_norms: [f64; MAX_CACHED_OUTPUT_TERMS],
     /// Rounding-error bound of the norm per unit change of each coefficient.
-    slack: [f64; MAX_CACHED_OWN_TERMS],
+    slack: [f64; MAX_CACHED_OUTPUT_TERMS],
 }
 
 /// Cache of norms of one thread, reused for all candidates.
 #[derive(Default)]
 pub(crate) struct NormCache {
     /// Output columns of the current candidate (integrals of the output) and their coefficients.
-    own: Vec<Weighted>,
+    output_terms: Vec<Weighted>,
     /// Index of the test vector that excluded the most recent candidate.
     last_vector: usize,
     /// The cached norms for the test vectors, found by the output columns of a candidate. `None` disables the cache.
@@ -91,7 +91,7 @@ impl TailoredVectors {
     /// Return the memory of one test vector for these banks \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         let samples: usize = banks.iter().map(samples).sum();
-        let output_count = banks.first().map_or(0, |bank| own_columns(bank).len());
+        let output_count = banks.first().map_or(0, |bank| output_columns(bank).len());
         8 * (samples.next_multiple_of(NORM_CHECK_SAMPLES) as u64 * (output_count as u64 + 1)
             + banks.first().map_or(0, Bank::len) as u64)
     }
@@ -100,7 +100,7 @@ impl TailoredVectors {
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let mut rows = vec![NO_INDEX; banks.first().map_or(0, Bank::len)];
         if let Some(bank) = banks.first() {
-            own_columns(bank).into_iter().enumerate().for_each(|(row, p)| rows[p] = row);
+            output_columns(bank).into_iter().enumerate().for_each(|(row, p)| rows[p] = row);
         }
         Self { rounding_bounds: RoundingBounds::new(banks, targets, norm), rows, vectors: Vec::new() }
     }
@@ -178,14 +178,14 @@ impl TailoredVectors {
         memory: &mut NormCache,
     ) -> bool {
         let limit = self.rounding_bounds.norm_threshold(limit);
-        let NormCache { own, last_vector: last, norms: cache } = memory;
+        let NormCache { output_terms, last_vector: last, norms: cache } = memory;
         let (mut rounding, mut length) = (self.rounding_bounds.target_rounding, self.max_vector_norm());
-        own.clear();
+        output_terms.clear();
         for (&p, &c) in terms.iter().zip(coefficients) {
             rounding += c.abs() * self.rounding_bounds.rounding[p];
             length += c.abs() * self.rounding_bounds.kernel_norms[p];
             if self.rows[p] != NO_INDEX {
-                own.push((self.rows[p], c));
+                output_terms.push((self.rows[p], c));
             }
         }
         let rounding_error = self.rounding_bounds.unit * length;
@@ -195,14 +195,14 @@ impl TailoredVectors {
                 terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, &c)| sum - c * fitted.products[p]);
             (response.abs() - rounding) / limit - rounding_error
         };
-        let pair: [Weighted; MAX_CACHED_OWN_TERMS] =
-            std::array::from_fn(|n| own.get(n).copied().unwrap_or((NO_INDEX, 0.0)));
+        let pair: [Weighted; MAX_CACHED_OUTPUT_TERMS] =
+            std::array::from_fn(|n| output_terms.get(n).copied().unwrap_or((NO_INDEX, 0.0)));
         let mut cache_index = None;
-        if let (Some(cache), 1..=MAX_CACHED_OWN_TERMS) = (cache, own.len()) {
+        if let (Some(cache), 1..=MAX_CACHED_OUTPUT_TERMS) = (cache, output_terms.len()) {
             cache.resize(NORM_CACHE_ENTRIES, None);
             let entry_index = pair[0].0.wrapping_mul(97).wrapping_add(pair[1].0) % NORM_CACHE_ENTRIES;
             let entry = &mut cache[entry_index];
-            if entry.is_some_and(|entry| entry.own[0].0 != pair[0].0 || entry.own[1].0 != pair[1].0) {
+            if entry.is_some_and(|entry| entry.output_terms[0].0 != pair[0].0 || entry.output_terms[1].0 != pair[1].0) {
                 *entry = None;
             }
             if let Some(entry) = entry {
@@ -218,7 +218,9 @@ impl TailoredVectors {
         }
         for attempt in 0..self.vectors.len() {
             let index = (*last + attempt) % self.vectors.len();
-            let Some(norm) = self.norm_up_to_limit(&self.vectors[index], own, max_norm(index)) else { continue };
+            let Some(norm) = self.norm_up_to_limit(&self.vectors[index], output_terms, max_norm(index)) else {
+                continue;
+            };
             *last = index;
             if let Some(cache_index) = cache_index {
                 let lengths = |n: usize| {
@@ -229,13 +231,13 @@ impl TailoredVectors {
                 };
                 let norm = norm + rounding_error;
                 *cache_index = Some(match *cache_index {
-                    Some(entry) if entry.vector == index => CachedNorm { own: pair, norm, ..entry },
+                    Some(entry) if entry.vector == index => CachedNorm { output_terms: pair, norm, ..entry },
                     _ => CachedNorm {
                         vector: index,
-                        own: pair,
+                        output_terms: pair,
                         norm,
                         projection: 0.0,
-                        deviation_norms: [f64::NAN; MAX_CACHED_OWN_TERMS],
+                        deviation_norms: [f64::NAN; MAX_CACHED_OUTPUT_TERMS],
                         slack: [lengths(0), lengths(1)],
                     },
                 });
@@ -248,8 +250,8 @@ impl TailoredVectors {
     /// Return an upper bound of ‖Dᵀt‖ for a candidate with the same output columns as the cached norm. D is the
     /// denominator of the candidate, and t the test vector of the cached norm.
     #[inline(always)]
-    fn norm_upper_bound(&self, cached: &CachedNorm, output_terms: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
-        let deviations = [output_terms[0].1 - cached.own[0].1, output_terms[1].1 - cached.own[1].1];
+    fn norm_upper_bound(&self, cached: &CachedNorm, output_terms: &[Weighted; MAX_CACHED_OUTPUT_TERMS]) -> f64 {
+        let deviations = [output_terms[0].1 - cached.output_terms[0].1, output_terms[1].1 - cached.output_terms[1].1];
         let [first, second] = cached.deviation_norms;
         let deviation_norm =
             (deviations[0] + cached.projection * deviations[1]).abs() * first + deviations[1].abs() * second;
@@ -263,13 +265,13 @@ impl TailoredVectors {
     fn compute_deviation_norms(&self, cached: &mut CachedNorm) {
         let fitted = &self.vectors[cached.vector];
         let length = fitted.vector.len();
-        let row = |n: usize| match cached.own[n].0 {
+        let row = |n: usize| match cached.output_terms[n].0 {
             NO_INDEX => &[][..],
             row => &fitted.transposed_products[row * length..(row + 1) * length],
         };
         let (first, second) = (row(0), row(1));
         let (square, inner) = (simd::dot(first, first), simd::dot(&first[..second.len()], second));
-        // The bound holds for any share.
+        // The bound holds for any value.
         let projection = if square > 0.0 && (inner / square).abs() < MAX_SAFE_MAGNITUDE { inner / square } else { 0.0 };
         cached.projection = projection;
         cached.deviation_norms =
@@ -277,7 +279,7 @@ impl TailoredVectors {
         cached.slack[1] += projection.abs() * cached.slack[0];
     }
 
-    /// Return the dual norm ‖a − share·b‖ of vectors whose length is a multiple of [`NORM_CHECK_SAMPLES`].
+    /// Return the dual norm ‖a − factor·b‖ of vectors whose length is a multiple of [`NORM_CHECK_SAMPLES`].
     #[inline(always)]
     fn difference_norm(&self, a: &[f64], b: &[f64], factor: f64) -> f64 {
         let mut all = [0.0_f64; LANE_COUNT];
@@ -364,7 +366,7 @@ fn samples(bank: &Bank) -> usize {
 }
 
 /// Return the columns that are integrals of the output.
-fn own_columns(bank: &Bank) -> Vec<usize> {
+fn output_columns(bank: &Bank) -> Vec<usize> {
     (0..bank.len()).filter(|&p| !bank.kernel(p).is_empty()).collect()
 }
 

@@ -75,11 +75,11 @@ fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
         .collect()
 }
 
-/// Write the real and the imaginary part of a test vector to `halves`, one vector each.
+/// Write the real and the imaginary part of a test vector to `parts`, one vector each.
 #[allow(clippy::cast_precision_loss)]
-fn write_vector((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
-    let m = halves[0].len();
-    let [re, im] = halves;
+fn write_vector((window, cycles): Shape, parts: &mut [Vec<f64>; 2]) {
+    let m = parts[0].len();
+    let [re, im] = parts;
     for (k, (re, im)) in re.iter_mut().zip(im).enumerate() {
         let x = (k as f64 + 0.5) / m as f64;
         let (sin, cos) = libm::sincos(-std::f64::consts::TAU * cycles * x);
@@ -94,11 +94,11 @@ pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64
     vector_shapes(count, m)
         .par_iter()
         .map(|&shape| {
-            let mut halves = [0, 1].map(|_| vec![0.0; m]);
+            let mut parts = [0, 1].map(|_| vec![0.0; m]);
             if !stop.is_set() {
-                write_vector(shape, &mut halves);
+                write_vector(shape, &mut parts);
             }
-            halves
+            parts
         })
         .collect()
 }
@@ -107,7 +107,7 @@ pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64
 /// output columns.
 struct Vector {
     /// Real and imaginary part of the test vector.
-    halves: [Vec<f64>; 2],
+    parts: [Vec<f64>; 2],
     /// Index of the test vector.
     number: usize,
     /// Dual norm of the test vector.
@@ -130,7 +130,7 @@ impl Vector {
         let none = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::zeros(m));
         Self {
-            halves: none(),
+            parts: none(),
             number: 0,
             size: 0.0,
             spectra,
@@ -140,9 +140,9 @@ impl Vector {
         }
     }
 
-    /// Compute the spectra of the test vector stored in `halves`. `number` is its index, and `size` its dual norm.
+    /// Compute the spectra of the test vector stored in `parts`. `number` is its index, and `size` its dual norm.
     fn load_spectra(&mut self, number: usize, size: f64, buffers: &mut Buffers) {
-        for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
+        for (spectrum, half) in self.spectra.iter_mut().zip(&self.parts) {
             spectrum.read(half.iter().rev().copied(), buffers);
         }
         (self.number, self.size, self.last_projection) = (number, size, None);
@@ -157,7 +157,7 @@ impl Vector {
         }
         let before = self.last_projection.map(|last| (&self.previous_product, last));
         let [g, h, rest, rounding, step] =
-            column_effect(&self.halves, &self.current_product, before, norm, unit * length);
+            column_effect(&self.parts, &self.current_product, before, norm, unit * length);
         self.last_projection = Some([g, h, rounding]);
         let truncation = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
         [g * self.size, h * self.size, rest + truncation, step]
@@ -208,8 +208,8 @@ pub(super) fn divisor_effects(
                     return;
                 }
                 match &next_vector {
-                    Some(all) => vector.halves.clone_from(&all[i]),
-                    None => write_vector(shapes[start + i], &mut vector.halves),
+                    Some(all) => vector.parts.clone_from(&all[i]),
+                    None => write_vector(shapes[start + i], &mut vector.parts),
                 }
                 vector.load_spectra(start + i, sizes[start + i], buffers);
             },
@@ -332,7 +332,7 @@ pub(crate) struct TestVectors {
 
 /// Maximum number of output columns of a candidate for which their contributions to the denominator are bounded
 /// jointly. With more output columns, each contribution is bounded separately.
-const MAX_JOINT_OWN_COLUMNS: usize = 4;
+const MAX_JOINT_OUTPUT_COLUMNS: usize = 4;
 
 impl TestVectors {
     /// Build `count` test vectors on one record, and compute their products. If `output_error` is false, no column
@@ -360,12 +360,12 @@ impl TestVectors {
         let mut columns: Vec<&[f64]> = (0..bank.len()).map(|p| bank.column(p)).collect();
         columns.push(target);
         let flat: Vec<&[f64]> = vectors.iter().flatten().map(Vec::as_slice).collect();
-        let (inner, halves) = (dense::inner_products(&columns, &flat, stop), flat.len());
+        let (inner, parts) = (dense::inner_products(&columns, &flat, stop), flat.len());
         let gathered = |p: usize| -> Vec<[Wide; 2]> {
             (0..groups)
                 .map(|g| {
                     let part =
-                        |half: usize| std::array::from_fn(|n| inner[p * halves + 2 * (g * LANE_COUNT + n) + half]);
+                        |half: usize| std::array::from_fn(|n| inner[p * parts + 2 * (g * LANE_COUNT + n) + half]);
                     [part(0), part(1)]
                 })
                 .collect()
@@ -460,7 +460,7 @@ impl TestVectors {
         let [mut re, mut im] = self.target[group];
         let mut divisor = self.size[group];
         let (mut divisor_im, mut slack) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
-        let (mut output_terms, mut count) = ([(0, 0.0); MAX_JOINT_OWN_COLUMNS], 0);
+        let (mut output_terms, mut count) = ([(0, 0.0); MAX_JOINT_OUTPUT_COLUMNS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             let [a, b] = &self.products[p * self.groups + group];
             for n in 0..LANE_COUNT {
@@ -475,7 +475,7 @@ impl TestVectors {
                     divisor_im[n] -= c * b[n];
                     slack[n] += c.abs() * rest[n];
                 }
-                if count < MAX_JOINT_OWN_COLUMNS {
+                if count < MAX_JOINT_OUTPUT_COLUMNS {
                     output_terms[count] = (row, c);
                 }
                 count += 1;
@@ -488,7 +488,7 @@ impl TestVectors {
                 im[n] -= c * b[n];
             }
         }
-        if (2..=MAX_JOINT_OWN_COLUMNS).contains(&count) {
+        if (2..=MAX_JOINT_OUTPUT_COLUMNS).contains(&count) {
             let together = self.joint_slack(group, &mut output_terms[..count]);
             for n in 0..LANE_COUNT {
                 slack[n] = if together[n] < slack[n] { together[n] } else { slack[n] };
@@ -556,7 +556,7 @@ mod tests {
         let (m, count) = (VECTOR_SPECTRA_BYTES / 32 / 6, 2 * LANE_COUNT);
         let record = Record::from_rows(1e-3, vec![(0..m).map(|k| libm::sin(k as f64 * 0.01)).collect()], None)?;
         let mut index = Index::default();
-        let own: Vec<usize> = [0.4, 1.1, 1.9].map(|eta| index.insert(Key::integral(0, eta))).into();
+        let output_columns: Vec<usize> = [0.4, 1.1, 1.9].map(|eta| index.insert(Key::integral(0, eta))).into();
         let bank = Bank::new(&index, &record, 0)?;
         let all = build_vectors(count, m, &Stop::default());
         let sizes = vec![1.0; count];
@@ -564,12 +564,14 @@ mod tests {
             .iter()
             .filter_map(|&threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok())
             .map(|pool| {
-                pool.install(|| divisor_effects(&bank, &own, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default()))
+                pool.install(|| {
+                    divisor_effects(&bank, &output_columns, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default())
+                })
             })
             .collect();
         assert!(bounds.len() == 2 && bounds[0] == bounds[1], "whatever the threads");
         let groups = count / LANE_COUNT;
-        for (row, &p) in own.iter().enumerate() {
+        for (row, &p) in output_columns.iter().enumerate() {
             let kernel = Kernel::new(bank.kernel(p));
             let length: f64 = bank.kernel(p).iter().map(|v| v.abs()).sum();
             for (j, vector) in all.iter().enumerate().step_by(5) {
@@ -595,7 +597,7 @@ mod tests {
         let m = 64;
         let record = Record::from_rows(0.1, vec![vec![1.0; m]], None)?;
         let mut index = Index::default();
-        let own: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
+        let output_columns: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
         let (going, stopped_flag) = (Stop::default(), Stop::default());
         stopped_flag.set();
         let bank = Bank::new_interruptible(&index, &record, 0, &going)?;
@@ -606,7 +608,7 @@ mod tests {
         let columns = |stop| {
             divisor_effects(
                 &bank,
-                &own,
+                &output_columns,
                 build_vectors(LANE_COUNT, m, &Stop::default()),
                 &[1.0; LANE_COUNT],
                 (Norm::L1, 1e-15),
@@ -624,16 +626,22 @@ mod tests {
         let record = Record::from_rows(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
         let mut index = Index::default();
         let orders: Vec<f64> = (1..40).map(|i| 0.05 * f64::from(i)).collect();
-        let own: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();
+        let output_columns: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();
         let bank = Bank::new(&index, &record, 0)?;
         let all = build_vectors(count, m as usize, &Stop::default());
         for norm in [Norm::L1, Norm::L2] {
-            let effects =
-                divisor_effects(&bank, &own, all.clone(), &[1.0; LANE_COUNT], (norm, 1e-15), &Stop::default());
+            let effects = divisor_effects(
+                &bank,
+                &output_columns,
+                all.clone(),
+                &[1.0; LANE_COUNT],
+                (norm, 1e-15),
+                &Stop::default(),
+            );
             let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {
                 let [g, h] = [0, 1].map(|half: usize| effects[row][half][j]);
                 let parts = [0, 1].map(|half: usize| -> Vec<f64> {
-                    let (t, f) = (&all[j][half], bank.kernel(own[row]));
+                    let (t, f) = (&all[j][half], bank.kernel(output_columns[row]));
                     (0..t.len()).map(|k| (k..t.len()).map(|i| t[i] * f[i - k]).sum()).collect()
                 });
                 let t = all[j][0].iter().zip(&all[j][1]);

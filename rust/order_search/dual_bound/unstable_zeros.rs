@@ -51,7 +51,7 @@ const MAX_RECORD_SAMPLES: usize = 1 << 14;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..256).map(|k| if k % 64 < 32 { 1.0 } else { -0.5 }).collect();
 /// let record = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 256], input]), None)?;
-/// // D y = c y + u grows as exp(c t) for 25.6 time units, or decays.
+/// // The solution of D y = c y + u increases as exp(c t) for 25.6 time units, or decays for c < 0.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let structure = Structure { output: 0, order: 1.0, terms };
 /// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c, 1.0] };
@@ -207,7 +207,7 @@ impl PathSums {
     }
 
     /// Return the number of zeros that a weighted sum of columns plus the constant `unit` has inside a path. It is the
-    /// winding number of the values of the sum along the path. `left_out` bounds the omitted part: a constant, and a
+    /// winding number of the values of the sum along the path. `omission` bounds the omitted part: a constant, and a
     /// multiple of |z^M| for M samples. `None` if the sum may be 0 on the path.
     #[inline(always)]
     fn count_zeros(
@@ -215,13 +215,13 @@ impl PathSums {
         path: usize,
         columns: impl Iterator<Item = (usize, f64)>,
         unit: f64,
-        left_out: [f64; 2],
+        omission: [f64; 2],
     ) -> Option<i32> {
         let width = self.sums.len();
         let (mut re, mut im, mut slack) =
             ([unit; PADDED_NODE_COUNT], [0.0; PADDED_NODE_COUNT], [0.0; PATH_SEGMENT_COUNT]);
         for (slack, tail) in slack.iter_mut().zip(&self.tails[path]) {
-            *slack = left_out[0] + left_out[1] * tail;
+            *slack = omission[0] + omission[1] * tail;
         }
         for (p, c) in columns {
             let [a, b, rest] = &self.values[path * width + p];
@@ -302,8 +302,8 @@ impl UnstableZeros {
                 let path = (*last + path_index) % record.paths;
                 let divisor = terms_of(true).map(|(p, c)| (p, -c));
                 let Some(most @ 1..) = record.count_zeros(path, divisor, 1.0, [record.unit, 0.0]) else { continue };
-                let left_out = [rounding, length * size];
-                if record.count_zeros(path, terms_of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
+                let omission = [rounding, length * size];
+                if record.count_zeros(path, terms_of(false), 0.0, omission).is_some_and(|zeros| zeros < most) {
                     *last = path;
                     return true;
                 }

@@ -65,11 +65,11 @@ impl OrderGrid {
     ///
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
-    /// // Two own terms that may be swapped, and the input at order 0.
-    /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
+    /// // Two interchangeable output terms, and the input with order 0.
+    /// let output_axis = TermAxis { signal: 0, values: vec![0.0, 0.5, 1.0], interchangeable: true };
     /// let input = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
-    /// let grid = OrderGrid::new(0, &[0.8, 1.2], &[own.clone(), own, input], |signal| signal == 1)?;
-    /// // (0.5, 0) below 0.8; (1, 0.5), (1, 0), (0.5, 0) below 1.2.
+    /// let grid = OrderGrid::new(0, &[0.8, 1.2], &[output_axis.clone(), output_axis, input], |signal| signal == 1)?;
+    /// // Orders (0.5, 0) for α = 0.8, and (1, 0.5), (1, 0), (0.5, 0) for α = 1.2.
     /// assert_eq!(grid.count(), 4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
@@ -133,8 +133,8 @@ impl OrderGrid {
             .zip(axes)
             .map(|(&signal, axes)| {
                 let members = members(signal);
-                let swappable: Vec<bool> = members.iter().map(|&k| terms[k].interchangeable).collect();
-                Group::new(signal, members, axes, &swappable)
+                let interchangeable: Vec<bool> = members.iter().map(|&k| terms[k].interchangeable).collect();
+                Group::new(signal, members, axes, &interchangeable)
             })
             .collect();
         let mut blocks = Vec::new();
@@ -313,18 +313,18 @@ impl BitSet {
 }
 
 impl Group {
-    /// Build the terms of one signal. `axes` lists the orders of each term in descending order, and `swappable` is true
-    /// for interchangeable terms.
-    pub(super) fn new(signal: usize, terms: Vec<usize>, axes: Vec<Vec<f64>>, swappable: &[bool]) -> Self {
+    /// Build the terms of one signal. `axes` lists the orders of each term in descending order, and `interchangeable`
+    /// is true for interchangeable terms.
+    pub(super) fn new(signal: usize, terms: Vec<usize>, axes: Vec<Vec<f64>>, interchangeable: &[bool]) -> Self {
         // Orders descend within an axis.
         let contains = |axis: &[f64], value: f64| axis.binary_search_by(|v| value.total_cmp(v)).is_ok();
         let allowed = (0..terms.len())
             .map(|b| {
                 (0..b)
                     .map(|a| {
-                        let swappable = swappable[a] && swappable[b];
+                        let is_interchangeable = interchangeable[a] && interchangeable[b];
                         let is_shared: Vec<bool> =
-                            axes[b].iter().map(|&y| swappable && contains(&axes[a], y)).collect();
+                            axes[b].iter().map(|&y| is_interchangeable && contains(&axes[a], y)).collect();
                         let completions = |&x: &f64| {
                             let is_shared_value = contains(&axes[b], x);
                             // Of two combinations that differ by an interchange, only the one with the larger order
@@ -359,10 +359,10 @@ impl Group {
     }
 
     /// Enumerate the axis positions of the last order that are allowed with the axis positions `digits` of the other
-    /// orders. Their set is a bit set: `take` receives the index and the bits of each 64-bit word. `first` gives the
-    /// first axis position in range for each order. `take` is not called if the other orders exclude each other.
+    /// orders. Their set is a bit set: `visit` receives the index and the bits of each 64-bit word. `first` gives the
+    /// first axis position in range for each order. `visit` is not called if the other orders exclude each other.
     #[inline]
-    pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut take: impl FnMut(usize, u64)) {
+    pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut visit: impl FnMut(usize, u64)) {
         let last = self.last();
         if (0..last).any(|b| (0..b).any(|a| !self.allowed[b][a][digits[a]].has(digits[b]))) {
             return;
@@ -377,7 +377,7 @@ impl Group {
                 bits &= !(!0 << (len % 64));
             }
             (0..last).for_each(|a| bits &= self.allowed[last][a][digits[a]].0[word]);
-            take(word, bits);
+            visit(word, bits);
         }
     }
 

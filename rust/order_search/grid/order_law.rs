@@ -51,7 +51,7 @@ impl OrderLawGrid {
     /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
     /// let grid = OrderLawGrid::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
     /// assert_eq!((grid.product(), grid.free(1)), (2, vec![1.5]));
-    /// // An order below 0 is for inputs alone.
+    /// // Only inputs may have an order below 0.
     /// assert!(grid.structures(0).is_none());
     /// assert_eq!(grid.structures(1).map(|all| all[0].terms[0].order), Some(0.5));
     /// # Ok::<(), ftlm::error::Error>(())

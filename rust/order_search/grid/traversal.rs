@@ -11,8 +11,8 @@ impl OrderGrid {
     ///
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
-    /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
-    /// let grid = OrderGrid::new(0, &[0.8], &[own], |_| false)?;
+    /// let output_axis = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
+    /// let grid = OrderGrid::new(0, &[0.8], &[output_axis], |_| false)?;
     /// let orders: Vec<f64> = (0..grid.count()).map(|index| grid.structure(index).terms[0].order).collect();
     /// assert_eq!(orders, [0.5, 0.0]);
     /// # Ok::<(), ftlm::error::Error>(())

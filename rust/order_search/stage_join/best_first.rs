@@ -272,7 +272,7 @@ impl<'a> CoupledSearch<'a> {
             let structures = self
                 .grid
                 .structures(index)
-                .ok_or_else(|| Error::Internal { what: "a kept tuple without structures".into() })?;
+                .ok_or_else(|| Error::Internal { what: "a tuple of the result table without structures".into() })?;
             let mut parts = Vec::with_capacity(structures.len());
             for (table, structure) in self.tables.iter().zip(&structures) {
                 let (_, mut row) = table.problem.evaluate_structure(structure, f64::INFINITY, &mut scratch, control)?;

@@ -134,7 +134,7 @@ fn split_free_orders(
     }
     let (bytes, limit) = (BYTES_PER_HALF_ROW * min_size, u128::from(memory));
     if bytes > limit {
-        return Err(Error::Memory { what: format!("{min_size} rows of the layout of the order law"), bytes, limit });
+        return Err(Error::Memory { what: format!("{min_size} rows of the join of coupled equations"), bytes, limit });
     }
     Ok(best)
 }
@@ -156,8 +156,9 @@ impl Join {
         let private_axes = split_free_orders(grid, &rows, memory, control)?;
         let other: Vec<usize> = (0..grid.axes().len()).filter(|axis| !private_axes.contains(axis)).collect();
         let full = |axes: &[usize], rows: &OrderLawSums| {
-            rows.distinct_sums(grid, axes, usize::MAX, control)?
-                .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
+            rows.distinct_sums(grid, axes, usize::MAX, control)?.ok_or_else(|| Error::Internal {
+                what: "no contributions of free orders, although their number is unlimited".into(),
+            })
         };
         let addends = [full(&other, &rows[0])?, full(&private_axes, &rows[1])?];
         let stride = addends[1].len() as u64;
@@ -520,19 +521,19 @@ impl OrderLawSums {
         Ok(Some(distinct))
     }
 
-    /// Call `take(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is its
+    /// Call `visit(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is its
     /// contribution to the index of a combination of all free orders. `sums` are the values of the order laws of these
     /// equations, with constants. `other_sums` are the contributions to the order laws of `other_rows`, without
     /// constants.
     ///
     /// # Errors
-    /// The first error of `take`.
+    /// The first error of `visit`.
     pub(super) fn for_each_choice(
         &self,
         grid: &OrderLawGrid,
         axes: &[usize],
         other_rows: &Self,
-        mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
+        mut visit: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
     ) -> Result<()> {
         let strides: Vec<u64> =
             axes.iter().map(|&axis| grid.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
@@ -550,7 +551,7 @@ impl OrderLawSums {
             add(&self.constants, &self.weights, &mut sums);
             add(&vec![0.0; other_rows.constants.len()], &other_rows.weights, &mut other_sums);
             let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
-            take(index, &sums, &other_sums)?;
+            visit(index, &sums, &other_sums)?;
             let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < grid.axes()[axes[i]].len()) else {
                 return Ok(());
             };

@@ -76,7 +76,7 @@ impl Join {
             }
         };
         let mut worst_score = f64::INFINITY;
-        let room = top.max(512).saturating_mul(2);
+        let capacity = top.max(512).saturating_mul(2);
         for (bound, i, min_scores) in order {
             control.check_stop()?;
             if bound > worst_score {
@@ -102,7 +102,7 @@ impl Join {
                     }
                     let pair = [first.combination, second.combination];
                     best_pairs.push((self.score(scores, pair), first.index + second.index));
-                    if best_pairs.len() >= room {
+                    if best_pairs.len() >= capacity {
                         worst_score = truncate_rows(&mut best_pairs);
                     }
                 }

@@ -63,7 +63,7 @@ pub fn run_checkpointed<T: Send>(
             }
             let result = worker
                 .join()
-                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread result without a result".into() }));
+                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread ended without a result".into() }));
             match raised {
                 Some(error) => Err(error),
                 None => result.map_err(PyErr::from),
@@ -137,7 +137,7 @@ pub fn run_interruptible<T: Send + 'static>(
                     stop.check()?;
                 }
                 Err(RecvTimeoutError::Disconnected) => {
-                    let what = "a computing thread result without a result".into();
+                    let what = "a computing thread ended without a result".into();
                     return Err(Error::Internal { what }.into());
                 }
             }
@@ -182,7 +182,7 @@ pub fn run_with_progress<T: Send + 'static>(
                 }
                 Err(RecvTimeoutError::Timeout) => Python::attach(|py| py.check_signals()),
                 Err(RecvTimeoutError::Disconnected) => {
-                    let what = "a computing thread result without a result".into();
+                    let what = "a computing thread ended without a result".into();
                     return Err(Error::Internal { what }.into());
                 }
             };
