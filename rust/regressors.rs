@@ -249,7 +249,7 @@ impl Record {
         }
         let unit = if levels.iter().any(|v| *v != 0.0) { self.initial_term(0.0) } else { Vec::new() };
         let deviation = |(signal, &level): (&Vec<f64>, &f64)| {
-            (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
+            (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, unit_value)| v - level * unit_value).collect())
         };
         self.deviations = self.signals.iter().zip(levels).map(deviation).collect();
         (self.filter_transients, self.impulse_responses) = (transients, impulse_responses);

@@ -39,10 +39,10 @@ impl<K: SimdKernel> WithSimd for PulpKernel<K> {
 
 static USE_PORTABLE: AtomicBool = AtomicBool::new(false);
 
-/// If `on`, make [`dispatch_simd`] run kernels with the minimum instruction set, so that tests can compare both
+/// If `is_forced`, make [`dispatch_simd`] run kernels with the minimum instruction set, so that tests can compare both
 /// results.
-pub fn force_portable(on: bool) {
-    USE_PORTABLE.store(on, Ordering::Relaxed);
+pub fn force_portable(is_forced: bool) {
+    USE_PORTABLE.store(is_forced, Ordering::Relaxed);
 }
 
 /// Run a kernel with the widest vector instructions of the processor and return its result.

@@ -179,11 +179,11 @@ pub struct Streaming {
     means: Vec<f64>,
     options: StreamingOptions,
     pulses: usize,
-    longest: usize,
+    max_pulses: usize,
 }
 
 impl Streaming {
-    /// Return a recursion on samples with the interval `step` \[s\], for at most `longest` pulses.
+    /// Return a recursion on samples with the interval `step` \[s\], for at most `max_pulses` pulses.
     ///
     /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. `equations` holds the structure of
     /// each equation, and one entry per term: the value of a fixed coefficient, or None for a free one.
@@ -207,7 +207,7 @@ impl Streaming {
     /// ```
     pub fn new(
         step: f64,
-        longest: usize,
+        max_pulses: usize,
         inputs: &[bool],
         equations: &[(Structure, Vec<Option<f64>>)],
         options: StreamingOptions,
@@ -215,7 +215,7 @@ impl Streaming {
         check_step(step)?;
         options.check()?;
         #[allow(clippy::cast_precision_loss)]
-        let rates = Rates::new(step, step * (longest.max(2) as f64), MEMORY_TOLERANCE)?;
+        let rates = Rates::new(step, step * (max_pulses.max(2) as f64), MEMORY_TOLERANCE)?;
         let mut fits = Vec::with_capacity(equations.len());
         for (structure, fixed) in equations {
             structure.check(inputs.len(), |s| inputs[s])?;
@@ -261,7 +261,7 @@ impl Streaming {
             means: vec![0.0; inputs.len()],
             options,
             pulses: 0,
-            longest,
+            max_pulses,
         })
     }
 
@@ -269,7 +269,7 @@ impl Streaming {
     ///
     /// # Errors
     /// [`Error::Length`] if there is not one value per signal. [`Error::NotFinite`] if a value is not finite.
-    /// [`Error::OutOfRange`] if the stream exceeds the longest run. [`Error::Diverged`] if rounding makes the
+    /// [`Error::OutOfRange`] if the stream exceeds `max_pulses`. [`Error::Diverged`] if rounding makes the
     /// covariance indefinite.
     pub fn push(&mut self, sample: &[f64]) -> Result<()> {
         check_length("sample", self.inputs.len(), sample.len())?;
@@ -278,12 +278,12 @@ impl Streaming {
             self.sample.extend_from_slice(sample);
             return Ok(());
         }
-        if self.pulses == self.longest {
+        if self.pulses == self.max_pulses {
             #[allow(clippy::cast_precision_loss)]
             return Err(Error::OutOfRange {
                 name: "pulses in the stream".into(),
                 value: (self.pulses + 1) as f64,
-                range: format!("[0, {}]", self.longest),
+                range: format!("[0, {}]", self.max_pulses),
                 remedy: "set a longer duration of the stream".into(),
             });
         }

@@ -308,8 +308,8 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.endpoint_slope(k as f64)).collect();
     if out.len() < m {
         let (odd, logarithms) = (odd_powers(exponent, m), integer_logarithms(2 * m));
-        let far = odd.iter().enumerate().skip(ENDPOINT_PULSES);
-        out.extend(far.map(|(k, &power)| means.midpoint_slope(k, power, logarithms[2 * k + 1])));
+        let later_pulses = odd.iter().enumerate().skip(ENDPOINT_PULSES);
+        out.extend(later_pulses.map(|(k, &power)| means.midpoint_slope(k, power, logarithms[2 * k + 1])));
     }
     out
 }

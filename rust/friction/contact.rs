@@ -154,12 +154,13 @@ impl FrictionProblem {
     }
 
     /// Return the derivative of a body's friction force in an interval of a pulse with respect to its end velocity
-    /// without friction. `velocity` is its velocity at the start. `at` holds the end velocity and the pulse from
+    /// without friction. `velocity` is its velocity at the start. `solved_pulse` holds the end velocity and the pulse
+    /// from
     /// [`FrictionProblem::solve`].
     #[must_use]
-    pub fn force_slope(&self, body: usize, length: f64, velocity: f64, at: &(f64, Pulse)) -> f64 {
+    pub fn force_slope(&self, body: usize, length: f64, velocity: f64, solved_pulse: &(f64, Pulse)) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, gain: 0.0, law: [0.0; 3] };
-        self.laws[body].slope(velocity, at.0, length * self.own_gain(body), &at.1, &unit).0
+        self.laws[body].slope(velocity, solved_pulse.0, length * self.own_gain(body), &solved_pulse.1, &unit).0
     }
 
     /// Return the solution x of (1 + `length` diag(slopes) (G − diag G)) x = `vector`. x holds the changes of the

@@ -217,21 +217,21 @@ impl FrictionLaw {
     }
 
     /// Return the derivatives of the friction force in a pulse and of the velocity at its end with respect to a
-    /// parameter. `v`, `p` and `g` are the arguments of [`FrictionLaw::pulse`], and `at` is its result. `derivatives`
-    /// holds the derivatives of these arguments and of the law with respect to the parameter.
+    /// parameter. `v`, `p` and `g` are the arguments of [`FrictionLaw::pulse`], and `pulse` is its result.
+    /// `derivatives` holds the derivatives of these arguments and of the law with respect to the parameter.
     #[must_use]
-    pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
+    pub fn slope(&self, v: f64, p: f64, g: f64, pulse: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
         let law_derivative = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();
-        match at.phase {
+        match pulse.phase {
             Phase::Stick if g > 0.0 && self.breakaway() > 0.0 => {
-                ((derivatives.free - at.force * derivatives.gain) / g, 0.0)
+                ((derivatives.free - pulse.force * derivatives.gain) / g, 0.0)
             }
             Phase::Stick => (0.0, 0.0),
             Phase::Slip => {
-                let direction = if v == 0.0 { at.end.signum() } else { v.signum() };
-                let mean = self.mean_with_slopes(direction * v, (direction * at.end).max(0.0));
+                let direction = if v == 0.0 { pulse.end.signum() } else { v.signum() };
+                let mean = self.mean_with_slopes(direction * v, (direction * pulse.end).max(0.0));
                 let mean_derivative = law_derivative(&mean) + mean.slope_from * direction * derivatives.start;
-                let end = (direction * (derivatives.free - at.force * derivatives.gain) - g * mean_derivative)
+                let end = (direction * (derivatives.free - pulse.force * derivatives.gain) - g * mean_derivative)
                     / (1.0 + g * mean.slope_to);
                 (direction * (mean_derivative + mean.slope_to * end), direction * end)
             }
@@ -247,7 +247,7 @@ impl FrictionLaw {
                 let total_derivative = derivatives.gain * first_mean.value + g * first_derivative + loss_derivative;
                 let fraction_derivative = (speed_derivative - reversal_fraction * total_derivative) / total_loss;
                 let remaining_fraction = 1.0 - reversal_fraction;
-                let second_mean = self.mean_with_slopes(0.0, at.end.abs());
+                let second_mean = self.mean_with_slopes(0.0, pulse.end.abs());
                 let second_derivative = law_derivative(&second_mean);
                 let reverse_speed = (remaining_fraction
                     * (loss_derivative - derivatives.gain * second_mean.value - g * second_derivative)

@@ -35,11 +35,11 @@ const NEWTON_TOLERANCE: f64 = 1e-8;
 /// Rounding error of the residual of a channel, relative to the sum of the magnitudes of the channel's terms.
 const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
-/// Argument of an expression, by its index: a state channel, or a known channel (an input or a derivative of one).
+/// Argument of an expression, by its index: a state channel, or an input channel (an input or a derivative of one).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ExpressionArgument {
     State(usize),
-    Known(usize),
+    Input(usize),
 }
 
 /// Non-linear term of an equation: indices of equation, term and derived signal, and the arguments of its expression.
@@ -81,7 +81,7 @@ pub(super) struct Operators {
     outputs: usize,
     states: Vec<StateChannel>,
     /// Inputs, or derivatives of inputs, that enter expressions: (signal, order of the derivative), and pulse means.
-    known: Vec<((usize, f64), Vec<f64>)>,
+    input_means: Vec<((usize, f64), Vec<f64>)>,
     terms: Vec<NonlinearTerm>,
     integrals: Vec<IntegralKernel>,
     /// Convolution kernel of each entry of `integrals`.
@@ -104,7 +104,7 @@ pub(super) struct Operators {
 pub(super) struct LinearizedRun {
     /// Pulse means of each source: state channels, then non-linear terms, then friction forces.
     pub(super) sources: Vec<Vec<f64>>,
-    /// Derivatives of the non-linear terms with respect to the state channels, then the known channels. One row-major
+    /// Derivatives of the non-linear terms with respect to the state channels, then the input channels. One row-major
     /// matrix per pulse, with additional zero rows for friction forces.
     slopes: Vec<f64>,
     /// Inverse Jacobian of the equations in each pulse, row-major.
@@ -144,7 +144,7 @@ impl Operators {
     pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Result<Self> {
         let (m, step, states) = (record.m(), record.step(), system.state_channels());
         let state_index = |channel: StateChannel| states.iter().position(|state| state.is_same(channel));
-        let mut known: Vec<((usize, f64), Vec<f64>)> = Vec::new();
+        let mut input_means: Vec<((usize, f64), Vec<f64>)> = Vec::new();
         let mut terms: Vec<NonlinearTerm> = Vec::new();
         for (i, equation) in system.equations.iter().enumerate() {
             for (k, term) in equation.structure.terms.iter().enumerate().filter(|(_, t)| t.signal >= system.recorded) {
@@ -155,7 +155,9 @@ impl Operators {
                     let state = output.and_then(|equation| state_index(StateChannel::Mean { equation, order }));
                     arguments.push(match state {
                         Some(state) => ExpressionArgument::State(state),
-                        None => ExpressionArgument::Known(known_index(&mut known, (signal, order), record)?),
+                        None => {
+                            ExpressionArgument::Input(input_channel_index(&mut input_means, (signal, order), record)?)
+                        }
                     });
                 }
                 terms.push(NonlinearTerm { equation: i, term: k, signal, arguments });
@@ -189,14 +191,14 @@ impl Operators {
                     }
                 } else if let Some(q) = terms.iter().position(|t| (t.equation, t.term) == (j, k)) {
                     let has_input =
-                        terms[q].arguments.iter().any(|argument| matches!(argument, ExpressionArgument::Known(_)));
+                        terms[q].arguments.iter().any(|argument| matches!(argument, ExpressionArgument::Input(_)));
                     let remaining_order = eta - rho;
                     let min_remaining_order = if at_ends { MAX_FEEDTHROUGH_ORDER } else { -ORDER_GRAIN };
                     if remaining_order < min_remaining_order || (has_input && eta < MIN_INTEGRATION_ORDER) {
                         return Err(order_too_high());
                     }
                     is_algebraic |= remaining_order < MIN_INTEGRATION_ORDER
-                        && !terms[q].arguments.iter().all(|p| matches!(p, ExpressionArgument::Known(_)));
+                        && !terms[q].arguments.iter().all(|p| matches!(p, ExpressionArgument::Input(_)));
                     (Some(states.len() + q), kernel_index(&mut integrals, remaining_order.max(0.0), at_ends))
                 } else {
                     let remaining_order = eta - rho;
@@ -242,7 +244,7 @@ impl Operators {
             step,
             outputs,
             states,
-            known,
+            input_means,
             terms,
             integrals,
             kernels,
@@ -347,7 +349,7 @@ impl Operators {
     /// and the run consists of the pulses before it.
     pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<EarlyEnd>) {
         let (states, count) = (self.states.len(), self.sources());
-        let width = states + self.known.len();
+        let width = states + self.input_means.len();
         let mut run = LinearizedRun {
             sources: vec![Vec::with_capacity(self.m); count],
             slopes: Vec::with_capacity(self.m * self.values() * width),
@@ -365,7 +367,7 @@ impl Operators {
                 pulse.free[group.state] += convolution.past_contribution();
             }
             pulse.predict(&run.sources);
-            pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
+            pulse.input_means.iter_mut().zip(&self.input_means).for_each(|(value, (_, means))| *value = means[k]);
             let solved = match &mut motion {
                 Some(motion) => motion.solve(&mut pulse, &self.jumps.intervals(k)),
                 None => pulse.solve(),
@@ -403,14 +405,18 @@ impl Operators {
     }
 }
 
-/// Return the index of an input, or of a derivative of an input, in `known`. A new entry is computed from the record
-/// and appended.
-fn known_index(known: &mut Vec<((usize, f64), Vec<f64>)>, channel: (usize, f64), record: &Record) -> Result<usize> {
-    if let Some(index) = known.iter().position(|(entry, _)| *entry == channel) {
+/// Return the index of an input, or of a derivative of an input, in `input_means`. A new entry is computed from the
+/// record and appended.
+fn input_channel_index(
+    input_means: &mut Vec<((usize, f64), Vec<f64>)>,
+    channel: (usize, f64),
+    record: &Record,
+) -> Result<usize> {
+    if let Some(index) = input_means.iter().position(|(entry, _)| *entry == channel) {
         return Ok(index);
     }
-    known.push((channel, derivative(record.signal(channel.0), channel.1, record.step())?));
-    Ok(known.len() - 1)
+    input_means.push((channel, derivative(record.signal(channel.0), channel.1, record.step())?));
+    Ok(input_means.len() - 1)
 }
 
 /// Return the pulse means of the derivative of a signal from its pulse means. Return [`Error::OutOfRange`] for an order
@@ -440,7 +446,7 @@ struct Pulse<'a> {
     /// For each state channel, whether it was fixed when `inverse` was computed. Without non-linear terms, the inverse
     /// depends on these flags only.
     fixed_in_inverse: Vec<bool>,
-    known: Vec<f64>,
+    input_means: Vec<f64>,
     z: Vec<f64>,
     /// Values of the non-linear terms at `z`, followed by the friction forces.
     values: Vec<f64>,
@@ -460,17 +466,17 @@ struct Pulse<'a> {
 
 impl<'a> Pulse<'a> {
     fn new(operators: &'a Operators, system: &'a NonlinearSystem) -> Self {
-        let (states, values, known) = (operators.states.len(), operators.values(), operators.known.len());
+        let (states, values, input_count) = (operators.states.len(), operators.values(), operators.input_means.len());
         Self {
             operators,
             system,
             free: vec![0.0; states],
             fixed: vec![None; states],
             fixed_in_inverse: Vec::new(),
-            known: vec![0.0; known],
+            input_means: vec![0.0; input_count],
             z: vec![0.0; states],
             values: vec![0.0; values],
-            slopes: vec![0.0; values * (states + known)],
+            slopes: vec![0.0; values * (states + input_count)],
             inverse: vec![0.0; states * states],
             determinant: 1.0,
             residual: vec![0.0; states],
@@ -490,14 +496,14 @@ impl<'a> Pulse<'a> {
 
     /// Evaluate non-linear terms, their derivatives and the residual at `z`. Return the Euclidean norm of the residual.
     fn evaluate(&mut self) -> f64 {
-        let (states, width) = (self.z.len(), self.z.len() + self.known.len());
+        let (states, width) = (self.z.len(), self.z.len() + self.input_means.len());
         self.slopes.fill(0.0);
         self.fault = None;
         for (q, term) in self.operators.terms.iter().enumerate() {
             self.arguments.clear();
             let value = |argument: &ExpressionArgument| match *argument {
                 ExpressionArgument::State(state) => self.z[state],
-                ExpressionArgument::Known(known) => self.known[known],
+                ExpressionArgument::Input(input) => self.input_means[input],
             };
             self.arguments.extend(term.arguments.iter().map(value));
             self.values[q] = self.system.derived[term.signal].expression.evaluate(&self.arguments, &mut self.work);
@@ -505,7 +511,7 @@ impl<'a> Pulse<'a> {
             for (argument, slope) in term.arguments.iter().zip(self.work.slopes()) {
                 let column = match *argument {
                     ExpressionArgument::State(state) => state,
-                    ExpressionArgument::Known(known) => states + known,
+                    ExpressionArgument::Input(input) => states + input,
                 };
                 self.slopes[q * width + column] += slope;
             }
@@ -541,7 +547,7 @@ impl<'a> Pulse<'a> {
     /// Compute the inverse Jacobian of the equations of the pulse. Return false if the Jacobian is singular or the
     /// inverse is not finite.
     fn linearize(&mut self) -> bool {
-        let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
+        let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.input_means.len());
         let is_fixed = self.fixed.iter().map(Option::is_some);
         if self.is_linear() && is_fixed.clone().eq(self.fixed_in_inverse.iter().copied()) {
             return true;
@@ -791,10 +797,10 @@ impl Operators {
                 }
             }
         }
-        let mut known = Vec::new();
-        for (index, ((signal, order), _)) in self.known.iter().enumerate() {
+        let mut input_derivatives = Vec::new();
+        for (index, ((signal, order), _)) in self.input_means.iter().enumerate() {
             if let Some(input) = derivatives.inputs.iter().find(|input| input.signal == *signal) {
-                known.push((index, derivative(&input.means, *order, self.step)?));
+                input_derivatives.push((index, derivative(&input.means, *order, self.step)?));
             }
         }
         let bodies = match &self.contact {
@@ -805,7 +811,7 @@ impl Operators {
             None => None,
         };
         cache.linearize_contacts()?;
-        self.linear_run(run, &forcing, &known, bodies, (derivatives, cache.contacts.as_ref()))
+        self.linear_run(run, &forcing, &input_derivatives, bodies, (derivatives, cache.contacts.as_ref()))
     }
 
     /// Return the derivatives of `gains` with respect to a parameter, in the same layout.
@@ -827,19 +833,19 @@ impl Operators {
     /// Simulate the linearized equations. Return the derivatives of the pulse means of each output with respect to a
     /// parameter.
     ///
-    /// `forcing` holds the derivatives of the forcing of each state channel. `known` holds indices of known channels
-    /// and the derivatives of their pulse means. `bodies` holds the derivatives of the initial states, gains and
-    /// friction laws of the bodies.
+    /// `forcing` holds the derivatives of the forcing of each state channel. `input_derivatives` holds indices of input
+    /// channels and the derivatives of their pulse means. `bodies` holds the derivatives of the initial states, gains
+    /// and friction laws of the bodies.
     fn linear_run(
         &self,
         run: &LinearizedRun,
         forcing: &[Vec<f64>],
-        known: &[(usize, Vec<f64>)],
+        input_derivatives: &[(usize, Vec<f64>)],
         bodies: Option<(&ContactOperators, BodyDerivatives)>,
         (derivatives, responses): (&SystemDerivatives, Option<&ContactResponses>),
     ) -> Result<Vec<Vec<f64>>> {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
-        let width = states + self.known.len();
+        let width = states + self.input_means.len();
         let mut out = vec![Vec::with_capacity(self.m); self.outputs];
         let mut convolutions: Vec<OnlineConvolution<'_>> =
             self.kernel_contributions.iter().map(|group| OnlineConvolution::new(&self.kernels[group.kernel])).collect();
@@ -854,9 +860,10 @@ impl Operators {
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];
             x[states..].fill(0.0);
             for q in 0..terms {
-                x[states + q] = known.iter().map(|(index, means)| slopes[q * width + states + index] * means[k]).sum();
+                x[states + q] =
+                    input_derivatives.iter().map(|(index, means)| slopes[q * width + states + index] * means[k]).sum();
             }
-            if !known.is_empty() {
+            if !input_derivatives.is_empty() {
                 for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
                     *free += gains[states..].iter().zip(&x[states..]).map(|(g, v)| g * v).sum::<f64>();
                 }

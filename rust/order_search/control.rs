@@ -20,7 +20,7 @@ pub struct Control {
     /// Number of processed candidates that a bound excluded or whose evaluation was stopped early.
     pub pruned: AtomicU64,
     /// True if the caller takes checkpoints. Otherwise none are made.
-    pub saving: AtomicBool,
+    pub makes_checkpoints: AtomicBool,
     /// Latest checkpoint not yet taken by the caller.
     pub checkpoint: Mutex<Option<Checkpoint>>,
 }

@@ -221,7 +221,7 @@ impl Budget {
         let width = index.keys().len() as u128;
         let output_integrals = Bank::output_integral_count(index, output) as u128;
         let refined = options.refines();
-        let bounded = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
+        let has_dual_bound = options.pruning && !options.ranks_by_gram_matrix() && vectors > 0;
         let mut largest = 0;
         for record in records {
             let m = record.m();
@@ -234,11 +234,11 @@ impl Budget {
                 self.bytes += spectrum * (width + output_integrals + 1);
                 // The dual bound uses D e = w with denominator D, output error e and equation error w. It requires
                 // integrals of the measured output, which need another bank.
-                if bounded && options.criterion == Criterion::OutputError {
+                if has_dual_bound && options.criterion == Criterion::OutputError {
                     self.bytes += bank;
                 }
             }
-            if bounded {
+            if has_dual_bound {
                 // Products of real and imaginary parts with every column and the target are stored twice while they are
                 // regrouped. Further memory is for four numbers per output column and for the vectors.
                 let vectors = vectors as u128;

@@ -61,10 +61,10 @@ impl simd::SimdKernel for Screening<'_> {
         if !candidate_index.options.initial.follows_orders() {
             let mut screen = Screen::<LANE_COUNT>::new(width);
             candidate_index.positions(&cursor, &mut screen.terms);
-            let sharing = RowBoundContext::of(candidate_index, limit);
+            let row_bound = RowBoundContext::of(candidate_index, limit);
             while index < hi {
-                let common_factor = sharing.as_ref().and_then(|sharing| {
-                    screen.screen_row(candidate_index, sharing, &mut cursor, (index, hi), &mut outcome)
+                let common_factor = row_bound.as_ref().and_then(|row_bound| {
+                    screen.screen_row(candidate_index, row_bound, &mut cursor, (index, hi), &mut outcome)
                 });
                 if let Some(candidates) = common_factor {
                     index += candidates;

@@ -284,7 +284,7 @@ impl Streaming {
     fn new(
         py: Python<'_>,
         step: f64,
-        longest: usize,
+        max_pulses: usize,
         inputs: List<bool>,
         equations: List<(StructureArg, List<Option<f64>>)>,
         length: usize,
@@ -297,7 +297,7 @@ impl Streaming {
             .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed.into())))
             .collect::<PyResult<Vec<_>>>()?;
         let options = StreamingOptions { length, prior: prior(prior_covariance), forgetting, initial: initial(terms)? };
-        let inner = run_detached(py, || StreamingFit::new(step, longest, &inputs, &equations, options))?;
+        let inner = run_detached(py, || StreamingFit::new(step, max_pulses, &inputs, &equations, options))?;
         Ok(Self { inner })
     }
 

@@ -80,17 +80,17 @@ impl Guard {
         })
     }
 
-    fn read(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4], late: f64) -> PyResult<[f64; 6]> {
-        run_attached(|| Ok(self.inner.read(&Reading { analog, counts, switches }, late)))
+    fn read(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4], delay: f64) -> PyResult<[f64; 6]> {
+        run_attached(|| Ok(self.inner.read(&Reading { analog, counts, switches }, delay)))
     }
 
     fn command(&mut self, current: [f64; 2]) -> PyResult<[f64; 2]> {
         run_attached(|| Ok(self.inner.command(current)))
     }
 
-    fn fail(&mut self, why: String) -> PyResult<()> {
+    fn fail(&mut self, reason: String) -> PyResult<()> {
         run_attached(|| {
-            self.inner.fail(Fault::Rig(why));
+            self.inner.fail(Fault::Rig(reason));
             Ok(())
         })
     }
@@ -211,9 +211,9 @@ impl VirtualArm {
         })
     }
 
-    fn inject(&mut self, what: &str, channel: usize, sample: u64, value: f64) -> PyResult<()> {
+    fn inject(&mut self, fault: &str, channel: usize, sample: u64, value: f64) -> PyResult<()> {
         let joint = channel;
-        let injection = match what {
+        let injection = match fault {
             "dead encoder" => Injection::DeadEncoder { joint, from: sample },
             "saturated gauge" => Injection::SaturatedGauge { joint, from: sample },
             "limit switch" => Injection::LimitSwitch { line: channel, from: sample },
@@ -221,7 +221,7 @@ impl VirtualArm {
             "late" => Injection::Late { at: sample, seconds: value },
             "lost samples" => Injection::LostSamples { from: sample },
             _ => {
-                let what = format!("{what:?} cannot be injected");
+                let what = format!("{fault:?} cannot be injected");
                 return Err(Error::Structure { what, remedy: "see ftlm.rig.FAULT_INJECTIONS".into() }.into());
             }
         };

@@ -103,7 +103,7 @@ impl FilterStates {
         // Level and slope of the input are two additional states. The slope is constant, and the level is its integral.
         let n = self.size;
         let extended = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
-        let unit_state = |at: usize| (0..n + 2).map(|i| f64::from(u8::from(i == at))).collect::<Vec<f64>>();
+        let unit_state = |state: usize| (0..n + 2).map(|i| f64::from(u8::from(i == state))).collect::<Vec<f64>>();
         let impulses = self.impulse_states(states);
         let mut initial_states: Vec<Vec<f64>> =
             impulses.iter().map(|state| [state.as_slice(), &[0.0; 2]].concat()).collect();
@@ -117,7 +117,7 @@ impl FilterStates {
             .zip(&norms)
             .map(|(c, norm_of_column)| c.iter().map(|v| v / norm_of_column).collect())
             .collect();
-        let remainder: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
+        let remainder: Vec<f64> = samples.iter().zip(&first).map(|(v, unit_value)| v - level * unit_value).collect();
         #[allow(clippy::cast_precision_loss)]
         let rounding = f64::EPSILON * remainder.len().max(scaled.len()) as f64;
         let mut scaled_states = minimum_norm_solution(&scaled, &remainder, rounding)?;

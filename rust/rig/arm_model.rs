@@ -148,7 +148,7 @@ impl Arm {
             decay_factors: steps.iter().map(|s| s.0).collect(),
             first_weights: steps.iter().map(|s| h * s.1).collect(),
             last_weights: steps.iter().map(|s| h * s.2).collect(),
-            history: has_history.map(|any| vec![0.0; if any { count } else { 0 }]),
+            history: has_history.map(|has_history| vec![0.0; if has_history { count } else { 0 }]),
             rate: [0.0; 4],
             angle: [0.0; 4],
             force: [0.0; 4],

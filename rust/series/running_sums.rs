@@ -38,8 +38,8 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     for row in 1..=eta {
         let mut next = vec![0.0; row + 1];
         for (l, value) in next.iter_mut().enumerate() {
-            let kept = stirling.get(l).map_or(0.0, |s| (l + 1) as f64 * s);
-            *value = kept + if l > 0 { stirling[l - 1] } else { 0.0 };
+            let same_column_part = stirling.get(l).map_or(0.0, |s| (l + 1) as f64 * s);
+            *value = same_column_part + if l > 0 { stirling[l - 1] } else { 0.0 };
         }
         stirling = next;
     }

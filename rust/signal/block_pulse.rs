@@ -184,17 +184,17 @@ pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64
     check_finite("delay", &[delay])?;
     check_finite("samples", samples)?;
     check_finite("before", &[before])?;
-    let (count, whole) = (samples.len(), delay.floor());
-    let fraction = delay - whole;
-    let whole = whole.clamp(-(count as f64), count as f64) as isize;
+    let (count, integer_delay) = (samples.len(), delay.floor());
+    let fraction = delay - integer_delay;
+    let integer_delay = integer_delay.clamp(-(count as f64), count as f64) as isize;
     let sample_before = |j: usize, back: isize| delayed_row(j, back).map_or(before, |i| samples[i.min(count - 1)]);
     Ok((0..count)
         .map(|j| {
-            let nearer = sample_before(j, whole);
+            let nearer = sample_before(j, integer_delay);
             if fraction == 0.0 {
                 nearer
             } else {
-                (1.0 - fraction) * nearer + fraction * sample_before(j, whole + 1)
+                (1.0 - fraction) * nearer + fraction * sample_before(j, integer_delay + 1)
             }
         })
         .collect())
@@ -326,10 +326,10 @@ impl SampleInterpolation {
     pub fn jumps(&self, positions: &[f64], sizes: &[f64]) -> Jumps {
         let mut result = Jumps { starts: vec![0], jumps: Vec::new() };
         for (&sample_position, &first) in self.positions.iter().zip(&self.first) {
-            let from = positions.partition_point(|&p| p < sample_position - KINK_RANGE_PULSES);
-            let to = positions.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
+            let start = positions.partition_point(|&p| p < sample_position - KINK_RANGE_PULSES);
+            let end = positions.partition_point(|&p| p < (first + STENCIL_PULSES) as f64);
             for (&p, &size) in
-                positions[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
+                positions[start..end.max(start)].iter().zip(sizes.iter().skip(start)).filter(|(_, size)| **size != 0.0)
             {
                 let pulse = p.floor();
                 result.jumps.push(NearbyJump {

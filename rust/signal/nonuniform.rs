@@ -102,8 +102,8 @@ impl<'a> NonuniformSignal<'a> {
         let (mut means, mut row) = (Vec::with_capacity(m), 0);
         for pulse in edges.windows(2) {
             let (start, end) = (pulse[0], pulse[1]);
-            let advance = |mut row: usize, until: f64| {
-                while switches.get(row + 1).is_some_and(|next| *next <= until) {
+            let advance = |mut row: usize, time: f64| {
+                while switches.get(row + 1).is_some_and(|next| *next <= time) {
                     row += 1;
                 }
                 row

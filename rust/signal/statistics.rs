@@ -466,7 +466,7 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], max_order: usize) ->
         })
         .collect();
     let filter = std::iter::once(1.0).chain(coefficients[fixed..fixed + order].iter().map(|c| -c)).collect();
-    ArxModel { filter, start, innovations, parameters: regression.used.len() }
+    ArxModel { filter, start, innovations, parameters: regression.selected_columns.len() }
 }
 
 /// Subtract the mean of each row, and divide all rows by the largest magnitude. Return the rows and this magnitude. NaN
@@ -488,16 +488,16 @@ fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
 struct Regression {
     gram: Vec<Vec<f64>>,
     diagonal: Vec<f64>,
-    used: Vec<usize>,
+    selected_columns: Vec<usize>,
 }
 
 impl Regression {
     fn new(gram: Vec<Vec<f64>>) -> Self {
         let diagonal = gram.iter().enumerate().map(|(k, line)| line[k]).collect();
-        Self { gram, diagonal, used: Vec::new() }
+        Self { gram, diagonal, selected_columns: Vec::new() }
     }
 
-    /// Add a regression column, unless it is nearly a linear combination of the columns that are already used.
+    /// Add a regression column, unless it is nearly a linear combination of the selected columns.
     fn add(&mut self, column: usize) {
         let pivot = self.gram[column][column];
         if pivot.is_nan() || pivot <= COLUMN_TOLERANCE * self.diagonal[column] {
@@ -511,7 +511,7 @@ impl Regression {
         }
         self.gram[column] = line;
         self.gram[column][column] = 1.0 / pivot;
-        self.used.push(column);
+        self.selected_columns.push(column);
     }
 
     /// Return the residual sum of squares of the last column.
@@ -519,11 +519,11 @@ impl Regression {
         self.gram.last().and_then(|line| line.last()).copied().unwrap_or(0.0)
     }
 
-    /// Return the coefficient of each column except the last; 0 for columns that are not used.
+    /// Return the coefficient of each column except the last; 0 for columns that are not selected.
     fn coefficients(&self) -> Vec<f64> {
         let last = self.gram.len() - 1;
         let mut values = vec![0.0; last];
-        self.used.iter().for_each(|&column| values[column] = self.gram[column][last]);
+        self.selected_columns.iter().for_each(|&column| values[column] = self.gram[column][last]);
         values
     }
 }

@@ -858,7 +858,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
             let mut from = None;
             let part: Part = loop {
                 let control = Control::default();
-                control.saving.store(true, Relaxed);
+                control.makes_checkpoints.store(true, Relaxed);
                 let base = from.as_ref().map_or(0, |c: &Checkpoint| c.part.counts.processed_count());
                 let end = base + 1 + random.below(6000) as u64;
                 let finished = std::sync::atomic::AtomicBool::new(false);
@@ -887,7 +887,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                         let mut other = checkpoint.clone();
                         other.position.order ^= 1;
                         let control = Control::default();
-                        control.saving.store(true, Relaxed);
+                        control.makes_checkpoints.store(true, Relaxed);
                         assert_eq!(run(&ready, Some(other), &control).unwrap(), whole);
                         assert_eq!(control.finished_count.load(Relaxed), whole.counts.processed_count());
                         assert!(control.take_checkpoint().is_some_and(|first| first.replaces_previous));

@@ -126,11 +126,11 @@ pub(super) fn state_variable_filter(pole: f64, order: f64, record: &Record) -> R
 
 /// First `m` coefficients of the constant series 1.
 pub(super) fn unit(m: usize) -> Vec<f64> {
-    let mut one = vec![0.0; m];
-    if let Some(first) = one.first_mut() {
+    let mut series = vec![0.0; m];
+    if let Some(first) = series.first_mut() {
         *first = 1.0;
     }
-    one
+    series
 }
 
 /// Number of resonators of [`project`] per decade and input. At [`RESONATOR_DAMPING`], adjacent passbands overlap.

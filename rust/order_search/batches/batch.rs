@@ -205,11 +205,14 @@ impl<'a> BatchEvaluation<'a> {
             return Ok(());
         }
         let CandidateIndex { problem, options, .. } = self.candidate_index;
-        let saving = counts_outcomes && self.control.saving.load(Ordering::Relaxed);
+        let makes_checkpoints = counts_outcomes && self.control.makes_checkpoints.load(Ordering::Relaxed);
         // A refinement costs about ten times a simulation.
         let pulses = if problem.refines() { CHECKPOINT_PULSES / 8 } else { CHECKPOINT_PULSES };
-        let max_chunk =
-            if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
+        let max_chunk = if makes_checkpoints {
+            (pulses / problem.samples().max(1)).max(4 * self.scratches.len())
+        } else {
+            usize::MAX
+        };
         let (initial_size, max_size) = if problem.refines() { REFINEMENT_CHUNK_RANGE } else { SIMULATION_CHUNK_RANGE };
         let to_index = |count: u64| usize::try_from(count).unwrap_or(usize::MAX).min(open.len());
         if position.end == 0 {
@@ -225,7 +228,7 @@ impl<'a> BatchEvaluation<'a> {
                 let end = end.min(start.saturating_add(max_chunk));
                 let rows = self.simulate_chunk(&open[start..end], limit, counts_outcomes)?;
                 position.evaluated_count = end as u64;
-                if saving {
+                if makes_checkpoints {
                     top_rows.insert_rows(rows.iter().cloned());
                     self.result.failures.sort_unstable();
                     self.result.failures.truncate(MAX_LISTED_FAILURES);

@@ -146,7 +146,7 @@ pub(crate) struct Scratch {
     infeasibility: InfeasibilityProof,
     /// Initial guess of the coefficients for the proof of infeasibility.
     start: Vec<f64>,
-    one: Solve<1>,
+    least_squares: Solve<1>,
     simulation: BlockSimulation,
     /// Coefficients of the terms of the most recent candidate.
     coefficients: Vec<f64>,
@@ -165,7 +165,7 @@ impl Default for Scratch {
             lookup: VectorLookup::default(),
             infeasibility: InfeasibilityProof::default(),
             start: Vec::new(),
-            one: Solve::new(),
+            least_squares: Solve::new(),
             simulation: BlockSimulation::default(),
             coefficients: Vec::new(),
             weights: Vec::new(),
@@ -428,13 +428,14 @@ impl Problem {
     /// Evaluate the candidate whose terms have the columns `positions` and whose initial terms have the columns
     /// `initial`. `limit` is a limit of the raw score (Σ|e| or Σe²).
     ///
-    /// The coefficients are stored in `scratch`. If `bounded` is true, the dual bound is tried before the simulation.
+    /// The coefficients are stored in `scratch`. If `tries_dual_bound` is true, the dual bound is tried before the
+    /// simulation.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
         initial: &[usize],
         limit: f64,
-        bounded: bool,
+        tries_dual_bound: bool,
         scratch: &mut Scratch,
         control: &Control,
     ) -> Verdict {
@@ -444,20 +445,20 @@ impl Problem {
             lookup,
             infeasibility: proof,
             start,
-            one,
+            least_squares,
             simulation,
             coefficients,
             weights,
             ..
         } = scratch;
-        let [singular] = self.equations.solve(&sources, initial, one);
+        let [singular] = self.equations.solve(&sources, initial, least_squares);
         if singular {
             return Verdict::Failed(Failure::Singular);
         }
         coefficients.clear();
-        coefficients.extend(one.coefficients.iter().map(|c| c[0]));
+        coefficients.extend(least_squares.coefficients.iter().map(|c| c[0]));
         weights.clear();
-        weights.extend(one.initial.iter().map(|c| c[0]));
+        weights.extend(least_squares.initial.iter().map(|c| c[0]));
         if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
             // Refinement may change the coefficients arbitrarily, so only a bound over all coefficients can exclude the
             // candidate.
@@ -478,7 +479,7 @@ impl Problem {
         }
         let (coefficients, weights) = (&coefficients[..], &weights[..]);
         let of_record = |r: usize| &weights[r * initial.len()..(r + 1) * initial.len()];
-        if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
+        if let (true, Some(bound)) = (tries_dual_bound && limit < f64::INFINITY, &self.bound) {
             let columns = |r: usize| (positions, coefficients, initial, of_record(r));
             let (lowest, _) = simd::dispatch_simd(BoundKernel { bound, limit, columns });
             if lowest > limit {

@@ -57,13 +57,16 @@ impl BlockSimulation {
         while division.solved_terms() < m {
             let lo = division.solved_terms();
             let hi = (lo + BLOCK_TERMS).min(m);
-            let computed = divisor.len();
-            let required = division.required_terms().max(computed);
-            divisor.resize(required, 0.0);
+            let computed_terms = divisor.len();
+            let required_terms = division.required_terms().max(computed_terms);
+            divisor.resize(required_terms, 0.0);
             for (kernel, c) in output_terms.clone() {
-                divisor[computed..].iter_mut().zip(&kernel[computed..required]).for_each(|(d, v)| *d -= c * v);
+                divisor[computed_terms..]
+                    .iter_mut()
+                    .zip(&kernel[computed_terms..required_terms])
+                    .for_each(|(d, v)| *d -= c * v);
             }
-            if computed == 0 {
+            if computed_terms == 0 {
                 divisor[0] += 1.0;
                 if divisor[0] == 0.0 || !divisor[0].is_finite() {
                     return Verdict::Failed(Failure::Singular);

@@ -146,7 +146,7 @@ impl CellBisection<'_> {
             });
         }
         let (mut best, mut best_point) = (f64::INFINITY, Vec::new());
-        let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
+        let (mut lower_bound, mut cell_count, mut open_count) = (f64::INFINITY, 0_u64, 0_u64);
         let target = |best: f64| (1.0 - self.options.tolerance).powi(2) * best;
         let max_cells =
             self.options.max_cells.min(self.options.memory.saturating_sub(self.tables.bytes) / CELL_MEMORY_BYTES);
@@ -157,13 +157,13 @@ impl CellBisection<'_> {
         }
         self.polish(records, &mut best, &mut best_point)?;
         while !cells.is_empty() {
-            if bounded + cells.len() as u64 > max_cells {
-                open += cells.len() as u64;
-                proved = cells.iter().fold(proved, |bound, cell| bound.min(cell.inherited_bound));
+            if cell_count + cells.len() as u64 > max_cells {
+                open_count += cells.len() as u64;
+                lower_bound = cells.iter().fold(lower_bound, |bound, cell| bound.min(cell.inherited_bound));
                 break;
             }
             // The total is the number of cells known so far. Halves of these cells are added later.
-            self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
+            self.control.total.store(cell_count + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
             for cells in cells.chunks(CELLS_PER_PASS) {
                 let bounds = self.bounds(cells, target(best))?;
@@ -173,16 +173,16 @@ impl CellBisection<'_> {
                 for (cell, bounds) in cells.iter().zip(&bounds) {
                     let bound = bounds.lower_bound.max(cell.inherited_bound);
                     if bound >= target_bound {
-                        proved = proved.min(bound);
+                        lower_bound = lower_bound.min(bound);
                     } else if let Some(halves) = self.halve_cell(cell, bound, &bounds.costs) {
                         next.extend(halves.into_iter().flatten());
                     } else {
-                        open += 1;
-                        proved = proved.min(bound);
+                        open_count += 1;
+                        lower_bound = lower_bound.min(bound);
                     }
                 }
             }
-            bounded += cells.len() as u64;
+            cell_count += cells.len() as u64;
             cells = next;
         }
         self.polish(records, &mut best, &mut best_point)?;
@@ -195,8 +195,8 @@ impl CellBisection<'_> {
         let best_orders = if best.is_finite() { self.region.orders(&best_point) } else { None };
         let (order, orders) = best_orders.unwrap_or((f64::NAN, Vec::new()));
         let root = |mean_bound: f64| if mean_bound.is_finite() { (mean_bound * mean).sqrt() } else { f64::INFINITY };
-        let at_least = if proved.is_finite() { root(proved) * (1.0 - 1e-9) } else { 0.0 };
-        Ok(Certificate { lower_bound: at_least, best: root(best), order, orders, cells: bounded, open_cells: open })
+        let lower_bound = if lower_bound.is_finite() { root(lower_bound) * (1.0 - 1e-9) } else { 0.0 };
+        Ok(Certificate { lower_bound, best: root(best), order, orders, cells: cell_count, open_cells: open_count })
     }
 
     /// Compute the bounds of some cells, relative to the squared norm of the output. `target_bound` is the bound at
@@ -220,9 +220,10 @@ impl CellBisection<'_> {
         best: &mut f64,
         best_point: &mut Vec<f64>,
     ) -> Result<()> {
-        let mut promising: Vec<usize> = (0..cells.len()).filter(|&n| bounds[n].midpoint_residual < *best).collect();
-        promising.sort_by(|&a, &b| bounds[a].midpoint_residual.total_cmp(&bounds[b].midpoint_residual).then(a.cmp(&b)));
-        for n in promising.into_iter().take(MIDPOINTS_PER_PASS) {
+        let mut candidates: Vec<usize> = (0..cells.len()).filter(|&n| bounds[n].midpoint_residual < *best).collect();
+        candidates
+            .sort_by(|&a, &b| bounds[a].midpoint_residual.total_cmp(&bounds[b].midpoint_residual).then(a.cmp(&b)));
+        for n in candidates.into_iter().take(MIDPOINTS_PER_PASS) {
             let Some(orders) = self.region.midpoint_orders(&self.cell_intervals(&cells[n])) else { continue };
             let residual = self.relative_residual(records, &orders)?;
             if residual < *best {
@@ -329,9 +330,9 @@ impl CellBisection<'_> {
             }
             let mut next = Vec::new();
             for cell in &cells {
-                for at in first..first + count {
+                for position in first..first + count {
                     let mut cell = *cell;
-                    cell.position[term] = u32::try_from(at).unwrap_or(u32::MAX);
+                    cell.position[term] = u32::try_from(position).unwrap_or(u32::MAX);
                     let intervals: Vec<(f64, f64)> =
                         (0..=term).map(|t| self.tables.order_interval(self.region, &cell, t)).collect();
                     if self.region.alpha_interval(&intervals).is_some() {

@@ -206,9 +206,9 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
     }
     b[..k].iter_mut().for_each(|b| *b *= 1.0 + BOUND_MARGIN);
     // Accept the vector only if it satisfies the inequality.
-    let proved =
+    let is_dominating =
         |i: usize| (target[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * BOUND_MARGIN) <= b[i];
-    (0..k).all(proved).then_some(b)
+    (0..k).all(is_dominating).then_some(b)
 }
 
 /// Return two lower bounds of Σε² over a cell (a box of orders), 0 without a proof. ε is the equation error with zero

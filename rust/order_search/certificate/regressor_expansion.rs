@@ -158,7 +158,7 @@ impl RegressorExpansion {
             }
         }
         let lambda = dot(&columns[0], &columns[1]) / dot(&columns[0], &columns[0]);
-        let mut rest = 0.0;
+        let mut remainder_squares = 0.0;
         for (j, column) in columns.iter_mut().enumerate() {
             if j > 0 {
                 column.clear();
@@ -178,7 +178,7 @@ impl RegressorExpansion {
                 if j == 0 {
                     let remainder =
                         libm::exp(mu.abs() * half) * fourth_derivative_bound(eta + half, mu, m) * scale * size;
-                    rest += remainder * remainder;
+                    remainder_squares += remainder * remainder;
                 }
             }
             errors[j] = squares.sqrt();
@@ -194,7 +194,7 @@ impl RegressorExpansion {
         }
         let inverse = 1.0 / size;
         columns.iter_mut().flatten().for_each(|v| *v *= inverse);
-        let mut remainder = rest.sqrt() * half.powi(4) / FACTORIAL_TABLE[4];
+        let mut remainder = remainder_squares.sqrt() * half.powi(4) / FACTORIAL_TABLE[4];
         for j in 0..EXPANSION_COLUMNS {
             remainder += errors[j] * half.powi(i32::try_from(j).unwrap_or(0)) / FACTORIAL_TABLE[j];
         }

@@ -98,13 +98,14 @@ impl DerivativeSubspace {
         }
         let (n, all) = (self.count, max_coefficient / self.min_column_norm);
         let powers = f64::from(u8::try_from(SPANNED_DERIVATIVES).unwrap_or(u8::MAX));
-        let added = (RIDGE_TARGET_FRACTION * target_bound / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
-        let coefficients = self.ridge_solution(added);
+        let ridge_parameter = (RIDGE_TARGET_FRACTION * target_bound / (powers * all * all)).clamp(MIN_RIDGE, 1.0);
+        let coefficients = self.ridge_solution(ridge_parameter);
         // The minimum of the form with the ridge is at least its value anywhere minus |gradient|²/(4·ridge). The bound
         // uses the exact form of the columns, which is positive semidefinite, not the rounded one.
         let (mut value, mut gradient, mut sum) = (1.0, 0.0, 1.0);
         for i in 0..n {
-            let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + added * coefficients[i];
+            let row: f64 =
+                (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + ridge_parameter * coefficients[i];
             value += coefficients[i] * (row - 2.0 * self.target[i]);
             let partial = 2.0 * (row - self.target[i]);
             gradient += partial * partial;
@@ -113,9 +114,9 @@ impl DerivativeSubspace {
         #[allow(clippy::cast_precision_loss)]
         let (count, rounded) = (n as f64, self.rounding + 16.0 * f64::EPSILON * n as f64);
         let slope = gradient.sqrt() + 2.0 * rounded * sum * count.sqrt();
-        let ridge = value - rounded * sum * sum - slope * slope / (4.0 * added);
+        let ridge = value - rounded * sum * sum - slope * slope / (4.0 * ridge_parameter);
         // The coefficients of the values, and those of each derivative, sum up to at most `all`.
-        let square = ridge - added * powers * all * all;
+        let square = ridge - ridge_parameter * powers * all * all;
         let root = square.max(0.0).sqrt() - all * self.max_omitted_norm;
         let lower_bound = root * root * (1.0 - ROUNDING_MARGIN);
         if root > 0.0 && lower_bound.is_finite() {
@@ -125,15 +126,15 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Return an approximate minimizer of the quadratic form with the ridge parameter `added` on its diagonal.
-    fn ridge_solution(&self, added: f64) -> [f64; MAX_BASIS_ROWS] {
+    /// Return an approximate minimizer of the quadratic form with `ridge_parameter` added to its diagonal.
+    fn ridge_solution(&self, ridge_parameter: f64) -> [f64; MAX_BASIS_ROWS] {
         let n = self.count;
         let mut factor = self.matrix;
         let mut x = self.target;
-        factor.iter_mut().enumerate().for_each(|(i, row)| row[i] += added);
+        factor.iter_mut().enumerate().for_each(|(i, row)| row[i] += ridge_parameter);
         for i in 0..n {
             let row = factor[i];
-            let pivot = row[i].max(added);
+            let pivot = row[i].max(ridge_parameter);
             for l in i + 1..n {
                 let multiplier = row[l] / pivot;
                 for (a, b) in factor[l][l..n].iter_mut().zip(&row[l..n]) {
@@ -144,7 +145,7 @@ impl DerivativeSubspace {
         }
         for i in (0..n).rev() {
             let sum: f64 = (i + 1..n).map(|j| factor[i][j] * x[j]).sum();
-            x[i] = (x[i] - sum) / factor[i][i].max(added);
+            x[i] = (x[i] - sum) / factor[i][i].max(ridge_parameter);
         }
         x
     }

@@ -292,8 +292,8 @@ impl LinearizedVectors {
         }
         let mut lengths: Vec<f64> = Vec::new();
         for (i, &(p, _)) in output_terms.iter().enumerate() {
-            let mixed: f64 = (0..i).map(|j| projections[i * k + j].abs() * lengths[j]).sum();
-            lengths.push(self.rounding_bounds.kernel_norms[p] + mixed);
+            let basis_part: f64 = (0..i).map(|j| projections[i * k + j].abs() * lengths[j]).sum();
+            lengths.push(self.rounding_bounds.kernel_norms[p] + basis_part);
         }
         let sizes: Vec<f64> = (1..=k).map(|m| largest(parts.iter().flat_map(|part| &part.vectors[m]))).collect();
         let products = self.products(&parts, banks, targets, &output_terms);
@@ -381,13 +381,13 @@ impl LinearizedVectors {
         let (rounding_bounds, k) = (&self.rounding_bounds, linearized.center.len());
         let limit = rounding_bounds.norm_threshold(limit);
         let (mut rounding, mut length) = (rounding_bounds.target_rounding, 0.0);
-        let (mut output_coefficients, mut filled) = ([0.0; MAX_OUTPUT_TERMS], 0);
+        let (mut output_coefficients, mut count) = ([0.0; MAX_OUTPUT_TERMS], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             rounding += c.abs() * rounding_bounds.rounding[p];
             length += c.abs() * rounding_bounds.kernel_norms[p];
             if self.input_index[p] == NO_INDEX {
-                output_coefficients[filled] = c;
-                filled += 1;
+                output_coefficients[count] = c;
+                count += 1;
             }
         }
         // Coordinates of the coefficient differences in the basis of the G_m.

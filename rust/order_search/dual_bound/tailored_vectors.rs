@@ -190,9 +190,9 @@ impl TailoredVectors {
         }
         let rounding_error = self.rounding_bounds.unit * length;
         let max_norm = |index: usize| {
-            let fitted = &self.vectors[index];
+            let tailored = &self.vectors[index];
             let response =
-                terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, &c)| sum - c * fitted.products[p]);
+                terms.iter().zip(coefficients).fold(tailored.target, |sum, (&p, &c)| sum - c * tailored.products[p]);
             (response.abs() - rounding) / limit - rounding_error
         };
         let pair: [Weighted; MAX_CACHED_OUTPUT_TERMS] =
@@ -263,11 +263,11 @@ impl TailoredVectors {
     /// is the denominator of a candidate, and t the test vector of the cached norm.
     #[inline(always)]
     fn compute_deviation_norms(&self, cached: &mut CachedNorm) {
-        let fitted = &self.vectors[cached.vector];
-        let length = fitted.vector.len();
+        let tailored = &self.vectors[cached.vector];
+        let length = tailored.vector.len();
         let row = |n: usize| match cached.output_terms[n].0 {
             NO_INDEX => &[][..],
-            row => &fitted.transposed_products[row * length..(row + 1) * length],
+            row => &tailored.transposed_products[row * length..(row + 1) * length],
         };
         let (first, second) = (row(0), row(1));
         let (square, inner) = (simd::dot(first, first), simd::dot(&first[..second.len()], second));
@@ -304,7 +304,7 @@ impl TailoredVectors {
     #[allow(clippy::cast_precision_loss)]
     fn max_vector_norm(&self) -> f64 {
         match (self.rounding_bounds.norm, self.vectors.first()) {
-            (Norm::L2, Some(fitted)) => (fitted.vector.len() as f64).sqrt(),
+            (Norm::L2, Some(tailored)) => (tailored.vector.len() as f64).sqrt(),
             _ => 1.0,
         }
     }
@@ -312,24 +312,24 @@ impl TailoredVectors {
     /// Return the dual norm ‖t − Σ c Fᵀt‖, where t is a test vector. The sum is over the output columns, each with
     /// convolution matrix F and coefficient c. `None` if it exceeds `limit` or cannot be computed safely.
     #[inline(always)]
-    fn norm_up_to_limit(&self, fitted: &TailoredVector, output_terms: &[Weighted], limit: f64) -> Option<f64> {
+    fn norm_up_to_limit(&self, tailored: &TailoredVector, output_terms: &[Weighted], limit: f64) -> Option<f64> {
         // A NaN limit proves nothing. Products with coefficients below [`MAX_SAFE_MAGNITUDE`] do not overflow.
         if limit.is_nan() || limit <= 0.0 || !output_terms.iter().all(|(_, c)| c.abs() < MAX_SAFE_MAGNITUDE) {
             return None;
         }
-        let length = fitted.vector.len();
+        let length = tailored.vector.len();
         let squares = limit * limit;
         let mut all = [0.0_f64; LANE_COUNT];
         for (first, vector) in
-            (0..length).step_by(NORM_CHECK_SAMPLES).zip(fitted.vector.chunks_exact(NORM_CHECK_SAMPLES))
+            (0..length).step_by(NORM_CHECK_SAMPLES).zip(tailored.vector.chunks_exact(NORM_CHECK_SAMPLES))
         {
             let mut sums = [0.0; NORM_CHECK_SAMPLES];
             sums.copy_from_slice(vector);
             for &(row, c) in output_terms {
-                let acted =
-                    &fitted.transposed_products[row * length + first..row * length + first + NORM_CHECK_SAMPLES];
+                let convolution_product =
+                    &tailored.transposed_products[row * length + first..row * length + first + NORM_CHECK_SAMPLES];
                 for i in 0..NORM_CHECK_SAMPLES {
-                    sums[i] -= c * acted[i];
+                    sums[i] -= c * convolution_product[i];
                 }
             }
             for part in sums.chunks_exact(LANE_COUNT) {

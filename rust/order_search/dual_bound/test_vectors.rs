@@ -127,15 +127,15 @@ struct Vector {
 impl Vector {
     /// Return a workspace for test vectors on a record of `m` samples.
     fn with_samples(m: usize) -> Self {
-        let none = || [0, 1].map(|_| vec![0.0; m]);
+        let zeros = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::zeros(m));
         Self {
-            parts: none(),
+            parts: zeros(),
             number: 0,
             size: 0.0,
             spectra,
-            current_product: none(),
-            previous_product: none(),
+            current_product: zeros(),
+            previous_product: zeros(),
             last_projection: None,
         }
     }
@@ -361,7 +361,7 @@ impl TestVectors {
         columns.push(target);
         let flat: Vec<&[f64]> = vectors.iter().flatten().map(Vec::as_slice).collect();
         let (inner, parts) = (dense::inner_products(&columns, &flat, stop), flat.len());
-        let gathered = |p: usize| -> Vec<[Wide; 2]> {
+        let grouped_products = |p: usize| -> Vec<[Wide; 2]> {
             (0..groups)
                 .map(|g| {
                     let part =
@@ -370,7 +370,7 @@ impl TestVectors {
                 })
                 .collect()
         };
-        let products: Vec<[Wide; 2]> = (0..bank.len()).flat_map(gathered).collect();
+        let products: Vec<[Wide; 2]> = (0..bank.len()).flat_map(grouped_products).collect();
 
         // Generous multiple of the error of m additions, which also covers columns, inner products and simulation.
         let unit = 16.0 * f64::EPSILON * m as f64;
@@ -390,7 +390,7 @@ impl TestVectors {
         Self {
             groups,
             products,
-            target: gathered(bank.len()),
+            target: grouped_products(bank.len()),
             rows,
             effects,
             size,

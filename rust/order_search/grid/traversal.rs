@@ -116,13 +116,13 @@ impl<'a> Cursor<'a> {
         let words = &mut self.completions[g].0;
         words.clear();
         words.resize(group.axes[group.last()].len().div_ceil(64), 0);
-        let mut any = 0;
+        let mut union = 0;
         group.completions(first, &self.digits[g], |word, bits| {
             words[word] = bits;
-            any |= bits;
+            union |= bits;
         });
         self.prefixes[g] = prefix;
-        any != 0
+        union != 0
     }
 
     /// Advance to the next candidate, if there is one. Return the index of the first group (terms of one signal) that

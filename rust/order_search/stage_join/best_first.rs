@@ -65,7 +65,7 @@ struct Table {
     problem: Problem,
     candidates: Candidates,
     /// Candidates that occur for some combination of free orders, ascending.
-    used: Vec<usize>,
+    candidate_ids: Vec<usize>,
     /// Divisor of the score of this equation.
     scale: f64,
 }
@@ -151,7 +151,7 @@ impl<'a> CoupledSearch<'a> {
             grid.check_signals(record.len())?;
         }
         let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
-        let (join, used) = Join::new(&grid, &mut candidates, options.memory, pool, control)?;
+        let (join, candidate_ids) = Join::new(&grid, &mut candidates, options.memory, pool, control)?;
         if join.tuples() == 0 {
             return Err(Error::EmptyOrderGrid { why: "no tuple of free orders gives orders in range".into() });
         }
@@ -160,28 +160,28 @@ impl<'a> CoupledSearch<'a> {
         let mut indices = Vec::with_capacity(equations.len());
         let mut budget = Budget::default();
         budget.add_layout(join.bytes());
-        for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
+        for (e, (candidates, candidate_ids)) in candidates.into_iter().zip(candidate_ids).enumerate() {
             check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
             let mut required = RequiredRegressors::new(&options.initial);
-            for &id in &used {
+            for &id in &candidate_ids {
                 let structure = candidates.structure(id);
                 required.add_alpha(structure.order);
                 structure.terms.iter().for_each(|term| required.add_term(structure.order, term.signal, term.order));
             }
             let index = required.into_index();
             budget.add(records, equations[e].output, &index, options, Bound::MAX_TEST_VECTORS);
-            indices.push((index, candidates, used));
+            indices.push((index, candidates, candidate_ids));
         }
         budget.check(options.memory)?;
         let mut tables = Vec::with_capacity(equations.len());
-        for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
+        for (e, (index, candidates, candidate_ids)) in indices.into_iter().enumerate() {
             let problem = pool.install(|| {
                 let problem = Problem::new(records, equations[e].output, index, &fixed[e], options, &control.stop)?;
-                let problem = problem.with_bound(used.len() as u64, &control.stop);
+                let problem = problem.with_bound(candidate_ids.len() as u64, &control.stop);
                 control.check_stop()?;
                 Ok(problem)
             })?;
-            tables.push(Table { problem, candidates, used, scale: scales[e] });
+            tables.push(Table { problem, candidates, candidate_ids, scale: scales[e] });
         }
         let search = Self { grid, options: options.clone(), tables, samples };
         let mut state = SearchState {
@@ -190,7 +190,7 @@ impl<'a> CoupledSearch<'a> {
             pass: (0, 0, f64::INFINITY),
             limit_factor: SCORE_LIMIT_FACTOR,
             pending_spans: Vec::new(),
-            total: search.tables.iter().map(|t| t.used.len() as u64).sum(),
+            total: search.tables.iter().map(|t| t.candidate_ids.len() as u64).sum(),
             best_rows: Vec::new(),
         };
         state.plan_next(&search, pool, control)?;
@@ -217,13 +217,13 @@ impl<'a> CoupledSearch<'a> {
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut requests = Vec::new();
         for &Span { equation, first, last, limit } in spans {
-            let used_ids = self.tables.get(equation).map_or(&[][..], |table| &table.used);
+            let candidate_ids = self.tables.get(equation).map_or(&[][..], |table| &table.candidate_ids);
             // Candidates that occur for no combination of free orders have no regressors.
             let is_evaluated = first < last
-                && last - first <= used_ids.len()
-                && (first..last).all(|id| used_ids.binary_search(&id).is_ok());
+                && last - first <= candidate_ids.len()
+                && (first..last).all(|id| candidate_ids.binary_search(&id).is_ok());
             if !is_evaluated || limit.is_nan() {
-                let count = used_ids.len();
+                let count = candidate_ids.len();
                 let what = format!("candidates {first} to {last} of equation {equation} are not among its {count}");
                 return Err(mismatch_error(what));
             }
@@ -281,7 +281,7 @@ impl<'a> CoupledSearch<'a> {
             }
             rows.push(StageRow { index, free: self.grid.free(index), score, structures, rows: parts });
         }
-        let distinct = self.tables.iter().map(|t| t.used.len() as u64).collect();
+        let distinct = self.tables.iter().map(|t| t.candidate_ids.len() as u64).collect();
         Ok(StageOutcome { rows, counts, failures, distinct })
     }
 
@@ -368,12 +368,14 @@ impl SearchState {
     fn plan_next(&mut self, search: &CoupledSearch<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
         control.total.store(self.total, Ordering::Relaxed);
         // The first pass finds the best score of each equation. Evaluations stop at a multiple of it.
-        while let Some(Table { used, .. }) = search.tables.get(self.pass.0) {
+        while let Some(Table { candidate_ids, .. }) = search.tables.get(self.pass.0) {
             let (equation, start, best) = self.pass;
-            if start < used.len() {
-                let end = used.len().min(start + if start == 0 { 256 } else { CANDIDATES_PER_UPDATE.max(start / 2) });
+            if start < candidate_ids.len() {
+                let end = candidate_ids
+                    .len()
+                    .min(start + if start == 0 { 256 } else { CANDIDATES_PER_UPDATE.max(start / 2) });
                 let limit = if search.options.pruning { SCORE_LIMIT_FACTOR * best } else { f64::INFINITY };
-                self.pending_spans = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
+                self.pending_spans = spans(equation, candidate_ids[start..end].iter().map(|&id| (id, limit)));
                 self.pass.1 = end;
                 return Ok(());
             }

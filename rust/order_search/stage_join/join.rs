@@ -170,7 +170,7 @@ impl Join {
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
             rows[h].for_each_choice(grid, axes, &rows[1 - h], |index, sums, other_sums| {
                 control.check_stop()?;
-                let Some(named) = addends[1 - h].find(other_sums) else { return Ok(()) };
+                let Some(other_index) = addends[1 - h].find(other_sums) else { return Ok(()) };
                 for (number_of_addend, addend) in addends[h].iter().enumerate() {
                     if number_of_addend % ROWS_PER_STOP_CHECK == ROWS_PER_STOP_CHECK - 1 {
                         control.check_stop()?;
@@ -180,8 +180,9 @@ impl Join {
                     }
                     let combination =
                         combination(grid, candidates, &mut half, &mut ids_by_key, &orders, &mut key, &mut ids)?;
-                    let (addend_index, named) = (number_of_addend as u64, u64::from(named));
-                    let bucket_id = if h == 0 { addend_index * stride + named } else { named * stride + addend_index };
+                    let (addend_index, other_index) = (number_of_addend as u64, u64::from(other_index));
+                    let bucket_id =
+                        if h == 0 { addend_index * stride + other_index } else { other_index * stride + addend_index };
                     half.rows.push(HalfRow { bucket_id, index, combination });
                 }
                 Ok(())
@@ -194,7 +195,7 @@ impl Join {
             <[Half; 2]>::try_from(halves).map_err(|_| Error::Internal { what: "a join without two halves".into() })?;
         let mut join = Self { halves: [first, second], buckets: Vec::new() };
         join.match_buckets(control)?;
-        let mut used: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
+        let mut occurs: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
         for (i, bucket) in join.buckets.iter().enumerate() {
             if i % ROWS_PER_STOP_CHECK == 0 {
                 control.check_stop()?;
@@ -202,13 +203,13 @@ impl Join {
             for (half, rows) in join.halves.iter().zip(&bucket.rows) {
                 for row in &half.rows[rows.clone()] {
                     for (e, &id) in half.equations.clone().zip(half.ids(row.combination)) {
-                        used[e][id as usize] = true;
+                        occurs[e][id as usize] = true;
                     }
                 }
             }
         }
-        let used = used.iter().map(|u| (0..u.len()).filter(|&id| u[id]).collect()).collect();
-        Ok((join, used))
+        let candidate_ids = occurs.iter().map(|flags| (0..flags.len()).filter(|&id| flags[id]).collect()).collect();
+        Ok((join, candidate_ids))
     }
 
     /// Find the buckets that contain rows of both halves of the join. Any two such rows in a bucket are compatible

@@ -187,7 +187,7 @@ impl Join {
                 }
                 class_counts
             });
-            let mut failed = false;
+            let mut has_failure = false;
             for &(a, x) in &class_counts[0] {
                 for &(b, y) in &class_counts[1] {
                     let count = x * y;
@@ -199,10 +199,10 @@ impl Join {
                         Class::Failed(Failure::Singular) => &mut counts.singular,
                         Class::Failed(Failure::Diverged) => &mut counts.diverged,
                     } += count;
-                    failed |= a.combine(b).is_failed();
+                    has_failure |= a.combine(b).is_failed();
                 }
             }
-            if failed {
+            if has_failure {
                 list_failures(rows_of_bucket, states, &mut failures);
             }
         }

@@ -58,16 +58,16 @@ impl JointProblem {
         run_attached(|| Ok(self.inner.problem.bounds()))
     }
 
-    /// Move from the feasible point `at` toward `towards`, and return the last point that satisfies the bounds and the
-    /// constraints of the orders. The move follows the constraints that are active at `at`.
+    /// Move from the feasible point `start` toward `target`, and return the last point that satisfies the bounds and
+    /// the constraints of the orders. The move follows the constraints that are active at `start`.
     fn feasible<'py>(
         &self,
         py: Python<'py>,
-        at: PyReadonlyArray1<'py, f64>,
-        towards: PyReadonlyArray1<'py, f64>,
+        start: PyReadonlyArray1<'py, f64>,
+        target: PyReadonlyArray1<'py, f64>,
     ) -> PyResult<Array<'py>> {
-        let (at, towards) = (vector("point to start from", &at)?, vector("point to move towards", &towards)?);
-        let point = run_detached(py, || self.inner.problem.last_feasible_point(&at, &towards))?;
+        let (start, target) = (vector("start point", &start)?, vector("target point", &target)?);
+        let point = run_detached(py, || self.inner.problem.last_feasible_point(&start, &target))?;
         Ok(PyArray1::from_vec(py, point))
     }
 
@@ -117,8 +117,8 @@ impl JointProblem {
         dict.set_item("initial_responses", responses)?;
         dict.set_item("cost", optimum.cost)?;
         dict.set_item("residuals", PyArray1::from_vec(py, optimum.residuals))?;
-        let none = optimum.jacobian.first().is_none_or(Vec::is_empty);
-        dict.set_item("jacobian", if none { None } else { Some(stack_rows(py, &optimum.jacobian)?) })?;
+        let is_empty = optimum.jacobian.first().is_none_or(Vec::is_empty);
+        dict.set_item("jacobian", if is_empty { None } else { Some(stack_rows(py, &optimum.jacobian)?) })?;
         dict.set_item("evaluations", optimum.evaluations)?;
         dict.set_item("status", status(optimum.status))?;
         Ok(dict)

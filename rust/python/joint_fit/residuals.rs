@@ -73,39 +73,40 @@ pub fn long_run_covariance<'py>(
 }
 
 /// Return the likelihood ratio of two nested regressions of `residuals` under autoregressive noise, whose order is at
-/// most `most`. The rows of `few` and `many` are the regressors of the smaller and of the larger regression. `blocks`
-/// holds the (start, stop) indices of the samples by output and run.
+/// most `max_lag`. The rows of `nested_columns` and `full_columns` are the regressors of the smaller and of the larger
+/// regression. `blocks` holds the (start, stop) indices of the samples by output and run.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn prediction_ratio(
     py: Python<'_>,
-    few: PyReadonlyArray2<'_, f64>,
-    many: PyReadonlyArray2<'_, f64>,
+    nested_columns: PyReadonlyArray2<'_, f64>,
+    full_columns: PyReadonlyArray2<'_, f64>,
     residuals: PyReadonlyArray1<'_, f64>,
     blocks: List<List<(usize, usize)>>,
-    most: usize,
+    max_lag: usize,
 ) -> PyResult<f64> {
-    let (few, many, residuals) = (rows(&few)?, rows(&many)?, copy_vector("residuals", &residuals)?);
+    let (nested_columns, full_columns, residuals) =
+        (rows(&nested_columns)?, rows(&full_columns)?, copy_vector("residuals", &residuals)?);
     let outputs: Vec<Vec<_>> = blocks.iter().map(|ranges| ranges.iter().map(|&(a, b)| a..b.max(a)).collect()).collect();
-    let points = residuals.len().saturating_mul((few.len() + many.len() + most).max(1));
+    let points = residuals.len().saturating_mul((nested_columns.len() + full_columns.len() + max_lag).max(1));
     run_interruptible(py, points, None, move |stop| {
-        generalized_least_squares::prediction_ratio(&few, &many, &residuals, &outputs, most, stop)
+        generalized_least_squares::prediction_ratio(&nested_columns, &full_columns, &residuals, &outputs, max_lag, stop)
     })
 }
 
 /// Return the whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance. n is at most
-/// `most`.
+/// `max_order`.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn whitening_filter<'py>(
     py: Python<'py>,
     series: List<PyReadonlyArray1<'py, f64>>,
-    most: usize,
+    max_order: usize,
 ) -> PyResult<(Array<'py>, f64)> {
     let series = copy_vectors("series", &series)?;
-    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(most.max(1));
+    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(max_order.max(1));
     let (filter, power) = run_interruptible(py, points, None, move |_| {
-        Ok(statistics::whitening_filter(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
+        Ok(statistics::whitening_filter(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), max_order))
     })?;
     Ok((PyArray1::from_vec(py, filter), power))
 }
@@ -118,11 +119,11 @@ pub fn arx_model<'py>(
     py: Python<'py>,
     series: List<PyReadonlyArray1<'py, f64>>,
     inputs: List<List<PyReadonlyArray1<'py, f64>>>,
-    most: usize,
+    max_order: usize,
 ) -> PyResult<(Array<'py>, usize, Vec<Array<'py>>, usize)> {
     let series = copy_vectors("series", &series)?;
     let inputs = inputs.iter().map(|rows| copy_vectors("inputs", rows)).collect::<PyResult<Vec<_>>>()?;
-    let lags = most.saturating_mul(inputs.len() + 1).max(1);
+    let lags = max_order.saturating_mul(inputs.len() + 1).max(1);
     let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(lags);
     let model = run_interruptible(py, points, None, move |_| {
         for rows in &inputs {
@@ -134,25 +135,25 @@ pub fn arx_model<'py>(
         }
         crate::error::check_points("lags by 256", lags.saturating_mul(256))?;
         let input_rows: Vec<Vec<&[f64]>> = inputs.iter().map(|rows| rows.iter().map(Vec::as_slice).collect()).collect();
-        Ok(statistics::arx_model(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), &input_rows, most))
+        Ok(statistics::arx_model(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), &input_rows, max_order))
     })?;
     let innovations = model.innovations.into_iter().map(|row| PyArray1::from_vec(py, row)).collect();
     Ok((PyArray1::from_vec(py, model.filter), model.start, innovations, model.parameters))
 }
 
-/// Return the autocovariances of series at lags 0 to `most`, and the number of sample pairs at each lag.
+/// Return the autocovariances of series at lags 0 to `max_lag`, and the number of sample pairs at each lag.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn autocovariances<'py>(
     py: Python<'py>,
     series: List<PyReadonlyArray1<'py, f64>>,
-    most: usize,
+    max_lag: usize,
 ) -> PyResult<(Array<'py>, Array<'py>)> {
     let series = copy_vectors("series", &series)?;
-    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(most.max(1));
+    let points = series.iter().map(Vec::len).sum::<usize>().saturating_mul(max_lag.max(1));
     let (sums, pairs) = run_interruptible(py, points, None, move |_| {
-        crate::error::check_points("lags by 256", most.saturating_mul(256))?;
-        Ok(statistics::autocovariances(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), most))
+        crate::error::check_points("lags by 256", max_lag.saturating_mul(256))?;
+        Ok(statistics::autocovariances(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), max_lag))
     })?;
     Ok((PyArray1::from_vec(py, sums), PyArray1::from_vec(py, pairs)))
 }

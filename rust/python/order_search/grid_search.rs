@@ -324,6 +324,6 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
 
 /// Test hook: run all kernels with the instruction set of the oldest supported processor if `on` is true.
 #[pyfunction]
-pub fn force_portable(on: bool) {
-    crate::simd::force_portable(on);
+pub fn force_portable(is_forced: bool) {
+    crate::simd::force_portable(is_forced);
 }

@@ -35,7 +35,7 @@ pub fn run_checkpointed<T: Send>(
     work: impl FnOnce(&Control) -> Result<T, Error> + Send,
 ) -> PyResult<T> {
     let control = Control::default();
-    control.saving.store(save.is_some(), Ordering::Relaxed);
+    control.makes_checkpoints.store(save.is_some(), Ordering::Relaxed);
     let result = py.detach(|| {
         std::thread::scope(|scope| {
             let (finished, wait) = channel::<()>();
