@@ -9,9 +9,10 @@ import pytest
 
 import ftlm
 from ftlm.analysis import dcgain, modes, steady_states
-from ftlm.analysis.poles import _mode, characteristic, right_zeros, zeros_of
+from ftlm.analysis.poles import _mode, characteristic, order_excesses, right_zeros, zeros_of
 from ftlm.analysis.time_response import response
-from ftlm.report.html_report import behavior_tables
+from ftlm.estimation.model_checks import has_growing_mode, stability_findings
+from ftlm.report.html_report import behavior_tables, stability_note
 from ftlm.report.text_summary import behavior_lines
 
 
@@ -284,6 +285,74 @@ def test_a_dead_time_is_waited_for_and_an_order_of_nearly_0_is_0():
     assert abs(late.step().values[0, 0, -1] - 1.5) < 5e-3
     nearly = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 D^0.00001 y + 4 u"))
     assert abs(nearly.dcgain()[0, 0] - 4 / 9) < 1e-3
+
+
+#: Two equations whose highest order is that of their coupling, 2 + 0.1, with the opposite sign: they have a growing pole
+#: near 4^10 rad/s. Positions in the parameter vector: alpha 0 and 7, orders of the coupling 1 and 8.
+EXCESS = "D x = 0.5 D^1.1 y - 2 x + u; D y = 0.5 D x - 3 y"
+
+
+def excess_covariance(scale):
+    """A covariance of the orders with correlations, of which the excess has the standard error ``scale``."""
+    root = np.zeros((12, 3))
+    root[[0, 1, 7, 8]] = [[1.0, 0.5, 0.0], [0.3, 2.0, 0.1], [0.0, 0.4, 1.5], [0.7, -0.2, 0.9]]
+    excess = root[1] + root[8] - root[0] - root[7]
+    root *= scale / np.linalg.norm(excess)
+    return root @ root.T
+
+
+def test_a_pole_from_an_excess_of_orders_is_one_if_the_excess_is_significant() -> None:
+    for coupling in ("simulated", "measured"):
+        certain, doubtful = (
+            model(EXCESS, excess_covariance(scale), coupling=coupling) for scale in (0.1 / 2.5, 0.1 / 2.2)
+        )
+        (pole,) = (s for s in doubtful.poles() if s.real > 0)
+        assert (pole + 2) * (pole + 3) == pytest.approx(0.25 * pole**2.1, rel=1e-9)
+        assert [m.frequency for m in certain.modes() if m.unstable] == pytest.approx([pole.real])
+        assert not any(m.unstable for m in doubtful.modes())
+        assert len(certain.modes()) == len(doubtful.modes()) + 1
+        (excess,) = order_excesses(doubtful, coupling="simulated")
+        assert (excess.excess, excess.order_sum) == pytest.approx((0.1, 2.0))
+        assert excess.error == pytest.approx(0.1 / 2.2)
+        assert has_growing_mode(certain, "simulated")
+        assert not has_growing_mode(doubtful, "simulated")
+        assert [(f.code, f.level) for f in stability_findings(certain)] == [("order_excess", "with care")]
+        (fact,) = stability_findings(doubtful)
+        assert (fact.code, fact.level) == ("order_excess_not_significant", "fact")
+        assert fact.numbers["frequency"] == pytest.approx(pole.real)
+        assert stability_note(doubtful).endswith(", but not significantly.")
+        assert "significantly" not in stability_note(certain)
+        assert not any("grows" in line for line in behavior_lines(doubtful))
+        # Without a covariance nothing is doubtful.
+        assert [f.code for f in stability_findings(model(EXCESS, coupling=coupling))] == ["order_excess"]
+
+
+def test_an_excess_of_orders_in_a_ring_of_equations() -> None:
+    ring = "D x = 0.5 D^1.1 y - 2 x + u; D y = 0.5 D^0.9 z - 3 y; D z = 0.5 D^1.25 x - z"
+    (excess,) = order_excesses(model(ring), coupling="simulated")
+    assert excess.excess == pytest.approx(0.25)
+    (pole,) = (s for s in model(ring).poles() if s.real > 0)
+    assert [math.exp(w.real) for w in excess.poles] == pytest.approx([pole.real])
+    assert order_excesses(model(ring), coupling="measured") == []
+    # A coupling of the other sign has a higher order too, but no growing pole.
+    assert order_excesses(model(ring.replace("0.5 D^0.9", "-0.5 D^0.9")), coupling="simulated") == []
+
+
+def test_a_pole_that_remains_without_the_excess_of_orders_is_not_due_to_it() -> None:
+    # The coupling exceeds the equations' own highest terms already at equal orders.
+    strong = EXCESS.replace("0.5 D^1.1 y", "8 D^1.1 y")
+    assert order_excesses(model(strong), coupling="simulated") == []
+    assert [f.code for f in stability_findings(model(strong, coupling="simulated"))] == ["simulation_unbounded"]
+    assert [f.code for f in stability_findings(model(strong, coupling="measured"))] == ["coupled_model_unstable"]
+
+
+def test_equations_without_a_common_solution_have_no_poles() -> None:
+    dependent = model("D x = D y + u; D y = D x + u")
+    with pytest.raises(ftlm.errors.ModelError, match="linearly dependent"):
+        dependent.modes()
+    assert behavior_lines(dependent) == []
+    assert "linearly dependent" in stability_note(dependent)
+    assert stability_findings(dependent) == []
 
 
 def test_a_pole_beyond_the_range_of_numbers_is_none() -> None:

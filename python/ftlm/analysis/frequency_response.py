@@ -91,6 +91,16 @@ def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
     return {p: v for p, v in sorted(out.items()) if abs(v) > CANCELLATION_TOLERANCE * magnitudes[p]}
 
 
+def nonzero_determinant(matrix: list[list[Polynomial]], names: Sequence[str]) -> Polynomial:
+    """Return the determinant of the equations of the outputs `names`; raise ModelError if it is 0."""
+    common_denominator = determinant(matrix)
+    if not common_denominator:
+        raise ModelError(
+            f"the equations of {', '.join(names)} are linearly dependent (determinant 0); change one of them"
+        )
+    return common_denominator
+
+
 @dataclass(frozen=True)
 class TransferFunctions:
     """Transfer functions from every input to every output, exact in powers and coefficients.
@@ -149,11 +159,7 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
         items = [e for e in model.equations if e.output in names]
         rows = [equation_polynomials(e, names) for e in items]
         matrix = [lhs for lhs, _ in rows]
-        common_denominator = determinant(matrix)
-        if not common_denominator:
-            raise ModelError(
-                f"the equations of {', '.join(names)} are linearly dependent (determinant 0); change one of them"
-            )
+        common_denominator = nonzero_determinant(matrix, names)
         for j, output in enumerate(names):
             denominator[output] = _coefficient_pairs(common_denominator)
             for signal in inputs:

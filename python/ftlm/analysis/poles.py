@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from statistics import NormalDist
 
 import numpy as np
 
@@ -15,16 +16,17 @@ from ftlm.analysis.frequency_response import (
     check_no_input_nonlinearity,
     coupled_outputs,
     covariance_of,
-    determinant,
     equation_polynomials,
     is_coupled,
+    nonzero_determinant,
     response_inputs,
     shifted_models,
     transfer_functions,
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
-from ftlm.structure.polynomial import POWER_TOLERANCE, Polynomial
+from ftlm.structure.equation import Equation
+from ftlm.structure.polynomial import POWER_TOLERANCE, Polynomial, add_polynomial
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import with_error
 from ftlm.utils.parameters import parameter
@@ -45,6 +47,10 @@ OVERFLOW_LOG_FREQUENCY = 600.0
 #: Magnitude of the characteristic function, relative to the sum of the magnitudes of its terms, below which a pole is
 #: regarded as on the imaginary axis.
 AXIS_TOLERANCE = 1e-9
+#: One-sided confidence level of a growing mode, and number of standard errors by which the real part of its pole, or
+#: the excess of orders that causes it, must exceed 0.
+GROWTH_LEVEL = 0.99
+GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class Stability:
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
     """Return the characteristic function of each group of coupled equations: a sum of c s^p, as a dictionary {p: c}."""
     return [
-        determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
+        nonzero_determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names], names)
         for names in coupled_outputs(model, coupled=coupled)
     ]
 
@@ -458,7 +464,8 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     Returns
     -------
     tuple of Mode
-        One mode per real pole or conjugate pair; poles at the origin are excluded. Standard errors are first-order
+        One mode per real pole or conjugate pair; poles at the origin are excluded. A pole that exists only because of
+        an insignificant excess of orders (:class:`OrderExcess`) is excluded too. Standard errors are first-order
         approximations from the parameter covariance of the fit.
 
     Raises
@@ -479,9 +486,101 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     for group, polynomial in enumerate(characteristic(model, coupled=coupled)):
         # A pole that underflows counts as a pole at the origin. A pole that overflows has no visible effect.
         zeros = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
+        excess = order_excess(model, group, coupled=coupled)
+        if excess is not None and not excess.significant:
+            zeros = [w for w in zeros if all(abs(w - v) > DISTINCT_ZERO_TOLERANCE for v in excess.poles)]
         deviations = _standard_deviations(model, group, np.array(zeros), coupled=coupled)
         result += [_mode(w, deviation) for w, deviation in zip(zeros, deviations, strict=True)]
     return tuple(sorted(result, key=lambda mode: (mode.frequency, mode.pole.imag)))
+
+
+@dataclass(frozen=True)
+class OrderExcess:
+    """Excess of the highest power of s in a characteristic function over the sum of the orders of its equations.
+
+    The product of all D^alpha should contain the highest power. If terms in the outputs of other equations contain a
+    higher one with the opposite sign, the coupled equations have a growing pole. As the excess decreases to 0, this
+    pole tends to infinity, so data that do not determine the sign of the excess do not show whether the pole exists.
+
+    Parameters
+    ----------
+    order_sum
+        Sum of the orders alpha of the equations.
+    excess
+        Highest power of s minus this sum.
+    error
+        Standard error of the excess; None without a covariance.
+    poles
+        Growing poles that do not exist without the excess, as ln s.
+    """
+
+    order_sum: float
+    excess: float
+    error: float | None
+    poles: tuple[complex, ...]
+
+    @property
+    def significant(self) -> bool:
+        """Whether the excess is significantly positive (99 %), or has no standard error."""
+        return not self.error or self.excess > GROWTH_SIGMAS * self.error
+
+
+def order_excesses(model: Model, *, coupling: str) -> list[OrderExcess]:
+    """Return the excesses of orders that cause growing poles, at most one for each group of coupled equations."""
+    coupled = is_coupled(coupling)
+    groups = range(len(coupled_outputs(model, coupled=coupled)))
+    return [e for k in groups if (e := order_excess(model, k, coupled=coupled)) is not None]
+
+
+def order_excess(model: Model, group: int, *, coupled: bool) -> OrderExcess | None:
+    """Return the excess of orders that causes a growing pole of a group of coupled equations; None if there is none."""
+    names = coupled_outputs(model, coupled=coupled)[group]
+    polynomial = characteristic(model, coupled=coupled)[group]
+    order_sum, highest = sum(e.order.constant for e in model.equations if e.output in names), max(polynomial)
+    if highest - order_sum < POWER_TOLERANCE:
+        return None
+    without_excess: Polynomial = {}
+    for power, value in polynomial.items():
+        add_polynomial(without_excess, {min(power, order_sum): value})
+    growing, remaining = (
+        [w for w in zeros_of(p) if w.imag <= DISTINCT_ZERO_TOLERANCE and w.real < MAX_LOG_FREQUENCY]
+        for p in (polynomial, without_excess)
+    )
+    if len(growing) <= len(remaining):
+        return None
+    matrix, error = covariance_of(model), None
+    if matrix is not None:
+        gradient = _excess_gradient(model, names, highest)
+        error = math.sqrt(max(float(gradient @ matrix @ gradient), 0.0))
+    return OrderExcess(order_sum, highest - order_sum, error, tuple(growing[len(remaining) :]))
+
+
+def _excess_gradient(model: Model, names: Sequence[str], highest: float) -> Floats:
+    """Return the derivatives of the power `highest` minus the sum of orders, with respect to all parameters."""
+    positions, at = {}, 0
+    for equation in model.equations:
+        positions[equation.output] = at
+        at += 1 + 2 * len(equation.terms)
+    gradient = np.zeros(at + len(model.structure.fixed_inputs))
+    items = [e for e in model.equations if e.output in names]
+
+    def leading(equation: Equation, name: str) -> tuple[float, int]:
+        """Return the highest order of a signal in an equation, and its position in the parameter vector."""
+        first = positions[equation.output]
+        orders = [(equation.order.constant, first)] if equation.output == name else []
+        orders += [
+            (t.order.constant, first + 1 + 2 * k) for k, t in enumerate(equation.terms) if t.signal == name and t.fixed
+        ]
+        return max(orders, default=(-math.inf, first))
+
+    products = [
+        [leading(e, name) for e, name in zip(items, columns, strict=True)] for columns in itertools.permutations(names)
+    ]
+    for _, position in min(products, key=lambda product: abs(sum(power for power, _ in product) - highest)):
+        gradient[position] += 1.0
+    for equation in items:
+        gradient[positions[equation.output]] -= 1.0
+    return gradient
 
 
 def _mode(w: complex, deviations: tuple[float, float, float] | None) -> Mode:

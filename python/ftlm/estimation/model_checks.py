@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from statistics import NormalDist
 
 import numpy as np
 
 from ftlm import _core
 from ftlm.analysis.frequency_response import covariance_of, parameter_vector, with_parameter_vector
-from ftlm.analysis.poles import modes
+from ftlm.analysis.poles import GROWTH_LEVEL, GROWTH_SIGMAS, OrderExcess, modes, order_excesses
 from ftlm.data.run import Run
 from ftlm.data.sampling import ZERO_ORDER_HOLD, drop_missing, interpolate_gaps
 from ftlm.errors import FtlmError
@@ -59,10 +58,6 @@ QUANTIZATION_NOISE_RATIO = 2.0
 #: Minimum change per sampling interval that counts as motion, as a fraction of the range or largest change of the
 #: output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
-#: One-sided confidence level of a growing mode, and number of standard errors by which the real part of its pole must
-#: exceed 0.
-GROWTH_LEVEL = 0.99
-GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
 #: Conditional variance of a parameter, relative to its variance, below which the eliminated parameters determine it.
 MIN_VARIANCE_RATIO = 1e-9
 #: Minimum number of sampling intervals at low speed that determine the Stribeck term. A speed is low below
@@ -568,22 +563,63 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
     return findings
 
 
+#: Codes of findings on growing poles, if they are significant and if they are not, by whether the simulation of the
+#: model contains these poles. It does not if outputs that enter other equations are taken as measured.
+GROWTH_CODES = {
+    True: ("simulation_unbounded", "instability_not_significant"),
+    False: ("coupled_model_unstable", "coupled_instability_not_significant"),
+}
+
+
 def stability_findings(model: Model) -> list[Finding]:
-    """Return a finding on poles with a positive real part; a short run may not reveal the growth of their modes.
+    """Return findings on poles with a positive real part; a short run may not reveal the growth of their modes.
 
     The finding is an error if the real part of a pole is significantly positive. Otherwise an integrator or a slowly
-    decaying mode explains the run as well.
+    decaying mode explains the run as well. A stable model with measured coupling may be unstable if its equations are
+    simulated together, as in its frequency response and in a controller design.
     """
     if not model.structure.is_linear:
         # Friction or a hardening spring can bound a growing motion. Poles do not describe this.
         return []
-    stable = model.stability(coupling=model.structure.coupling)
+    coupling = model.structure.coupling
+    findings = _growth_findings(model, coupling)
+    if findings or coupling == "simulated":
+        return findings
+    try:
+        return _growth_findings(model, "simulated")
+    except FtlmError:
+        # Equations that cannot be solved for all outputs together have no common poles.
+        return []
+
+
+def _growth_findings(model: Model, coupling: str) -> list[Finding]:
+    """Return findings on poles with a positive real part of the model with the given coupling."""
+    stable = model.stability(coupling=coupling)
     if not stable.unstable_poles > 0:
         return []
-    code = (
-        "simulation_unbounded" if has_growing_mode(model, model.structure.coupling) else "instability_not_significant"
+    excesses = order_excesses(model, coupling=coupling)
+    findings = [_excess_finding(excess) for excess in excesses]
+    count = stable.unstable_poles - _excess_pole_count(excesses)
+    if count > 0:
+        codes = GROWTH_CODES[coupling == model.structure.coupling]
+        code = codes[0 if _has_other_growing_mode(model, coupling) else 1]
+        findings.append(make_finding(code, stability=str(stable), poles=unstable_poles_text(count)))
+    return findings
+
+
+def _excess_finding(excess: OrderExcess) -> Finding:
+    """Return the finding on an excess of orders and the growing pole that it causes."""
+    return make_finding(
+        "order_excess" if excess.significant else "order_excess_not_significant",
+        excess=excess.excess,
+        spread="" if not excess.error else f" ± {excess.error:.2g}",
+        order_sum=excess.order_sum,
+        frequency=math.exp(max(w.real for w in excess.poles)),
     )
-    return [make_finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
+
+
+def _excess_pole_count(excesses: Sequence[OrderExcess]) -> int:
+    return sum(len(excess.poles) for excess in excesses)
 
 
 def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
@@ -606,9 +642,19 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether the model has a significantly unstable mode (99 %); True if modes or their errors are unknown.
+    """Whether an unstable model is significantly so (99 %); True if modes or their errors are unknown.
 
     `coupling` selects the poles, as in :func:`ftlm.modes`.
+    """
+    excesses = order_excesses(model, coupling=coupling)
+    if any(excess.significant for excess in excesses):
+        return True
+    count = model.stability(coupling=coupling).unstable_poles - _excess_pole_count(excesses)
+    return count > 0 and _has_other_growing_mode(model, coupling)
+
+
+def _has_other_growing_mode(model: Model, coupling: str) -> bool:
+    """Whether a growing mode that no excess of orders causes is significant.
 
     The standard error of a pole is a first-order approximation. It fails at multiple poles, such as those of a double
     integrator. A mode is therefore not significant if the model is stable without its insignificant terms.
@@ -662,7 +708,9 @@ def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
         )
         values[least_significant], matrix[least_significant], matrix[:, least_significant] = 0.0, 0.0, 0.0
         try:
-            if not with_parameter_vector(model, values).stability(coupling=coupling).unstable_poles > 0:
+            reduced = with_parameter_vector(model, values)
+            excess_count = _excess_pole_count(order_excesses(reduced, coupling=coupling))
+            if not reduced.stability(coupling=coupling).unstable_poles > excess_count:
                 return True
         except FtlmError:
             return False

@@ -19,6 +19,7 @@ from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
+from ftlm.estimation.model_checks import has_growing_mode
 from ftlm.estimation.model_validation import validate, validate_model
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
@@ -206,7 +207,14 @@ def stability_note(model: Model) -> str:
     """Return a sentence on the stability of a model, or on the reason why it has no poles."""
     if model.structure.has_nonlinear_terms:
         return NONLINEAR_STABILITY_NOTE
-    return FRICTION_STABILITY_NOTE if model.structure.has_friction else f"As a whole, the model is {model.stability()}."
+    if model.structure.has_friction:
+        return FRICTION_STABILITY_NOTE
+    try:
+        stable = model.stability()
+    except FtlmError as error:
+        return f"As a whole, the model has no poles: {error}."
+    is_doubtful = stable.unstable_poles > 0 and not has_growing_mode(model, "simulated")
+    return f"As a whole, the model is {stable}{', but not significantly' if is_doubtful else ''}."
 
 
 def identification_page(
