@@ -189,7 +189,9 @@ def test_both_stages():
     assert structure.outputs == ("theta11", "theta12", "theta21", "theta22")
     assert set(structure.order_names) == {*FREE[1], *FREE[2]}
     assert len(structure.coefficient_law) == 8
-    assert len(structure.reference) == 16
+    assert len(ftlm.flexible_link(form="published", stage="both", parameters="effective").reference) == 16
+    # Nominal values are those of one arm, so another arm has none.
+    assert structure.reference == ftlm.flexible_link(stage=2).reference == {}
     assert structure.name == "flexible link, both stages"
     first, second = ftlm.flexible_link(form="published", stage=1), ftlm.flexible_link(form="published", stage=2)
     assert structure.equations == first.equations + second.equations
@@ -281,6 +283,7 @@ def test_models_of_other_parameters_orders_and_coefficients():
     assert model.coefficients == link.coefficients(2) | {"g3": 7.0}
     assert model.orders["gamma3"] == 0.9
     assert model.orders["mu4"] == 1.0
+    assert model.structure.reference == {}
     assert ftlm.link_model(stage="both", parameters="table-3").coefficients["d3"] == pytest.approx(0.856 / 0.003)
     with pytest.raises(ftlm.ModelError, match="order 'gama3' does not occur in the equation; did you mean gamma3"):
         ftlm.link_model(stage=2, orders={"gama3": 0.9})

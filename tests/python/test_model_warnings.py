@@ -170,3 +170,24 @@ def test_an_unstable_model_is_called_so_however_well_it_fits(method: str) -> Non
         assert found.fit["y"] > 99
         said = [w for w in found.warnings if "1 pole with a positive real part" in w and "grows without bound" in w]
         assert len(said) == grows
+
+
+@pytest.mark.parametrize(("gain", "level"), [(2.0, "with care"), (0.5, "trust")])
+def test_equations_that_are_unstable_only_together_are_called_so(gain: float, level: str) -> None:
+    # The poles of both equations together are -1 ± sqrt(gain).
+    truth = ftlm.Model(ftlm.equation(f"D x = -x + {gain} y + 2 u; D y = -y + x", coupling="simulated"))
+    rng = np.random.default_rng(5)
+    runs = []
+    for _ in range(2):
+        u = np.repeat(rng.choice([-1.0, 1.0], 40), 20)
+        blank = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"x": 0 * u, "y": 0 * u})
+        clean = truth.simulate(blank)
+        outputs = {n: clean[n] + 1e-3 * np.std(clean[n]) * rng.standard_normal(u.size) for n in ("x", "y")}
+        runs.append(ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs=outputs))
+    found = ftlm.identify(runs[0], ftlm.equation("D x = a x + b y + c u; D y = d y + e x", initial="rest"))
+    verdict = found.validate(runs[1]).verdict
+    assert found.model.stability(coupling="measured").stable
+    assert (verdict.level, found.model.stability().stable) == (level, level == "trust"), verdict
+    reason = "simulated together, the equations are unstable (1 pole with a positive real part)"
+    assert (verdict.reason == reason) == (level == "with care")
+    assert (reason in [f.reason for f in found.findings]) == (level == "with care")

@@ -65,7 +65,8 @@ def sine():
 def identified(square):
     lattice = ftlm.order_grid(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
     # Initial terms although the run starts at rest, so that the page has them to show.
-    structure = replace(ftlm.flexible_link(form="published", stage=1), initial="caputo")
+    structure = ftlm.flexible_link(form="published", stage=1, parameters="effective")
+    structure = replace(structure, initial="caputo")
     return ftlm.identify(square, structure, method=ftlm.LeastSquares(order_grid=lattice))
 
 

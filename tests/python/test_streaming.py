@@ -77,7 +77,7 @@ def test_one_integral_of_any_order_is_the_batch_one(order):
 
 def test_a_term_of_higher_order_than_the_output_is_streamed():
     """Link 1 of the arm in Lagrange's form, as identify takes it: the truth comes out of a noise-free run."""
-    structure = ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured")
+    structure = ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured", parameters="effective")
     structure = structure.with_orders({n: v for n, v in ORDERS.items() if n in structure.order_names})
     run = rig.record(duration=5.0, parameters="linear", input="prbs", seed=5)
     stream = Streaming(structure, step=run.step, longest=6.0, prior_covariance=1e10)

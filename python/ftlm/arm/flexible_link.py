@@ -233,7 +233,7 @@ def flexible_link(
     cross_damping: bool = False,
     hub: bool = True,
     laws: Sequence[Law] = ("orders", "coefficients"),
-    parameters: Literal["effective", "table-3"] = "effective",
+    parameters: Literal["effective", "table-3"] | None = None,
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
     offset: Literal["none", "level", "constant", "ramp"] = "none",
 ) -> Structure:
@@ -300,7 +300,8 @@ def flexible_link(
         methods estimate all coefficients freely, and report their deviation from the law. ``"velocities"``: gamma_1 =
         mu_2 (gamma_3 = mu_4), for the Lagrange form together with ``"orders"``; see :func:`order_law`.
     parameters
-        Named set of nominal values, which are printed next to the estimates.
+        Named set of nominal values of the paper's arm, which are printed next to the estimates and bound a genetic
+        search; by default there are none.
     sensor_filter
         Filter that the deflections have passed in the measurement. ``"stock"`` is the 2 Hz low-pass of the arm's stock
         real-time model on both deflections.
@@ -343,7 +344,8 @@ def flexible_link(
         raise ModelError(
             f"{parameter('cross_stage', 'inertial')} requires {parameter('form', 'lagrange')}; use that form"
         )
-    check_choice("parameters", parameters, PARAMETER_SETS)
+    if parameters is not None:
+        check_choice("parameters", parameters, PARAMETER_SETS)
     if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
         raise ModelError(
             f"{setting('friction')} {short_repr(friction)} is not known; use False, 'coulomb' or 'stribeck'"
@@ -407,9 +409,10 @@ def flexible_link(
         if cross_stage == "inertial" and j == 2:
             # Both angles of joint 1 rotate joint 2, which is mounted on the tip of link 1.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
-        link = PARAMETER_SETS[parameters][j]
-        values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
-        reference |= {n: v for n, v in values.items() if any(n in e.coefficient_names for e in equations)}
+        if parameters is not None:
+            link = PARAMETER_SETS[parameters][j]
+            values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+            reference |= {n: v for n, v in values.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
         signals = {s for e in equations for s in e.signals}
         sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in signals])
@@ -601,6 +604,8 @@ def link_model(
         for j, link in parameters.items():
             link_values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
             values |= {n: v for n, v in link_values.items() if n in structure.coefficient_names}
+        # Those of the named set belong to another arm.
+        structure = replace(structure, reference={})
     values |= dict(coefficients or {})
     free = {name: integer_order(name) for name in structure.order_names} | dict(orders or {})
     return Model(

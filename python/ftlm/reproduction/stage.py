@@ -81,7 +81,8 @@ Traces = dict[str, dict[int, MultiInnovationTrace]]
 
 def published_structure(stage: StageNumber) -> Structure:
     """Return the structure of a joint by eqs. (22)-(25) of the paper, uncoupled and from rest."""
-    return replace(flexible_link(stage=stage, form="published", coupling="measured", laws=()), initial="rest")
+    structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), parameters="effective")
+    return replace(structure, initial="rest")
 
 
 def integer_orders(structure: Structure) -> Structure:
@@ -502,7 +503,8 @@ def compare_orders(
     ConvergenceError
         If no initial guess of one of the fits converges.
     """
-    structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
+    arm_structure = flexible_link(stage=stage, form="lagrange", coupling="simulated", parameters="effective")
+    structure = replace(arm_structure, initial="rest")
     own, other = (run.select(list(structure.signals)) for run in (square, validation))
     run = decimate_run(own, ROW_STRIDE)
     m, candidates = default_m([own], power_of_two=True), []
