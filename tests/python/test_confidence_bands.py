@@ -1,10 +1,14 @@
 """Bands of a simulation, against simulations at parameters that are drawn from the covariance."""
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
 import pytest
 
 import ftlm
 from ftlm.analysis.frequency_response import linear_part, parameter_vector, response_deviation, with_parameter_vector
+from ftlm.estimation.model_validation import validate_model
 from ftlm.plot.comparison_charts import confidence_bands
 from ftlm.report.html_report import model_page
 from slow_cases import slow_after
@@ -38,6 +42,19 @@ def test_band_is_the_spread_of_drawn_models(found, draws):
     ratio = ((high - low) / 2)[moved] / expected[moved]
     assert 0.9 < np.median(ratio) < 1.1
     assert np.all((ratio > 0.8) & (ratio < 1.25))
+
+
+def test_a_negative_variance_by_rounding_is_none(found):
+    matrix = np.array(found.model.estimate.covariance)
+    # The order of the equation is fixed, so its variance is 0.
+    assert matrix[0, 0] == 0.0
+    matrix[0, 0] = -1e-22
+    rounded = replace(found.model, estimate=msgspec.structs.replace(found.model.estimate, covariance=matrix.tolist()))
+    other = run(2)
+    with np.errstate(invalid="raise"):
+        bands = [confidence_bands(m, other, m.compare(other))["y"] for m in (rounded, found.model)]
+        assert validate_model(rounded, other).findings == validate_model(found.model, other).findings
+    np.testing.assert_array_equal(*bands)
 
 
 def delayed_lag(u, step, a, b, delay):

@@ -287,8 +287,8 @@ def test_a_dead_time_is_waited_for_and_an_order_of_nearly_0_is_0():
     assert abs(nearly.dcgain()[0, 0] - 4 / 9) < 1e-3
 
 
-#: Two equations whose highest order, 2 + 0.1, is that of their coupling, with the opposite sign: they have a growing pole
-#: near 4^10 rad/s. Positions in the parameter vector: alpha 0 and 7, orders of the coupling 1 and 8.
+#: Two equations whose highest order, 2 + 0.1, is that of their coupling, with the opposite sign: they have a growing
+#: pole near 4^10 rad/s. Positions in the parameter vector: alpha 0 and 7, orders of the coupling 1 and 8.
 EXCESS = "D x = 0.5 D^1.1 y - 2 x + u; D y = 0.5 D x - 3 y"
 
 

@@ -18,7 +18,7 @@ from scipy.signal import lsim
 
 import ftlm
 from ftlm.estimation import nuisance_parameters as history
-from ftlm.estimation.objective import covariance_of, propagated_errors
+from ftlm.estimation.objective import covariance_of, propagated_covariance, propagated_errors
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.report.html_report import model_page
 
@@ -101,6 +101,25 @@ def test_parameters_of_an_unseen_direction_have_infinite_variance_and_the_others
     derived = propagated_errors(np.array([[1.0, 0, 2.0, 0, 0], [1.0, 1.0, 0, 0, 0]]), found)
     np.testing.assert_allclose(derived[0] ** 2, found[0, 0] + 4 * found[2, 2] + 4 * found[0, 2])
     assert math.isinf(derived[1])
+
+
+def test_a_variance_that_is_only_rounding_error_is_zero() -> None:
+    rng = np.random.default_rng(4)
+    plain_signs = set()
+    for _ in range(40):
+        # The last two parameters determine one another exactly, so a combination of them has no variance.
+        root = rng.standard_normal((4, 3)) * np.array([[1e-3], [1.0], [1e3], [0.0]])
+        root[3] = -0.7 * root[2]
+        slopes = np.array([[0.0, 0, 0.7, 1], [1.0, 0, 0, 0], [0, 1.0, 1.0, 0]])
+        matrix = root @ np.diag(rng.lognormal(size=3)) @ root.T
+        plain, found = slopes @ matrix @ slopes.T, propagated_covariance(slopes, matrix)
+        plain_signs.add(float(np.sign(plain[0, 0])))
+        assert not found[0].any()
+        assert not found[:, 0].any()
+        np.testing.assert_array_equal(found[1:, 1:], plain[1:, 1:])
+    assert -1.0 in plain_signs
+    unknown = np.diag([np.inf, 1.0])
+    assert not np.isfinite(propagated_covariance(np.eye(2), unknown)).all()
 
 
 def driven_twice(seed: int, apart: float) -> ftlm.Run:

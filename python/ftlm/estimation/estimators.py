@@ -26,7 +26,7 @@ from ftlm.estimation.model_checks import (
     sample_findings,
 )
 from ftlm.estimation.nuisance_parameters import errors_with_orders, fit_with_initial_conditions
-from ftlm.estimation.objective import Iterate, Objective
+from ftlm.estimation.objective import Iterate, Objective, propagated_covariance
 from ftlm.estimation.output_error import JointFit, Loss
 from ftlm.estimation.result import Task
 from ftlm.findings import Finding, make_finding
@@ -274,9 +274,7 @@ def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[floa
     jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
     inputs = problem.structure.with_inputs(joint.inputs).fixed_inputs
     jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
-    with np.errstate(invalid="ignore", over="ignore"):
-        # Covariances of non-identifiable directions are NaN or overflow.
-        covariance = jacobian @ joint.covariance @ jacobian.T
+    covariance = propagated_covariance(jacobian, joint.covariance)
     return tuple(tuple(row) for row in covariance.tolist()) if np.all(np.isfinite(covariance)) else None
 
 

@@ -21,7 +21,7 @@ from ftlm.estimation.model_checks import (
     SECOND_OPTIMUM_LOG_LIKELIHOOD,
     second_optimum_findings,
 )
-from ftlm.estimation.objective import covariance_of
+from ftlm.estimation.objective import covariance_of, propagated_covariance
 from ftlm.estimation.prior_knowledge import Bounds, check_bounds, check_intervals, fit_within_bounds
 from ftlm.estimation.response_problem import MAX_EXPONENT, ConstraintText, ResponseProblem
 from ftlm.findings import Finding, make_finding
@@ -709,8 +709,7 @@ def _model(
                         row[problem.names.index(term.coefficient)] = term.factor
                     rows.append(row)
         rows += [np.array([float(n == name) for n in problem.names]) for name in structure.fixed_inputs]
-        table = np.array(rows)
-        coefficient_covariance = tuple(tuple(row) for row in (table @ covariance @ table.T).tolist())
+        coefficient_covariance = tuple(tuple(row) for row in propagated_covariance(np.array(rows), covariance).tolist())
     units: dict[str, str] = {}
     if all(r.unit == "Ω" for r in records):
         units = {r.output: "V" for r in records} | {r.input: "A" for r in records}

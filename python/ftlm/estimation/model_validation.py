@@ -80,6 +80,11 @@ def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comp
     return findings
 
 
+def uncertain_parameters(covariance: Floats) -> list[int]:
+    """Return the indices of the parameters with a positive variance; a negative one in a file is rounding error."""
+    return np.flatnonzero(np.diagonal(covariance) > 0.0).tolist()
+
+
 def simulation_sensitivities(
     model: Model, runs: Run | Sequence[Run], comparison: Comparison
 ) -> dict[str, list[Floats]]:
@@ -88,7 +93,7 @@ def simulation_sensitivities(
     Parameters
     ----------
     model
-        Identified model with a finite covariance, or without one. A parameter is uncertain if its variance is not 0.
+        Identified model with a finite covariance, or without one.
     runs, comparison
         Runs, and the comparison of the model with them.
 
@@ -102,11 +107,11 @@ def simulation_sensitivities(
     FtlmError
         If a simulation with a changed parameter fails.
     """
-    values, covariance = parameter_vector(model), covariance_of(model)
-    errors = np.zeros(values.size) if covariance is None else np.sqrt(np.diag(covariance))
+    values, matrix = parameter_vector(model), covariance_of(model)
+    covariance = np.zeros((values.size, values.size)) if matrix is None else matrix
     columns: dict[str, list[list[Floats]]] = {name: [[] for _ in each] for name, each in comparison.simulated.items()}
-    for k in np.flatnonzero(errors):
-        step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
+    for k in uncertain_parameters(covariance):
+        step = DERIVATIVE_STEP_IN_ERRORS * float(np.sqrt(covariance[k, k]))
         shifted = compare(with_parameter_vector(model, values + step * np.eye(values.size)[k]), runs)
         for name, each in comparison.simulated.items():
             for column, reference_samples, other in zip(columns[name], each, shifted.simulated[name], strict=True):

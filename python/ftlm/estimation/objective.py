@@ -231,6 +231,21 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
     return _core.covariance_of(jacobian, series, squares)
 
 
+def propagated_covariance(slopes: Floats, parameter_covariance: Floats) -> Floats:
+    """Return the covariance of functions of the parameters, to first order; that of unidentifiable ones is not finite.
+
+    `slopes` are the derivatives (functions, parameters), and `parameter_covariance` is that of the parameters. A
+    variance that is only rounding error, which may be negative, is 0, and so are the covariances with it.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        out: Floats = slopes @ parameter_covariance @ slopes.T
+        magnitudes = np.sum(np.abs(slopes) @ np.abs(parameter_covariance) * np.abs(slopes), axis=1)
+        rounding = np.finfo(np.float64).eps * len(parameter_covariance) * magnitudes
+        is_rounding = np.diagonal(out) <= rounding
+    out[is_rounding], out[:, is_rounding] = 0.0, 0.0
+    return out
+
+
 def propagated_errors(slopes: Floats, parameter_covariance: Floats) -> Floats:
     """Return standard errors of functions of the parameters, to first order.
 

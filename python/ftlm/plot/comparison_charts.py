@@ -10,7 +10,7 @@ import numpy as np
 from ftlm.analysis.frequency_response import covariance_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
-from ftlm.estimation.model_validation import simulation_sensitivities
+from ftlm.estimation.model_validation import simulation_sensitivities, uncertain_parameters
 from ftlm.model.model import Model
 from ftlm.svg.charts import BarChart, histogram
 from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figures
@@ -362,7 +362,7 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
         sensitivities = simulation_sensitivities(model, run, comparison)
     except FtlmError:
         return {}
-    rows, bands = np.flatnonzero(np.diag(covariance)), {}
+    rows, bands = uncertain_parameters(covariance), {}
     for name, (matrix,) in sensitivities.items():
         nominal = comparison.simulated[name][0]
         variance = np.einsum("kt,kl,lt->t", matrix, covariance[np.ix_(rows, rows)], matrix)
