@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,6 +67,26 @@ def test_a_machine_is_asked_what_it_has_left(tmp_path, monkeypatch, files, left)
     system = machine(tmp_path, **files)
     assert available_memory(system) == left
     assert memory_limit(system) == int(DEFAULT_MEMORY_FRACTION * left)
+
+
+def test_a_changed_limit_and_another_group_are_noticed(tmp_path, monkeypatch):
+    system = machine(tmp_path, proc__meminfo=MEMINFO, **V2)
+    assert available_memory(system) == 2_400_000_000
+    machine(tmp_path, **{"sys__fs__cgroup__jobs__mine__memory.max": "1000\n"})
+    assert available_memory(system) == 993
+    machine(tmp_path, **{"sys__fs__cgroup__jobs__mine__memory.current": "500\n"})
+    assert available_memory(system) == 500
+    machine(tmp_path, proc__self__cgroup="0::/jobs\n")
+    assert available_memory(system) == 2_400_000_000
+    machine(tmp_path, **{"sys__fs__cgroup__memory.max": "70\n", "sys__fs__cgroup__memory.current": "9\n"})
+    assert available_memory(system) == 61
+    # Usage and cache of a group matter only if it has a limit.
+    opened, plain = [], Path.open
+    monkeypatch.setattr(Path, "open", lambda path, *a, **k: (opened.append(path.name), plain(path, *a, **k))[1])
+    machine(tmp_path, **{"sys__fs__cgroup__memory.max": "max\n", "sys__fs__cgroup__jobs__memory.max": "max\n"})
+    opened.clear()
+    assert available_memory(system) == 8_000_000 << 10
+    assert opened == ["meminfo", "cgroup", "memory.max", "memory.max"]
 
 
 def test_a_machine_that_tells_nothing_gives_what_is_safe(tmp_path, monkeypatch):
