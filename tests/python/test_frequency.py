@@ -9,7 +9,7 @@ import pytest
 import ftlm
 from ftlm import analysis
 from ftlm.analysis.frequency_response import parameter_vector
-from ftlm.analysis.poles import right_zeros, roots_in_base
+from ftlm.analysis.polynomial_zeros import right_zeros, roots_in_base
 from ftlm.reproduction.simulated_arm import demo_plant
 
 TWO = "D^1.7 y = -20 y - 2 D^0.7 y + 15 z + 10 u; D^1.2 z = -5 z + 3 D^0.4 y + 2 D^0.3 u + v"

@@ -23,7 +23,7 @@ DRIVERS = (
 #: Calls that depend on the course of a fit and on what there is to report.
 SLACK_CALLS = 60
 #: Zeros in the right half plane are sought for models that have some, by halving rectangles.
-OF_SOME_MODELS = "analysis/poles.py:"
+OF_SOME_MODELS = ("analysis/poles.py:", "analysis/polynomial_zeros.py:")
 
 
 def count_calls(work: Callable[[], object]) -> tuple[Counter[str], set[str]]:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.analysis import dcgain, modes, steady_states
-from ftlm.analysis.poles import _mode, characteristic, order_excesses, right_zeros, zeros_of
+from ftlm.analysis import dcgain, modes, polynomial_zeros, steady_states
+from ftlm.analysis.poles import _mode, characteristic, order_excesses
+from ftlm.analysis.polynomial_zeros import right_zeros, zeros_of
 from ftlm.analysis.time_response import response
 from ftlm.estimation.model_checks import has_growing_mode, stability_findings
 from ftlm.report.html_report import behavior_tables, stability_note
@@ -344,6 +345,25 @@ def test_a_pole_that_remains_without_the_excess_of_orders_is_not_due_to_it() -> 
     assert order_excesses(model(strong), coupling="simulated") == []
     assert [f.code for f in stability_findings(model(strong, coupling="simulated"))] == ["simulation_unbounded"]
     assert [f.code for f in stability_findings(model(strong, coupling="measured"))] == ["coupled_model_unstable"]
+
+
+def test_zeros_of_one_polynomial_are_sought_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    sought = []
+    for name in ("_newton_zeros", "_two_term_zeros"):
+        plain = getattr(polynomial_zeros, name)
+        monkeypatch.setattr(polynomial_zeros, name, lambda *a, plain=plain: (sought.append(1), plain(*a))[1])
+    words = "D^1.7312 y = -0.61237 D^0.8123 y - 9.0451 y + u"
+    first = modes(model(words))
+    count = len(sought)
+    assert count == 2
+    assert modes(model(words)) == first
+    assert len(stability_findings(model(words))) + len(sought) == count
+    # A caller may change the returned list.
+    polynomial = characteristic(model(words), coupled=True)[0]
+    zeros_of(polynomial).clear()
+    assert len(zeros_of(polynomial)) == len(first)
+    modes(model(words.replace("9.0451", "9.0452")))
+    assert len(sought) == 2 * count
 
 
 def test_equations_without_a_common_solution_have_no_poles() -> None:
