@@ -258,9 +258,9 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     def _render(self, template: str) -> str:
         fields: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
         # An option in the words of the one who loaded the run means nothing to the reader of a page.
-        otherwise = self.numbers.get("otherwise", "") if current_interface() in TYPED_INTERFACES else ""
-        otherwise = f"; otherwise {otherwise}" if otherwise else ""
-        fields |= {**self.numbers, "otherwise": otherwise, "option": _ParameterText(), "choose": _InterfaceText()}
+        override = self.numbers.get("override", "") if current_interface() in TYPED_INTERFACES else ""
+        override = f"; otherwise {override}" if override else ""
+        fields |= {**self.numbers, "override": override, "option": _ParameterText(), "choose": _InterfaceText()}
         try:
             if "{remedy}" in template:
                 fields["remedy"] = self.remedy
@@ -310,7 +310,7 @@ def mark_validation(findings: Iterable[Finding], run: str) -> list[Finding]:
     return [msgspec.structs.replace(f, run=f.run or run, role=VALIDATION_ROLE) for f in findings]
 
 
-def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def unique_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings in their sequence, without repetitions."""
     selection: list[Finding] = []
     for item in findings:
@@ -359,7 +359,7 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
     """
     order = list(finding_catalogue().topics)
     groups: dict[tuple[int, int, int], list[Finding]] = {}
-    for index, item in enumerate(unique(findings)):
+    for index, item in enumerate(unique_findings(findings)):
         singleton = index if item.kind.topic == "other" else 0
         groups.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), singleton), []).append(item)
     # Within a group, findings with their own remedy precede those with the remedy of their topic.

@@ -500,7 +500,7 @@ class Candidates:
         return scores, coefficients_table
 
     @check_arguments
-    def free_run(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
+    def simulate(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
         """Simulate the output with zero initial conditions for each tuple of orders and coefficients.
 
         Parameters

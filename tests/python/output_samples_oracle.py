@@ -622,7 +622,7 @@ class SampleResponses:
         drivers = dict.fromkeys(
             t.signal for e, t in read if t.signal != e.output and not (coupled and t.signal in outputs)
         )
-        if structure.has_friction or run.sample_times is not None or structure.all_filtered:
+        if structure.has_friction or run.nonuniform_samples is not None or structure.all_filtered:
             return None
         if any(name not in run for name in drivers) or any(
             t.order.constant > e.order.constant + ORDER_TOLERANCE for e, t in read

@@ -50,7 +50,7 @@ class Line:
 
     @classmethod
     def of(cls, run, structure, name, before):
-        own, delay = run.sample_times, structure.delay.get(name, 0.0)
+        own, delay = run.nonuniform_samples, structure.delay.get(name, 0.0)
         times, values = (run.time, run[name]) if own is None else (own.times, own.data[name])
         if delay:
             times, values = np.append(0.0, times + delay), np.append(before, values)
@@ -166,9 +166,9 @@ def acting(run, structure):
     if not names or not states or fastest_pole(sensor) * run.step > 1e3:
         return run
     changed = {n: run[n] - filter_transient(run[n], run.step, sensor, states) for n in names}
-    if run.sample_times is None:
+    if run.nonuniform_samples is None:
         return run.with_samples(changed)
-    own = run.sample_times
+    own = run.nonuniform_samples
     read = {n: own.data[n] - np.interp(own.times, run.time, run[n] - v) for n, v in changed.items()}
     return run.with_samples(changed, read)
 
@@ -194,7 +194,7 @@ def means_of(run, structure, name, m, at_rest):
         return kernels.pulse_means(np.append(rate, rate[-1]), m, hold=True)
     samples, delay, step = gapless(run[name]), structure.delay.get(name, 0.0), run.duration / m
     is_hold, before = run.intersample.get(name) == "zoh", 0.0 if at_rest else float(run[name][0])
-    if run.sample_times is not None and name not in run.missing_samples:
+    if run.nonuniform_samples is not None and name not in run.missing_samples:
         return Line.of(run, structure, name, before).means(m, step)
     if delay:
         intervals = run.length - 1
@@ -224,7 +224,7 @@ def pulses(run, structure, m, filtered):
 
 def experiment(run, structure, *, every=1, decimation=1):
     """A run on a grid with the samples to compare with, as the core takes it; nothing of its inputs is free."""
-    structure = structure.without_input_nonlinearities()
+    structure = structure.without_free_input_parameters()
     rows = (run.length - 1) // decimation * decimation + 1
     if rows != run.length:
         run = run.window(None, rows * run.step - run.step / 2)
@@ -241,7 +241,9 @@ def experiment(run, structure, *, every=1, decimation=1):
         for name in structure.signals:
             line = None
             if name in run:
-                line = Line.of(limited, structure, name, 0.0 if at_rest else float(limited.sample_times.data[name][0]))
+                line = Line.of(
+                    limited, structure, name, 0.0 if at_rest else float(limited.nonuniform_samples.data[name][0])
+                )
             values = None if line is None else line.at(times[sample_rows])
             signals.append((None if values is None or np.isnan(values).any() else values, False))
             jump_pair = None if line is None or not line.is_zero_order_hold else line.jumps()
@@ -289,6 +291,6 @@ def instant(run, structure, name, means, sensor, every, decimation):
 
 def records(run, structure, m, inputs):
     """Step, means and series of the measured signals, with given free numbers of inputs, all behind the filter."""
-    names = [item.name for item in structure.free_inputs]
-    fixed = replace(structure.with_inputs(dict(zip(names, inputs, strict=True))), coupling="measured")
+    names = [item.name for item in structure.free_input_parameters]
+    fixed = replace(structure.with_input_parameters(dict(zip(names, inputs, strict=True))), coupling="measured")
     return pulses(run, fixed, m, filtered=True)[:3]

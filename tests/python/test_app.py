@@ -394,7 +394,7 @@ def test_a_file_is_told_as_ftlm_open_tells_it(used, content, tmp_path):
     opened = ftlm.open_file(path).to_dict()
     assert json.loads(json.dumps(opened["columns"])) == file.preview["columns"]
     assert json.loads(json.dumps(opened["options"])) == file.preview["options"]
-    assert file.preview["assumed"] == [a.words for a in ftlm.open_file(path).assumed]
+    assert file.preview["assumptions"] == [a.evidence for a in ftlm.open_file(path).assumptions]
     shown = view.file(file)
     assert "300 rows, step 0.05 s, 14.95 s in all" in shown
     assert "by their names" in shown
@@ -575,7 +575,7 @@ def test_names_with_scripts_in_them_are_text(used, loop):
             **next(iter(used.desk.files.values())).preview,
             "kind": HOSTILE,
             "problem": HOSTILE,
-            "assumed": [HOSTILE],
+            "assumptions": [HOSTILE],
             "notes": [HOSTILE],
             "advice": [HOSTILE],
             "columns": [

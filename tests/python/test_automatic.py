@@ -170,7 +170,7 @@ def test_each_output_has_its_own_structure() -> None:
 
 def test_outputs_with_different_delays_have_no_free_delay_in_one_structure() -> None:
     found = ftlm.select(two_outputs(6), "auto", threads=1)
-    assert not found.winner.structure.free_inputs
+    assert not found.winner.structure.free_input_parameters
     assert "The outputs do not have the same delay" in found.reason
     # A higher order takes the place of the delay.
     assert found.fit["z"] > 95

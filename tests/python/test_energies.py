@@ -35,8 +35,8 @@ def imbalance(orders, samples):
     work = integrated(found.motor, run.step)
     went = integrated(found.inertia, run.step)
     for part in (found.elastic, found.hub_friction, found.link_friction):
-        went = went + part.stored + integrated(part.lost, run.step)
-        assert part.lost.min() >= 0.0
+        went = went + part.stored + integrated(part.dissipated, run.step)
+        assert part.dissipated.min() >= 0.0
         assert part.stored.min() >= 0.0
     return np.max(np.abs(work - went)) / np.max(np.abs(work))
 
@@ -72,7 +72,7 @@ def test_energies_and_forces_are_the_paper_s():
     # With whole orders what inertia takes is the kinetic energy, and the link gives back all that it took.
     assert alike(integrated(found.inertia, run.step), found.kinetic)
     assert alike(found.elastic.stored, found.potential)
-    assert not found.elastic.lost.any()
+    assert not found.elastic.dissipated.any()
     assert not found.hub_friction.stored.any()
 
 
@@ -84,7 +84,7 @@ def test_a_fractional_force_loses_in_a_cycle_what_its_phase_says(order):
     found = power(angle, 3.0, order, step)
     cycles = slice(-2501, -1)
     lost = 0.5 * 3.0 * frequency ** (1 + order) * np.sin(0.5 * np.pi * order)
-    assert np.mean(found.lost[cycles]) == pytest.approx(lost, rel=5e-3)
+    assert np.mean(found.dissipated[cycles]) == pytest.approx(lost, rel=5e-3)
     # The force itself, by the definition.
     rate = np.gradient(angle, step)
     derivative = ftlm.fractional_derivative(angle, order, step=step, definition="caputo", initial=[0.0, 0.0])
@@ -96,7 +96,7 @@ def test_between_whole_orders_storage_and_loss_are_between():
     angle = np.sin(t) ** 2
     for order, near in ((1e-6, 0.0), (1 - 1e-6, 1.0)):
         ours, whole = power(angle, 2.0, order, 0.01), power(angle, 2.0, near, 0.01)
-        for name in ("supplied", "stored", "lost"):
+        for name in ("supplied", "stored", "dissipated"):
             assert np.max(np.abs(getattr(ours, name) - getattr(whole, name))) < 1e-3
 
 

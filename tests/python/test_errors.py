@@ -170,6 +170,26 @@ BAD = {
         "unexpected keyword argument 'thread'; did you mean threads=",
         lambda: search(thread=2),
     ),
+    "a keyword of the structure": (
+        TypeError,
+        "argument 'delay'; it is an argument of structure=ftlm.equation(…, delay=…)",
+        lambda: ftlm.identify(run(), "D y = a y + b u", delay={"u": 0.1}),
+    ),
+    "a keyword of two methods": (
+        TypeError,
+        "it is an argument of method=ftlm.MultiInnovation(…, norm=…) or ftlm.InstrumentalVariables(…, norm=…)",
+        lambda: ftlm.identify(run(), "D y = a y + b u", norm="l1"),
+    ),
+    "a parameter of the equation as keyword": (
+        TypeError,
+        "alpha is in the equation: write its value there, or fix an order with ftlm.equation(…, orders={'alpha': …})",
+        lambda: ftlm.identify(run(), ftlm.equation("D^alpha y = a y + b u"), alpha=1.5),
+    ),
+    "a keyword that belongs nowhere": (
+        TypeError,
+        "argument 'tau'; known: runs, structure, method, initial",
+        lambda: ftlm.identify(run(), "D^alpha y = a y + b u", tau=1.5),
+    ),
     # Runs
     "no run": (DATA, "no run is given", lambda: identify([])),
     "no run to compare": (DATA, "no run is given", lambda: model().compare([])),

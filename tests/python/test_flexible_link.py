@@ -189,9 +189,9 @@ def test_both_stages():
     assert structure.outputs == ("theta11", "theta12", "theta21", "theta22")
     assert set(structure.order_names) == {*FREE[1], *FREE[2]}
     assert len(structure.coefficient_law) == 8
-    assert len(ftlm.flexible_link(form="published", stage="both", parameters="effective").reference) == 16
+    assert len(ftlm.flexible_link(form="published", stage="both", parameters="effective").nominal_values) == 16
     # Nominal values are those of one arm, so another arm has none.
-    assert structure.reference == ftlm.flexible_link(stage=2).reference == {}
+    assert structure.nominal_values == ftlm.flexible_link(stage=2).nominal_values == {}
     assert structure.name == "flexible link, both stages"
     first, second = ftlm.flexible_link(form="published", stage=1), ftlm.flexible_link(form="published", stage=2)
     assert structure.equations == first.equations + second.equations

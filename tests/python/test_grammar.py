@@ -203,6 +203,10 @@ def test_what_is_printed_is_read(structure):
         ("D y = a D y^2", "a power of D y at character 12 has two meanings; write (D y)^…"),
         ("D y = sin(w y) + u", "'y' at character 13 follows another name inside a non-linear term"),
         ("D y = tan(y) + u", r"tan(…) at character 7: of the functions of signals only"),
+        (
+            "D y = tahn(y) + u",
+            "'tahn' is no known function (did you mean 'tanh'?); of the functions of signals only sin",
+        ),
         ("D y = a y*sign(y) + u", "sign(…) at character 11: of the functions of signals only"),
         ("D y = abs(D^nu y) + u", "the order nu at character 11 is free inside a non-linear term"),
         ("D y = k D^0.5 (y^2)*u", "'*' at character 20 follows the derivative of an expression"),

@@ -314,7 +314,7 @@ def test_results_print_and_are_json(clean_a, plants):
     assert text.startswith(
         "flexible link, stage 1: multi-innovation, M = 256, p = 7, K0 = 100, haar rows, initial terms: rest"
     )
-    assert "(stated 628.889)" in text
+    assert "(nominal 628.889)" in text
     for line in str(found.comparison).splitlines()[:5]:
         assert line in text
     for warning in found.warnings:

@@ -47,7 +47,9 @@ def fitted(words: str, free: str, start: dict[str, float], **options: object) ->
     structure = replace(ftlm.equation(free), initial="rest", **options)
     joint = fit_output_error([first_run(words)], structure, start=start, refine=False)
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
-    solved = structure.with_orders(joint.orders).with_coefficients(joint.coefficients).with_inputs(joint.inputs)
+    solved = (
+        structure.with_orders(joint.orders).with_coefficients(joint.coefficients).with_input_parameters(joint.inputs)
+    )
     estimate = ftlm.Estimate(
         "output-error", ("first",), values, free=structs.replace(parameter_set(joint, structure), refinement=8)
     )

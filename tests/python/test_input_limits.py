@@ -241,7 +241,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
     found = ftlm.identify(noisy, ftlm.equation(FREE.format("sat(u, 0.1:3)"), initial="rest"), threads=1)
     path = found.model.save(tmp_path / "model.json")
     written = json.loads(path.read_text())
-    assert written["limits"] == [{"signal": "u", "law": "saturation", "value": found.limits["sat_u"]}]
+    assert written["limits"] == [{"signal": "u", "kind": "saturation", "value": found.limits["sat_u"]}]
     again = ftlm.load_model(path)
     assert again == found.model
     np.testing.assert_array_equal(again.simulate(noisy)["y"], found.model.simulate(noisy)["y"])

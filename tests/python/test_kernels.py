@@ -182,7 +182,7 @@ def test_coefficients_of_candidates_are_those_of_dense_columns(p, prior, rows):
 def test_scores_of_candidates_are_errors_of_their_simulations(norm):
     model, signals, tuples = candidates()
     scores, numbers = model.score(tuples, norm=norm)
-    simulated = model.free_run(tuples, numbers)
+    simulated = model.simulate(tuples, numbers)
     for order, own, outputs in zip(tuples, numbers, simulated, strict=True):
         gaps = order[0] - order[1:]
         divisor = np.eye(64) - own[0] * dense(kernels.block_pulse_kernel(gaps[0], 64, step=STEP))
@@ -222,7 +222,7 @@ def test_candidates_without_an_estimate_are_marked():
     none = model.score(np.zeros((0, 3)))
     assert none[0].shape == (0,)
     assert none[1].shape == (0, 2)
-    assert model.free_run(np.zeros((0, 3)), np.zeros((0, 2))).shape == (0, 8)
+    assert model.simulate(np.zeros((0, 3)), np.zeros((0, 2))).shape == (0, 8)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,7 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: PAIR.coefficients([[0.5, 0.1]], rows="fourier"), "rows = 'fourier' is not known"),
         (lambda: SHORT.coefficients([[0.5, 0.1]], p=7), "power of two"),
         (lambda: PAIR.score([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\); give \(1, 1\)"),
-        (lambda: PAIR.free_run([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\)"),
+        (lambda: PAIR.simulate([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\)"),
     ],
 )
 def test_wrong_arguments_are_refused_in_words(call, words):

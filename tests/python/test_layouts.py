@@ -544,7 +544,7 @@ DATED = {
 def test_the_order_of_dates_that_was_inferred_is_said_and_an_option(tmp_path, dates):
     path = write(tmp_path, "date,u,y\n" + "".join(f"{d},{k % 3},{k}\n" for k, d in enumerate(dates.split(","))))
     order, opened = DATED[dates], ftlm.open_file(path, **SIGNALS)
-    assert [a.value for a in opened.assumed if a.option == "dates"] == [order] * bool(order)
+    assert [a.value for a in opened.assumptions if a.option == "dates"] == [order] * bool(order)
     assert opened.options.get("layout", ftlm.Layout()).dates == (order or None)
     run = ftlm.load(path, **SIGNALS)
     assert any("dates begin with" in w for w in run.warnings) is bool(order)
@@ -560,7 +560,7 @@ def test_the_order_of_dates_that_was_inferred_is_said_and_an_option(tmp_path, da
 )
 def test_seconds_that_nobody_stated_are_said_and_an_option(tmp_path, title, assumed):
     opened = ftlm.open_file(write(tmp_path, f"{title},u,y\n" + rows()), **SIGNALS)
-    assert any(a.option == "time_unit" for a in opened.assumed) is assumed
+    assert any(a.option == "time_unit" for a in opened.assumptions) is assumed
     assert opened.options.get("time_unit") == ("s" if assumed else None)
     assert opened.load().step == opened.step
     # The default need not be typed.
@@ -583,7 +583,7 @@ def test_clocks_of_12_and_of_24_hours_in_one_column_are_refused(tmp_path, monkey
 def test_a_column_of_marks_for_missing_numbers_is_named(tmp_path):
     path = write(tmp_path, "t,u,y\n" + "".join(f"{k},N/A,{k}\n" for k in range(5)))
     opened = ftlm.open_file(path)
-    assert (opened.columns[1].role, opened.columns[1].words) == ("input", "empty")
+    assert (opened.columns[1].role, opened.columns[1].description) == ("input", "empty")
     assert "column 'u', line 2: 'N/A' stands for no number" in opened.problem
     words = write(tmp_path, "t,u,y\n" + "".join(f"{k},off,{k}\n" for k in range(5)))
     assert "no column of numbers is 'u' (line 2: 'off' is not a number)" in ftlm.open_file(words).problem

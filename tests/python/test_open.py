@@ -172,7 +172,7 @@ def test_a_spectrum_is_called_one(tmp_path, names):
 def test_a_run_of_ftlm_is_opened_as_one(tmp_path, small_run):
     small_run.to_csv(tmp_path / "run.csv")
     opened = ftlm.open_file(tmp_path / "run.csv")
-    assert (opened.problem, opened.assumed, opened.step) == ("", (), small_run.step)
+    assert (opened.problem, opened.assumptions, opened.step) == ("", (), small_run.step)
     assert [c.role for c in opened.columns] == ["time", "input", "output"]
     assert opened.load()["y"].tobytes() == small_run["y"].tobytes()
     assert shlex.split(opened.command("select"))[3:] == ["-u", "u", "-y", "y", "--structure", "auto"]
@@ -247,7 +247,7 @@ def test_several_inputs_drive_and_one_drives(tmp_path):
     for header, verb in (("t,u,y", "'u' is an input of 'y'"), ("t,u1,u2,y", "'u1', 'u2' are inputs of 'y'")):
         cells = header.count(",")
         (tmp_path / "run.csv").write_text(header + "\n" + "".join(f"{k}{f',{k % 3}' * cells}\n" for k in range(9)))
-        assert any(verb in a.words for a in ftlm.open_file(tmp_path / "run.csv").assumed)
+        assert any(verb in a.evidence for a in ftlm.open_file(tmp_path / "run.csv").assumptions)
 
 
 def test_a_written_columns_file_maps_columns_to_the_signals_of_a_structure(tmp_path):

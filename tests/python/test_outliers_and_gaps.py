@@ -256,27 +256,27 @@ def irregular(seed: int, share: float = 0.0, **options: object) -> tuple[ftlm.Ru
 def test_readings_keep_what_was_read() -> None:
     run, y = irregular(1)
     t, u, _ = record(1, 0.3)
-    assert run.sample_times is not None
-    assert np.array_equal(run.sample_times.times, t)
-    assert np.array_equal(run.sample_times.data["y"], y)
-    assert np.array_equal(run.sample_times.data["u"], u)
+    assert run.nonuniform_samples is not None
+    assert np.array_equal(run.nonuniform_samples.times, t)
+    assert np.array_equal(run.nonuniform_samples.data["y"], y)
+    assert np.array_equal(run.nonuniform_samples.data["u"], u)
     assert "outputs at their original times in output-error fits" in run.warnings[0]
     regular = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=STEP, resample=0.2)
-    assert regular.sample_times is None
+    assert regular.nonuniform_samples is None
     part = run.window(5.0, 20.0)
-    assert part.sample_times is not None
+    assert part.nonuniform_samples is not None
     inside = (t >= 5.0) & (t <= 20.0)
-    np.testing.assert_allclose(part.sample_times.data["y"][1:][: inside.sum()], y[inside])
-    assert part.sample_times.data["u"][0] == u[np.searchsorted(t, 5.0) - 1]
-    assert run.rename({"y": "z"}).sample_times.data.keys() == {"u", "z"}
-    assert np.array_equal(run.resample(0.05).sample_times.data["y"], y)
-    np.testing.assert_allclose(run.detrend().sample_times.data["y"], y - run["y"].mean(), atol=1e-12)
+    np.testing.assert_allclose(part.nonuniform_samples.data["y"][1:][: inside.sum()], y[inside])
+    assert part.nonuniform_samples.data["u"][0] == u[np.searchsorted(t, 5.0) - 1]
+    assert run.rename({"y": "z"}).nonuniform_samples.data.keys() == {"u", "z"}
+    assert np.array_equal(run.resample(0.05).nonuniform_samples.data["y"], y)
+    np.testing.assert_allclose(run.detrend().nonuniform_samples.data["y"], y - run["y"].mean(), atol=1e-12)
 
 
 @pytest.mark.parametrize(("every", "error"), [(2, 8e-3), (8, 5e-4), (16, 1.2e-4)])
 def test_readings_of_a_free_run_are_those_of_the_state_space(every: int, error: float) -> None:
     run, y = irregular(2)
-    times = run.sample_times.times[run.sample_times.indices_within(run.duration)]
+    times = run.nonuniform_samples.times[run.nonuniform_samples.indices_within(run.duration)]
     found, _ = simulate_samples(ftlm.Model(ftlm.equation(WORDS)), run, every, {}, times)
     assert np.abs(found[0] - y[: times.size]).max() < error * np.std(y)
 
@@ -376,7 +376,7 @@ def test_a_run_of_irregular_rows_is_identified_as_a_regular_one() -> None:
     assert found.comparison.measured["y"][0].size == found.comparison.times[0].size
     assert found.model.compare(run).fit["y"] == pytest.approx(found.fit["y"], abs=1e-9)
     # A third of the outputs gone as well: the same mechanism serves.
-    u, part = run.sample_times.data["u"], run.sample_times.data["y"].copy()
+    u, part = run.nonuniform_samples.data["u"], run.nonuniform_samples.data["y"].copy()
     part[::3] = np.nan
     both = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": part}, time=t, resample=STEP, missing="weight")
     fewer = ftlm.identify(both, ftlm.equation(FREE))
@@ -404,8 +404,8 @@ def test_further_outputs_are_on_the_grid() -> None:
     more = run.with_outputs({"z": np.arange(float(run.length))})
     assert more.outputs == ("y", "z")
     assert more["z"][7] == 7.0
-    assert more.sample_times is not None
-    assert more.sample_times.data["z"].size == more.sample_times.times.size
+    assert more.nonuniform_samples is not None
+    assert more.nonuniform_samples.data["z"].size == more.nonuniform_samples.times.size
     with pytest.raises(ftlm.DataError, match=r"'u' is an input"):
         run.with_outputs({"u": np.zeros(run.length)})
     with pytest.raises(ftlm.DataError, match=r"rows where"):

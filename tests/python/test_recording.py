@@ -130,7 +130,7 @@ def test_a_fit_compares_the_samples_of_the_definition(name, initial, gaps, own):
 def test_what_is_free_of_an_input_is_left_to_the_fit(law):
     run = make_run()
     structure = ftlm.equation(ONE, initial="rest", **{law: {"u": (0.05, 0.4)}})
-    plain = structure.without_input_nonlinearities()
+    plain = structure.without_free_input_parameters()
     means = recording(run, structure).pulses(160, False)[1]
     np.testing.assert_array_equal(means, recording(run, plain).pulses(160, False)[1])
 
@@ -165,7 +165,7 @@ def test_values_and_jumps_are_those_of_the_definition(kind):
     structure = structure_of("delays", "caputo")
     found, times = recording(run, structure), np.sort(np.random.default_rng(2).uniform(0, 4, 50))
     for k, name in enumerate(structure.signals):
-        line = oracle.Line.of(run, structure, name, float(run.sample_times.data[name][0]))
+        line = oracle.Line.of(run, structure, name, float(run.nonuniform_samples.data[name][0]))
         np.testing.assert_array_equal(found.values_at(k, times), line.at(times))
         jumps = found.jumps(k)
         if line.is_zero_order_hold:

@@ -439,7 +439,7 @@ def test_parameters_stand_beside_the_stated_ones(identified):
     table = parameter_table(identified.model)
     values = [row[1] for row in table.rows]
     assert values == [*identified.orders.values(), *identified.coefficients.values()]
-    stated = identified.model.structure.reference
+    stated = identified.model.structure.nominal_values
     assert [row[2] for row in table.rows[-8:]] == [stated[n] for n in identified.coefficients]
     plain = parameter_table(ftlm.Model(ftlm.equation("D y = a y + b u").with_coefficients({"a": -1, "b": 2})))
     assert plain.columns == ("parameter", "value", "unit", "what it is")

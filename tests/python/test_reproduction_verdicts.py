@@ -257,7 +257,9 @@ def test_optimizers_have_one_budget_and_bounds_that_do_not_know_the_maker_s_valu
     made = compare_optimizers(run, single, lattice, settings, threads=1)
     assert made.candidates == 224
     # The maker's 2271 is not the middle of anything.
-    other = compare_optimizers(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
+    other = compare_optimizers(
+        run, replace(single, nominal_values={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1
+    )
     genetic, evolution = made.optimizers.values()
     assert genetic.bounds == evolution.bounds == other.optimizers["genetic"].bounds
     assert genetic.errors == other.optimizers["genetic"].errors

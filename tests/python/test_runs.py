@@ -487,9 +487,9 @@ def test_resample_of_a_run():
         in finer.warnings[0]
     )
     # Values between the rows are not measurements; every second row is.
-    np.testing.assert_array_equal(finer.sample_times.data["y"], run["y"])
-    assert run.resample(0.02).sample_times is None
-    assert run.resample(0.015).sample_times is not None
+    np.testing.assert_array_equal(finer.nonuniform_samples.data["y"], run["y"])
+    assert run.resample(0.02).nonuniform_samples is None
+    assert run.resample(0.015).nonuniform_samples is not None
     back = finer.resample(0.01)
     for name in run.signals:
         np.testing.assert_allclose(back[name], run[name], atol=1e-15)

@@ -282,7 +282,7 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
 def test_auto_is_of_outputs_that_something_drives(runs):
     (problem,) = automatic_problems(runs)
     made = IntegerOrderForm(2, 1, delayed=True, integrator=True).structure(problem)
-    assert str(made.without_input_nonlinearities()) == "D^2 y = a1 D^1 y + b1 D^1 u + b0 u"
+    assert str(made.without_free_input_parameters()) == "D^2 y = a1 D^1 y + b1 D^1 u + b0 u"
     assert list(made.free_delays) == ["u"]
     pair = [ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})]
     first, second = automatic_problems(pair, driven_by={"z": ["y"]})

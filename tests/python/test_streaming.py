@@ -84,7 +84,7 @@ def test_a_term_of_higher_order_than_the_output_is_streamed():
     stream.push(samples(stream, run))
     found, batched = stream.coefficients, batch(run, structure, prior_covariance=1e10)
     for name in ("a1", "b1", "g1", "a2", "b2"):
-        assert found[name] == pytest.approx(structure.reference.get(name, -1.0), rel=0.01), name
+        assert found[name] == pytest.approx(structure.nominal_values.get(name, -1.0), rel=0.01), name
         assert found[name] == pytest.approx(batched[name], rel=0.01), name
 
 

@@ -36,7 +36,7 @@ def check_no_input_nonlinearity(model: Model, operation: str) -> None:
     """Raise ModelError if an input has a saturation or a dead zone; `operation` names the linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
-            f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {operation} cannot "
+            f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.kind]} before it acts, which {operation} cannot "
             "represent; "
             "use simulations (simulate, compare), or a model of the equation without it"
         )
@@ -318,8 +318,8 @@ def parameter_vector(model: Model) -> Floats:
     """Return all orders and coefficients of a model as a vector, equation by equation, then its input parameters.
 
     An equation contributes alpha, then order and coefficient of each term, then the parameters of its friction. The
-    coefficient of a term includes its known factor. The input parameters are those of ``Structure.fixed_inputs``:
-    delays, saturations and dead zones.
+    coefficient of a term includes its known factor. The input parameters, delays, saturations and dead
+    zones, are those of ``Structure.fixed_input_parameters``.
     """
     parameters: list[float] = []
     for equation in model.equations:
@@ -327,8 +327,8 @@ def parameter_vector(model: Model) -> Floats:
             equation.order.constant,
             *(v for t in equation.terms for v in (t.order.constant, float(t.fixed or 0.0))),
         ]
-        parameters += [] if equation.friction is None else equation.friction.numbers
-    return np.array([*parameters, *model.structure.fixed_inputs.values()])
+        parameters += [] if equation.friction is None else equation.friction.parameter_values
+    return np.array([*parameters, *model.structure.fixed_input_parameters.values()])
 
 
 def with_parameter_vector(model: Model, parameters: Floats) -> Model:
@@ -345,11 +345,14 @@ def with_parameter_vector(model: Model, parameters: Floats) -> Model:
         friction = (
             None
             if equation.friction is None
-            else equation.friction.with_numbers([next(values) for _ in equation.friction.numbers])
+            else equation.friction.with_parameter_values([next(values) for _ in equation.friction.parameter_values])
         )
         equations.append(_replace_unchecked(equation, alpha, tuple(terms), friction))
     structure = replace(model.structure, equations=tuple(equations))
-    return replace(model, structure=structure.with_inputs({name: next(values) for name in structure.fixed_inputs}))
+    return replace(
+        model,
+        structure=structure.with_input_parameters({name: next(values) for name in structure.fixed_input_parameters}),
+    )
 
 
 def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Iterator[tuple[int, float, Model, Model]]:
@@ -373,7 +376,7 @@ def _replace_unchecked(
     Numerical derivatives at a limit of the range require orders beyond the limit.
     """
     copied = copy.copy(equation)
-    vars(copied).update(order=order, terms=terms, coulomb=UNSET if friction is None else friction)
+    vars(copied).update(order=order, terms=terms, friction=friction)
     return copied
 
 
@@ -386,9 +389,11 @@ def linear_part(model: Model) -> Model:
     structure, is_linear = model.structure, list[bool]()
     for equation in model.equations:
         is_linear += [True] * (1 + 2 * len(equation.terms))
-        is_linear += [False] * (0 if equation.friction is None else len(equation.friction.numbers))
-    is_linear += [True] * len(structure.delay) + [False] * (len(structure.fixed_inputs) - len(structure.delay))
-    equations = tuple(replace(e, coulomb=UNSET) for e in structure.equations)
+        is_linear += [False] * (0 if equation.friction is None else len(equation.friction.parameter_values))
+    is_linear += [True] * len(structure.delay) + [False] * (
+        len(structure.fixed_input_parameters) - len(structure.delay)
+    )
+    equations = tuple(replace(e, friction=None) for e in structure.equations)
     matrix, estimate = covariance_of(model), model.estimate
     if matrix is not None and estimate is not None:
         rows = tuple(tuple(row) for row in matrix[np.ix_(is_linear, is_linear)].tolist())

@@ -222,7 +222,9 @@ class FitRequest:
 
     def _time_estimate(self, run: Run, structure: Structure) -> str:
         """Return the estimated duration of an output-error fit as text; empty for a short fit or another method."""
-        parameter_count = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+        parameter_count = (
+            len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_input_parameters)
+        )
         seconds = estimate_duration(
             output_error_cost(run.length * len(structure.outputs), parameter_count), check_threads(None)
         )
@@ -467,7 +469,7 @@ def _text(texts: Mapping[str, Any], name: str) -> str:
 #: Maximum number of outputs, and of inputs, for which structures are suggested; longer lists are not readable.
 MAX_SUGGESTED_SIGNALS = 6
 #: Upper bound of the delay in a suggested structure, as a fraction of the duration of the run.
-MAX_DELAY_FRACTION = 0.1
+SUGGESTED_DELAY_FRACTION = 0.1
 
 
 @cache
@@ -488,7 +490,7 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
     suggestions: list[dict[str, str]] = []
     input_names = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
-        delay_range = f"0:{MAX_DELAY_FRACTION * duration:.2g} s"
+        delay_range = f"0:{SUGGESTED_DELAY_FRACTION * duration:.2g} s"
         terms = {
             "inputs": "".join(f" + b{k} {name}" for k, name in enumerate(input_names)),
             "delayed_inputs": "".join(f" + b{k} {name}(t - {delay_range})" for k, name in enumerate(input_names)),

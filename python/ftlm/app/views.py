@@ -18,7 +18,7 @@ from ftlm.data.units import SIGNAL_UNITS, TIME_UNITS
 from ftlm.estimation.verdict import verdict
 from ftlm.io.dialect import DATE_ORDERS, DECIMAL_CHARACTERS, SEPARATOR_CHARACTERS, THOUSANDS_CHARACTERS
 from ftlm.plot.comparison_charts import comparison_charts
-from ftlm.report.html_report import behavior_tables, first_findings, title_of, verdict_box
+from ftlm.report.html_report import behavior_tables, first_findings, model_title, verdict_box
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import read_resource, style_sheet, templates
@@ -157,7 +157,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
     tables = [parameter_table(result.model, result.joint, result.offsets), *behavior_tables(result.model)]
     choice = fitted_model.choice
     return {
-        "title": title_of(result.model),
+        "title": model_title(result.model),
         "verdict": overall_verdict.to_dict(),
         "box": str(verdict_box(overall_verdict)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],

@@ -101,7 +101,7 @@ def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
         "rows": opened.rows,
         "columns": description["columns"][:MAX_SHOWN_COLUMNS],
         "hidden": max(len(opened.columns) - MAX_SHOWN_COLUMNS, 0),
-        "assumed": [a.words for a in opened.assumed],
+        "assumptions": [a.evidence for a in opened.assumptions],
         "options": description["options"],
         "step": opened.step,
         "problem": opened.problem,

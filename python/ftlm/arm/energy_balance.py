@@ -43,13 +43,13 @@ class Power:
         Supplied power [W]: c D^nu theta times the rate of theta.
     stored
         Stored (recoverable) energy [J]: all supplied energy for a spring (nu = 0), 0 for a dashpot (nu = 1).
-    lost
+    dissipated
         Dissipated power [W], never negative.
     """
 
     supplied: Floats
     stored: Floats
-    lost: Floats
+    dissipated: Floats
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     rates = np.exp(low + width * (np.arange(count) + 0.5))
     spring, dashpot = scale * math.exp(low * order) / order, scale * math.exp(high * (order - 1.0)) / (1.0 - order)
     force = spring * angle + dashpot * rate
-    stored, lost = 0.5 * spring * angle**2, dashpot * rate**2
+    stored, dissipated = 0.5 * spring * angle**2, dashpot * rate**2
     k = np.arange(angle.size)
     for w, weight in zip(rates.tolist(), (scale * width * rates**order).tolist(), strict=True):
         # z is exact for an angle that is linear between samples.
@@ -247,5 +247,5 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
         z = _core.series_multiply(decay, increments, angle.size)
         force += weight * z
         stored += 0.5 * weight * z**2
-        lost += weight * w * z**2
-    return Power(coefficient * force * rate, coefficient * stored, coefficient * lost)
+        dissipated += weight * w * z**2
+    return Power(coefficient * force * rate, coefficient * stored, coefficient * dissipated)

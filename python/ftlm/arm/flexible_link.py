@@ -10,8 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from msgspec import UNSET
-
 from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
@@ -381,14 +379,14 @@ def flexible_link(
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
     equations: list[Equation] = []
     coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
-    reference: dict[str, float] = {}
+    nominal_values: dict[str, float] = {}
     for j in stages:
         order_option = input_order if form == "published" else None
         orders = order_law(j, form=form, input_order=order_option, velocities="velocities" in laws)
         pair = _joint_equations(j, form, orders, laws, bool(friction) and coupling == "measured")
         if friction and coupling == "simulated":
-            stribeck = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
-            pair = (replace(pair[0], coulomb=Friction(f"fc{j}", more=stribeck)), pair[1])
+            stribeck = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else None
+            pair = (replace(pair[0], friction=Friction(f"fc{j}", stribeck=stribeck)), pair[1])
         if cross_stage:
             pair = (
                 _add_cross_inertia(pair, j, laws, stage == "both")
@@ -412,7 +410,7 @@ def flexible_link(
         if parameters is not None:
             link = PARAMETER_SETS[parameters][j]
             values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
-            reference |= {n: v for n, v in values.items() if any(n in e.coefficient_names for e in equations)}
+            nominal_values |= {n: v for n, v in values.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
         signals = {s for e in equations for s in e.signals}
         sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in signals])
@@ -423,7 +421,7 @@ def flexible_link(
         coupling=coupling,
         sensor_filter=sensor_filter,
         coefficient_law=tuple(coefficient_law) if "coefficients" in laws and hub else (),
-        reference=reference,
+        nominal_values=nominal_values,
         name=f"{FLEXIBLE_LINK}, stage {stage}" if stage != "both" else f"{FLEXIBLE_LINK}, both stages",
         hints=_hints(form),
         offset=check_offset(offset),
@@ -599,7 +597,7 @@ def link_model(
         coupling=coupling,
         parameters=parameters_name,
     )
-    values = dict(structure.reference)
+    values = dict(structure.nominal_values)
     if not isinstance(parameters, str):
         for j, link in parameters.items():
             link_values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)

@@ -136,7 +136,9 @@ def select_structure(
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
     """Return the expected total time [s] of `fits` output-error fits, each to an equal share of the samples."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
-    parameter_count = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+    parameter_count = (
+        len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_input_parameters)
+    )
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), parameter_count), check_threads(threads))
 
 

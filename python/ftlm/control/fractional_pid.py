@@ -639,9 +639,9 @@ def least_certain_parameter(model: Model) -> str:
             )
         ]
         names += [f"the friction of {equation.output}"] * (
-            0 if equation.friction is None else len(equation.friction.numbers)
+            0 if equation.friction is None else len(equation.friction.parameter_values)
         )
-    names += list(model.structure.fixed_inputs)
+    names += list(model.structure.fixed_input_parameters)
     relative_errors = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(parameter_vector(model)), 1e-12)
     at = int(np.argmax(np.nan_to_num(relative_errors, nan=0.0, posinf=1e300)))
     return f"the most uncertain is {names[at]}, with a standard error of {100 * relative_errors[at]:.2g} %"

@@ -39,7 +39,7 @@ from ftlm.data.units import TIME_UNITS, check_units
 from ftlm.errors import DataError
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal_name, join_names
+from ftlm.utils.validation import Floats, bad_rows_error, check_run_name, check_signal_name, join_names
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class RunArguments:
             _intersample=intersample,
             notes=tuple(dict.fromkeys(all_notes)),
             _metadata=dict(self.metadata),
-            sample_times=nonuniform_samples,
+            nonuniform_samples=nonuniform_samples,
         )
 
     def _insert_missing_samples(
@@ -189,7 +189,7 @@ class RunArguments:
                 count = int((~is_missing).sum())
                 if count < MIN_RUN_SAMPLES:
                     problem = f"{count} values, but {MIN_RUN_SAMPLES} are needed"
-                    raise bad_rows(self.label_of(name), problem, 0, int(is_missing.sum()), "use a longer record")
+                    raise bad_rows_error(self.label_of(name), problem, 0, int(is_missing.sum()), "use a longer record")
                 notes.append(
                     describe_missing(
                         f"output {name}", is_missing, "they have no weight in output-error fits and figures"

@@ -205,7 +205,7 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
             run.outputs,
             run.units,
             dict(run.intersample),
-            run.notes if run.sample_times is None else (*run.notes, OMITTED_TIMES_NOTE),
+            run.notes if run.nonuniform_samples is None else (*run.notes, OMITTED_TIMES_NOTE),
             run.metadata,
             tuple(n for n in run.outputs if missing_mask(run[n]).any()),
         )

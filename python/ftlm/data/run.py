@@ -42,7 +42,15 @@ from ftlm.svg.figure import Figures
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
-from ftlm.utils.validation import Floats, as_mapping, bad_rows, check_signal_name, join_names, names_to_columns, nearest
+from ftlm.utils.validation import (
+    Floats,
+    as_mapping,
+    bad_rows_error,
+    check_signal_name,
+    join_names,
+    names_to_columns,
+    nearest,
+)
 
 if TYPE_CHECKING:
     from ftlm.validation.data_advice import Advice, Inspection
@@ -70,7 +78,7 @@ class Run:
         Names of the signals.
     notes : tuple of str
         Notes on processing and, for a rig, on the recording.
-    sample_times : NonuniformSamples or None
+    nonuniform_samples : NonuniformSamples or None
         Original samples at nonuniform times; None if all samples lie on the uniform grid. With nonuniform samples, the
         grid has interval means of zero-order-hold inputs and linear interpolations of all other signals.
     unmasked_run : Run or None
@@ -84,7 +92,7 @@ class Run:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     notes: tuple[str, ...]
-    sample_times: NonuniformSamples | None
+    nonuniform_samples: NonuniformSamples | None
     _data: dict[str, Floats]
     _units: dict[str, str]
     _intersample: dict[str, Intersample]
@@ -108,12 +116,12 @@ class Run:
         """Return a run from validated fields; arrays become read-only, and only data of the named signals are kept."""
         run = object.__new__(cls)
         vars(run).update(values)
-        samples = run.sample_times
+        samples = run.nonuniform_samples
         if samples is not None:
             data = {s: make_read_only(samples.data[s]) for s in run.signals}
             samples = NonuniformSamples(make_read_only(samples.times), data)
         vars(run).update(
-            sample_times=samples,
+            nonuniform_samples=samples,
             _data={s: make_read_only(run._data[s]) for s in run.signals},
             _units={s: run._units[s] for s in run.signals},
             _intersample={s: run._intersample[s] for s in run.inputs},
@@ -159,9 +167,9 @@ class Run:
             Name of the run in reports.
         resample : float, optional
             New step [s], to which the run is resampled: interval means of zero-order-hold inputs, linear interpolation
-            of all other signals. `warnings` lists this. Unless every new row is an original row, `sample_times` keeps
-            the original samples: the output error is simulated with the original inputs and evaluated at the original
-            output times. Equation-error methods use the resampled signals.
+            of all other signals. `warnings` lists this. Unless every new row is an original row, `nonuniform_samples`
+            keeps the original samples: the output error is simulated with the original inputs and evaluated at the
+            original output times. Equation-error methods use the resampled signals.
         window : pair of float or None, optional
             Times (a, b) [s] since the first row: only rows with a ≤ t < b are used. The window is applied before any
             other check of the rows.
@@ -292,9 +300,9 @@ class Run:
     def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
         """Boolean mask of missing samples, by name of every output that has missing samples.
 
-        The samples are those of `sample_times` if it is not None, otherwise those of the uniform grid.
+        The samples are those of `nonuniform_samples` if it is not None, otherwise those of the uniform grid.
         """
-        data = self._data if self.sample_times is None else self.sample_times.data
+        data = self._data if self.nonuniform_samples is None else self.nonuniform_samples.data
         masks = {name: missing_mask(data[name]) for name in self.outputs}
         return {name: rows for name, rows in masks.items() if rows.any()}
 
@@ -372,10 +380,10 @@ class Run:
         data = {name: values[first:last] for name, values in self._data.items()}
         # Digits beyond the twelfth are rounding errors of the sum.
         start_time = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
-        nonuniform = self.sample_times
+        nonuniform = self.nonuniform_samples
         if nonuniform is not None:
             nonuniform = nonuniform.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
-        return self._replace(_data=data, start=start_time, sample_times=nonuniform)
+        return self._replace(_data=data, start=start_time, nonuniform_samples=nonuniform)
 
     def split(self, duration: float) -> list[Run]:
         """Split this run into consecutive runs whose lengths differ by at most one row.
@@ -428,14 +436,14 @@ class Run:
             If `step` is not positive, or gives fewer than three rows or more than 50 million.
         """
         new_step = check_step(step, "resample")
-        times, nonuniform = uniform_times(self.length, self.step), self.sample_times
+        times, nonuniform = uniform_times(self.length, self.step), self.nonuniform_samples
         if nonuniform is None and (self.missing_samples or not rows_coincide(times, new_step)):
             nonuniform = NonuniformSamples(times, self._data)
         source = nonuniform or NonuniformSamples(times, self._data)
         data = resample_uniform(source.times, source.data, self._intersample, new_step)
         how = describe_resampled_signals(self._intersample, keep_times=nonuniform is not None)
         note = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
-        return self._replace(_data=data, step=new_step, notes=(*self.notes, note), sample_times=nonuniform)
+        return self._replace(_data=data, step=new_step, notes=(*self.notes, note), nonuniform_samples=nonuniform)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of signals subtracted from them.
@@ -465,33 +473,35 @@ class Run:
         unknown = next((name for name in names if name not in self), None)
         if unknown is not None:
             raise self._unknown_signal_error(unknown)
-        data, run_notes, nonuniform = dict(self._data), list(self.notes), self.sample_times
+        data, run_notes, nonuniform = dict(self._data), list(self.notes), self.nonuniform_samples
         for name in names:
             trend, text = fit_trend(self._data[name], self.step, linear=kind == "linear")
             data[name] = self._data[name] - trend(self.time)
             if nonuniform is not None:
                 nonuniform = nonuniform.replace_signals(**{name: nonuniform.data[name] - trend(nonuniform.times)})
             run_notes.append(f"detrended: {text} subtracted from {name}")
-        return self._replace(_data=data, notes=tuple(run_notes), sample_times=nonuniform)
+        return self._replace(_data=data, notes=tuple(run_notes), nonuniform_samples=nonuniform)
 
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
         """Return this run with the given saturations and dead zones, which must be fixed, applied to its inputs."""
-        data, nonuniform = dict(self._data), self.sample_times
+        data, nonuniform = dict(self._data), self.nonuniform_samples
         for limit in limits:
             data[limit.signal] = limit.apply(data[limit.signal])
             if nonuniform is not None:
                 nonuniform = nonuniform.replace_signals(**{limit.signal: limit.apply(nonuniform.data[limit.signal])})
-        return self._replace(_data=data, sample_times=nonuniform)
+        return self._replace(_data=data, nonuniform_samples=nonuniform)
 
-    def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
+    def with_samples(
+        self, samples: Mapping[str, Floats], nonuniform_samples: Mapping[str, Floats] | None = None
+    ) -> Run:
         """Return this run with some of its signals replaced by new samples.
 
         Parameters
         ----------
         samples : mapping of str to array
             New samples by name, shape (N,), in SI units. Only outputs may have missing (NaN or masked) samples.
-        read : mapping of str to array, optional
-            New samples by name at the times of `sample_times`; ignored if the run has none.
+        nonuniform_samples : mapping of str to array, optional
+            New samples by name at the times of `nonuniform_samples` of the run; ignored if the run has none.
 
         Raises
         ------
@@ -499,11 +509,13 @@ class Run:
             If a name is not a signal of this run, the number of values differs, or a value of an input is not finite.
         """
         checked = self._checked_samples("samples", samples, self.length)
-        nonuniform = self.sample_times
+        nonuniform = self.nonuniform_samples
         if nonuniform is not None:
-            values = {} if read is None else read
-            nonuniform = nonuniform.replace_signals(**self._checked_samples("read", values, nonuniform.times.size))
-        return self._replace(_data={**self._data, **checked}, sample_times=nonuniform)
+            values = {} if nonuniform_samples is None else nonuniform_samples
+            nonuniform = nonuniform.replace_signals(
+                **self._checked_samples("nonuniform_samples", values, nonuniform.times.size)
+            )
+        return self._replace(_data={**self._data, **checked}, nonuniform_samples=nonuniform)
 
     def with_unmasked_run(self, run: Run) -> Run:
         """Return this run with `unmasked_run` set to the original run, whose first samples give the initial state."""
@@ -553,10 +565,10 @@ class Run:
             _data={renamed[name]: values for name, values in self._data.items()},
             _units={renamed[name]: unit for name, unit in self._units.items()},
             _intersample={renamed[name]: kind for name, kind in self._intersample.items()},
-            sample_times=None
-            if self.sample_times is None
+            nonuniform_samples=None
+            if self.nonuniform_samples is None
             else NonuniformSamples(
-                self.sample_times.times, {renamed[name]: v for name, v in self.sample_times.data.items()}
+                self.nonuniform_samples.times, {renamed[name]: v for name, v in self.nonuniform_samples.data.items()}
             ),
         )
 
@@ -578,7 +590,9 @@ class Run:
             If a name is not an input or a value is neither "zoh" nor "foh".
         """
         intersample = {**self._intersample, **check_intersample(mapping, self.inputs)}
-        data = self._data if self.sample_times is None else self.sample_times.resample(intersample, self.step)
+        data = (
+            self._data if self.nonuniform_samples is None else self.nonuniform_samples.resample(intersample, self.step)
+        )
         return self._replace(_intersample=intersample, _data={n: v[: self.length] for n, v in data.items()})
 
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
@@ -605,7 +619,7 @@ class Run:
                 raise DataError(f"with_outputs: {name!r} is an input of run {self.name!r}; give it another name")
             check_lengths({f"run {self.name!r}": self.length, f"output {name!r}": numbers.size})
             check_values(numbers, f"output {name!r}", 0)
-        nonuniform = self.sample_times
+        nonuniform = self.nonuniform_samples
         if nonuniform is not None:
             nonuniform = nonuniform.replace_signals(
                 **{n: np.interp(nonuniform.times, self.time, v) for n, v in values_by_name.items()}
@@ -614,7 +628,7 @@ class Run:
             outputs=tuple(dict.fromkeys([*self.outputs, *values_by_name])),
             _data={**self._data, **values_by_name},
             _units={**dict.fromkeys(values_by_name, ""), **self._units},
-            sample_times=nonuniform,
+            nonuniform_samples=nonuniform,
         )
 
     def select(self, names: Iterable[str]) -> Run:
@@ -676,7 +690,7 @@ class Run:
                     "check the sensor and the column, or load a part of the record in which it moves with "
                     f"{parameter('window')}"
                 )
-                raise bad_rows(label, fault, 0, values.size, remedy)
+                raise bad_rows_error(label, fault, 0, values.size, remedy)
 
     def plot(self, *signals: str) -> Figures:
         """Return plots of the given signals (default all) over time, outputs first; see also ``ftlm.plot.run``.
@@ -729,8 +743,8 @@ class Run:
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object with name, step, start, inputs, outputs, units,
         intersample and warnings. A run with metadata also has ``about``. A header ``t_s,…`` and the samples follow,
-        with ``nan`` for missing outputs. Only the samples on the grid are written, not `sample_times`. The file is
-        written under a temporary name and renamed, so that readers never see an incomplete file.
+        with ``nan`` for missing outputs. Only the samples on the grid are written, not `nonuniform_samples`. The
+        file is written under a temporary name and renamed, so that readers never see an incomplete file.
 
         Parameters
         ----------

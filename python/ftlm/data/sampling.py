@@ -16,7 +16,7 @@ from ftlm import _core
 from ftlm.errors import DataError
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, parameter
-from ftlm.utils.validation import Floats, Scalar, as_array, as_mapping, bad_rows, join_names, nearest
+from ftlm.utils.validation import Floats, Scalar, as_array, as_mapping, bad_rows_error, join_names, nearest
 
 Intersample: TypeAlias = Literal["zoh", "foh"]
 # Every estimator squares values; larger ones overflow in double precision.
@@ -102,7 +102,7 @@ def as_vector(values: object, label: str, *, gaps: bool = False) -> tuple[Floats
     if array.dtype.kind == "O" and getattr(getattr(values, "dtype", None), "kind", "O") in "biuf":
         array = cast("Any", values).to_numpy(dtype=np.float64, na_value=np.nan)
     if array.dtype.kind in "USTO" or (array.ndim == 1 and array.dtype.kind in "MmV"):
-        raise _not_numbers(values, array, label)
+        raise _not_numbers_error(values, array, label)
     if array.ndim != 1:
         raise DataError(
             f"{label}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
@@ -112,9 +112,9 @@ def as_vector(values: object, label: str, *, gaps: bool = False) -> tuple[Floats
     if array.dtype.kind == "c":
         rows = np.flatnonzero(np.imag(array) != 0)
         first, count = (int(rows[0]), rows.size) if rows.size else (0, array.size)
-        raise bad_rows(label, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
+        raise bad_rows_error(label, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
     if array.dtype.kind not in "biuf":
-        raise _not_numbers(values, array, label)
+        raise _not_numbers_error(values, array, label)
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C"), array.dtype
 
@@ -154,9 +154,11 @@ def _to_universal_time(date: Any) -> Any:
     return date if zone is None else date.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
-def _not_numbers(values: object, array: npt.NDArray[Any], label: str) -> DataError:
+def _not_numbers_error(values: object, array: npt.NDArray[Any], label: str) -> DataError:
     if array.dtype.kind in "Mm":
-        return bad_rows(label, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
+        return bad_rows_error(
+            label, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first"
+        )
     if array.ndim == 0:
         return DataError(f"{label}: {_abbreviate(array.item())} is not an array; pass one number per row")
     # NumPy turns a list of numbers and text into an array of text; the list still distinguishes them.
@@ -164,9 +166,9 @@ def _not_numbers(values: object, array: npt.NDArray[Any], label: str) -> DataErr
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
         problem = f"objects, not numbers (dtype {array.dtype})"
-        return bad_rows(label, problem, 0, len(flat), "use np.asarray(x, dtype=float)")
+        return bad_rows_error(label, problem, 0, len(flat), "use np.asarray(x, dtype=float)")
     problem = "missing value None" if flat[bad[0]] is None else f"{_abbreviate(flat[bad[0]])} is not a number"
-    return bad_rows(label, problem, bad[0], len(bad), "convert it to numbers first")
+    return bad_rows_error(label, problem, bad[0], len(bad), "convert it to numbers first")
 
 
 def _abbreviate(value: object) -> str:
@@ -223,13 +225,13 @@ def check_values(values: Floats, label: str, offset: int, *, gaps: bool = False,
     first, count = offset + int(rows[0]), rows.size
     advice = f"avoid them with {parameter('window')}"
     if math.isnan(value):
-        raise bad_rows(label, "NaN", first, count, f"remove or fill these rows yourself, or {remedy or advice}")
+        raise bad_rows_error(label, "NaN", first, count, f"remove or fill these rows yourself, or {remedy or advice}")
     if math.isinf(value):
-        raise bad_rows(
+        raise bad_rows_error(
             label, f"infinity ({value})", first, count, f"correct these rows, or avoid them with {parameter('window')}"
         )
     problem = f"{value!r} is larger than {MAX_SAMPLE_VALUE:g} and its square overflows"
-    raise bad_rows(
+    raise bad_rows_error(
         label, problem, first, count, f"correct these rows, scale the signal, or avoid them with {parameter('window')}"
     )
 
@@ -237,7 +239,7 @@ def check_values(values: Floats, label: str, offset: int, *, gaps: bool = False,
 def masked_rows_error(label: str, problem: str, is_bad: NDArray[np.bool_], remedy: str, offset: int = 0) -> DataError:
     """Return a DataError that names the first row where `is_bad` is True; rows are counted from `offset`."""
     rows = np.flatnonzero(is_bad)
-    return bad_rows(label, problem, offset + int(rows[0]), rows.size, remedy)
+    return bad_rows_error(label, problem, offset + int(rows[0]), rows.size, remedy)
 
 
 def check_increasing(times: Floats, label: str, offset: int) -> None:
@@ -249,9 +251,11 @@ def check_increasing(times: Floats, label: str, offset: int) -> None:
     row, (earlier, later) = offset + row_before + 1, times[row_before : row_before + 2].tolist()
     if steps[row_before] == 0:
         remedy = "remove the repeated rows, or write the time with more digits"
-        raise bad_rows(label, f"repeated time {later!r} s", row, int((steps == 0).sum()), remedy)
+        raise bad_rows_error(label, f"repeated time {later!r} s", row, int((steps == 0).sum()), remedy)
     remedy = "sort the rows, or split the file where the clock starts again"
-    raise bad_rows(label, f"decreasing time, {later!r} s after {earlier!r} s", row, int((steps < 0).sum()), remedy)
+    raise bad_rows_error(
+        label, f"decreasing time, {later!r} s after {earlier!r} s", row, int((steps < 0).sum()), remedy
+    )
 
 
 def regular_step(
@@ -293,7 +297,7 @@ def regular_step(
                 f"empty outputs, and use {parameter('missing', 'weight')}; or, only if no input changed there, "
                 f"{parameter('missing', 'hold')} or {parameter('resample', Placeholder('STEP'))}"
             )
-            raise bad_rows(label, problem, offset + int(gaps[0]) + 1, gaps.size, remedy)
+            raise bad_rows_error(label, problem, offset + int(gaps[0]) + 1, gaps.size, remedy)
         problem = f"jitter of up to {100.0 * max_deviation / mean:.3g} % of the mean step {mean:.6g} s"
         problem += f" ({100 * _MAX_JITTER_FRACTION:g} % allowed)"
         remedy = (
@@ -373,7 +377,7 @@ def window_rows(times: Floats, window: object, label: str = "time") -> tuple[int
     if not np.isfinite(end_times).all():
         row, count = 0 if not np.isfinite(end_times[0]) else times.size - 1, int((~np.isfinite(times)).sum())
         remedy = f"remove these rows; {parameter('window')} counts from the first time"
-        raise bad_rows(label, "the first or last time is not finite", row, count, remedy)
+        raise bad_rows_error(label, "the first or last time is not finite", row, count, remedy)
     with np.errstate(over="ignore", invalid="ignore"):
         elapsed = times - times[0]
         steps = np.diff(elapsed)

@@ -51,7 +51,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
             "loop that is not in the model; give such a signal"
         )
     for run in runs:
-        if run.sample_times is not None:
+        if run.nonuniform_samples is not None:
             raise DataError(
                 f"run {run.name!r} has nonuniform sample times, but the response of an input to "
                 f"{parameter('reference')} is estimated on a regular grid; resample the run"

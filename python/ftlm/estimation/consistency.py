@@ -36,7 +36,7 @@ DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "disjoint", "overlap", "not
 MAX_ASYMMETRY_RATIO = 2.0
 #: Two runs differ by a delay if the model of one run fits the other run once its inputs are shifted. Maximum shift
 #: [samples], maximum residual relative to that without a shift, and relative to that of the other run's own model.
-MAX_SHIFT_ROWS, MAX_SHIFTED_SHARE, MAX_OWN_RATIO = 2, 0.5, 1.1
+MAX_SHIFT_ROWS, MAX_SHIFTED_RATIO, MAX_OWN_RATIO = 2, 0.5, 1.1
 
 
 @dataclass(frozen=True)
@@ -369,7 +369,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
     findings = []
     for (k, piece), (j, result) in itertools.product(enumerate(pieces), enumerate(results)):
         inputs = [n for n in result.model.structure.signals if n in piece.inputs]
-        if k == j or piece.sample_times is not None or piece.length <= 2 * MAX_SHIFT_ROWS:
+        if k == j or piece.nonuniform_samples is not None or piece.length <= 2 * MAX_SHIFT_ROWS:
             continue
         # A fit is 100 (1 - NR).
         segment_fit = results[k].fit
@@ -383,7 +383,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
             misfit_after = misfits[rows][output]
             if (
                 rows
-                and misfit_after < MAX_SHIFTED_SHARE * misfit_before
+                and misfit_after < MAX_SHIFTED_RATIO * misfit_before
                 and misfit_after <= MAX_OWN_RATIO * (100.0 - segment_fit[output])
             ):
                 text = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"

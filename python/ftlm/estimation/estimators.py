@@ -204,7 +204,7 @@ def estimate_output_error(
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     request = task.structure.with_orders(order_values)
     structure = resolve_start(task.runs, request)
-    record = prepare(task.runs, structure.without_input_nonlinearities(), m, power_of_two=False, gaps=True)[0]
+    record = prepare(task.runs, structure.without_free_input_parameters(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
     additional_guesses: list[dict[str, float]] = []
     if begin is not None:
@@ -249,7 +249,11 @@ def estimate_output_error(
         Task(task.runs, structure),
         "output-error",
         make_model(
-            task, "output-error", identified.with_inputs(joint.inputs), {**order_values, **joint.orders}, record.m
+            task,
+            "output-error",
+            identified.with_input_parameters(joint.inputs),
+            {**order_values, **joint.orders},
+            record.m,
         ),
         len(joint.names),
         {
@@ -272,7 +276,7 @@ def estimate_output_error(
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
     """Return the covariance of all parameters, as a model file stores it; None if a parameter is not identifiable."""
     jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
-    inputs = problem.structure.with_inputs(joint.inputs).fixed_inputs
+    inputs = problem.structure.with_input_parameters(joint.inputs).fixed_input_parameters
     jacobian = np.array([*jacobian, *([float(n == name) for n in joint.names] for name in inputs)])
     covariance = propagated_covariance(jacobian, joint.covariance)
     return tuple(tuple(row) for row in covariance.tolist()) if np.all(np.isfinite(covariance)) else None
@@ -428,7 +432,7 @@ def fitted_model(joint: JointFit, structure: Structure) -> Model:
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
     identified_structure = (
-        problem.structure.with_orders(joint.orders).with_coefficients(coefficients).with_inputs(joint.inputs)
+        problem.structure.with_orders(joint.orders).with_coefficients(coefficients).with_input_parameters(joint.inputs)
     )
     estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
     return Model(identified_structure, orders=joint.orders, estimate=estimate)

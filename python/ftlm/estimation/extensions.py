@@ -8,7 +8,6 @@ input, and a load step.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +36,7 @@ from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.expression import apply, channel, constant, multiply, power
 from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
-from ftlm.structure.structure import History, Initial, Offset, Structure
+from ftlm.structure.structure import History, Initial, Offset, Structure, unused_names
 from ftlm.utils.linalg import orthonormal
 from ftlm.utils.statistics import ROUNDING_RESIDUAL_RATIO
 from ftlm.utils.validation import Floats
@@ -61,22 +60,22 @@ MIN_CRITERION_GAP = 10.0
 #: Maximum number of samples, over all runs, to which extensions are fitted. Each run contributes its first samples.
 MAX_EXTENSION_SAMPLES = 6000
 #: Fraction of the samples at each end of a run in which no load step is sought.
-MIN_LOAD_SHARE = 0.05
+MIN_LOAD_FRACTION = 0.05
 #: Maximum number of iterations in the search for the time of a load step from one fit.
 MAX_LOAD_SEARCHES = 4
 #: Fraction of the power of a load response that sensitivities to the parameters do not explain. Below this value, the
 #: load is collinear with the parameters.
 LOAD_COLLINEARITY_TOLERANCE = 1e-6
 #: Lower bound of an estimated saturation limit, relative to the largest magnitude of the input.
-MIN_SATURATION_SHARE = 0.05
+MIN_SATURATION_FRACTION = 0.05
 #: Upper bound of an estimated dead zone, relative to the largest magnitude of the input.
-MAX_DEAD_ZONE_SHARE = 0.9
+MAX_DEAD_ZONE_FRACTION = 0.9
 #: Initial guesses of a saturation limit or dead zone, relative to the largest magnitude of the input.
-LIMIT_GUESS_SHARES = (0.25, 0.6)
+LIMIT_GUESS_FRACTIONS = (0.25, 0.6)
 #: Initial guess of a friction coefficient, relative to the largest magnitude of an input term in the equation.
-LOCAL_FRICTION_SHARE = 0.02
+LOCAL_FRICTION_FRACTION = 0.02
 #: Fraction of sampling intervals over which an input must change for its other intersample behavior to be tested.
-MIN_CHANGING_SHARE = 0.5
+MIN_CHANGING_FRACTION = 0.5
 #: Words for the intersample behavior of an input in messages.
 INTERSAMPLE_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 #: Minimum reported difference between an estimated delay and the delay in the structure [standard errors].
@@ -183,7 +182,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     inexact = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
     colored = any(not o.whiteness.passed or o.follows_direction for o in inexact)
-    is_excluded = structure.has_friction or structure.limits or structure.free_inputs
+    is_excluded = structure.has_friction or structure.limits or structure.free_input_parameters
     if joint is None or not joint.names or not colored or is_excluded:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
@@ -312,7 +311,7 @@ def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -
     extensions = []
     for name in runs[0].inputs:
         increments = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
-        if name in structure.signals and np.count_nonzero(increments) > MIN_CHANGING_SHARE * increments.size:
+        if name in structure.signals and np.count_nonzero(increments) > MIN_CHANGING_FRACTION * increments.size:
             alternative: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
             changed = as_runs([run.with_intersample({name: alternative}) for run in runs])
             extensions.append(
@@ -360,14 +359,6 @@ def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[J
         return joint, runs
     parts = as_runs([run if run.length <= length else run.window(None, length * run.step) for run in runs])
     return fit_output_error(parts, structure, initial_fit=joint, refine=False), parts
-
-
-def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
-    """Return `count` names that no parameter or signal has, built from `base` with numbers if necessary."""
-    reserved_names = {*structure.order_names, *structure.coefficient_names, *structure.signals, *run.signals}
-    numbered = (f"{base}{k}" for k in itertools.count(1))
-    names = itertools.chain([base] if count == 1 else [], numbered)
-    return list(itertools.islice((n for n in names if n not in reserved_names), count))
 
 
 def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, fitted_criterion: float) -> list[FittedExtension]:
@@ -463,12 +454,12 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     def with_terms(terms: Sequence[Term]) -> Structure:
         return replace(structure, equations=(_with_terms(equation, terms),))
 
-    (lag_name,) = _unused_names("lag", 1, structure, runs[0])
+    (lag_name,) = unused_names("lag", 1, structure, runs[0].signals)
 
     def with_lag(terms: Sequence[Term]) -> Structure:
         return replace(structure, equations=(_with_terms(_with_lag(equation, lag_name), terms),))
 
-    coefficients = _unused_names("k", len(names), structure, runs[0])
+    coefficients = unused_names("k", len(names), structure, runs[0].signals)
     derivative_terms = [_next_derivative(equation, *pair) for pair in zip(names, coefficients, strict=True)]
     terms_text = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in derivative_terms)
     has_fixed_orders = not equation.order.weights and not any(t.order.weights for t in derivative_terms)
@@ -500,16 +491,16 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
             local_start=fast_values,
             term_text=f"{previous_term} + {terms_text}",
         )
-    values, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
+    values, (coefficient,) = joint.values_by_name, unused_names("k", 1, structure, runs[0].signals)
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
         amplitudes = {
-            "saturation": (MIN_SATURATION_SHARE * largest, largest),
-            "dead_zone": (0.0, MAX_DEAD_ZONE_SHARE * largest),
+            "saturation": (MIN_SATURATION_FRACTION * largest, largest),
+            "dead_zone": (0.0, MAX_DEAD_ZONE_FRACTION * largest),
         }
         effects: tuple[InputEffect, InputEffect] = ("saturation", "dead_zone")
         for effect in effects:
-            starts = [{**values, input_name(effect, name): fraction * largest} for fraction in LIMIT_GUESS_SHARES]
+            starts = [{**values, input_name(effect, name): fraction * largest} for fraction in LIMIT_GUESS_FRACTIONS]
             limits = {effect: {name: amplitudes[effect]}}
             add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
         square = Term(name, Order(0.0), coefficient, expression=power(channel(name), 2.0))
@@ -524,7 +515,7 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
     The second one is omitted if y never changes sign, because its friction is then nearly constant.
     """
     (equation,) = structure.equations
-    (name,) = _unused_names("fc", 1, structure, runs[0])
+    (name,) = unused_names("fc", 1, structure, runs[0].signals)
     # A simulation with friction starts from a level and a velocity.
     initial = "caputo" if isinstance(structure.initial, History) else structure.initial
     extensions = []
@@ -538,7 +529,7 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
         for t in equation.terms
         if t.signal in amplitudes
     ]
-    local_start = {**values, name: LOCAL_FRICTION_SHARE * max(forces)}
+    local_start = {**values, name: LOCAL_FRICTION_FRACTION * max(forces)}
 
     def add(text: str, **changes: Any) -> None:
         # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
@@ -547,7 +538,7 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
             extension = Extension("friction_fits", extended, 1, [], local_start=local_start, term_text=text)
             extensions.append(replace(extension, positive_coefficient=name))
 
-    add(friction_term(equation.output, name), coulomb=Friction(name))
+    add(friction_term(equation.output, name), friction=Friction(name))
     slope = sign_tanh_slope([run[equation.output] for run in runs])
     if math.isfinite(slope):
         smooth_sign = apply("tanh", multiply(constant(slope), channel(equation.output)))
@@ -564,9 +555,9 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
     the time no longer changes or the residuals no longer decrease.
     """
     (equation,), (run, *other_runs) = structure.equations, runs
-    if other_runs or run.sample_times is not None:
+    if other_runs or run.nonuniform_samples is not None:
         return []
-    (name,) = _unused_names("load", 1, structure, run)
+    (name,) = unused_names("load", 1, structure, run.signals)
     extended = replace(structure, equations=(_with_terms(equation, [Term(name, Order(0.0), name)]),))
 
     def with_load(row: int) -> Run:
@@ -633,7 +624,7 @@ def _load_start_index(residuals: Floats, sensitivities: Floats, response: Floats
     residuals and load responses.
     """
     series, load = residuals, response[: residuals.size]
-    edge = max(int(MIN_LOAD_SHARE * series.size), 1)
+    edge = max(int(MIN_LOAD_FRACTION * series.size), 1)
     if not np.all(np.isfinite(load)):
         return None
     basis = orthonormal(sensitivities.T, 1e-12)

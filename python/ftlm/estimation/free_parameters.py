@@ -67,7 +67,7 @@ class FreeProblem:
     @property
     def inputs(self) -> tuple[FreeInputParameter, ...]:
         """Free delays, saturations and dead zones of inputs."""
-        return self.structure.free_inputs
+        return self.structure.free_input_parameters
 
     @property
     def names(self) -> list[str]:
@@ -183,7 +183,7 @@ def core_arguments(structure: Structure) -> Any:
         "delayed": bool(structure.delay),
         "initial": initial_tuple(structure.initial, offset, states),
         "history": isinstance(structure.initial, History),
-        "inputs": [(i.name, signals.index(i.signal), i.law, i.bounds) for i in structure.free_inputs],
+        "inputs": [(i.name, signals.index(i.signal), i.kind, i.bounds) for i in structure.free_input_parameters],
         "laws": list(structure.coefficient_law),
         "hints": {
             "highest": hints.highest_order_range,

@@ -306,7 +306,7 @@ def _structure(
         raise ModelError(
             f"the structure has a coefficient law, which this fit does not impose; leave {parameter('laws')} out"
         )
-    if not (target.order_names or target.coefficient_names or target.free_inputs):
+    if not (target.order_names or target.coefficient_names or target.free_input_parameters):
         raise ModelError(
             "no parameter is free: every order, coefficient and delay is a number; give the unknown ones names"
         )
@@ -691,7 +691,7 @@ def _model(
 ) -> Model:
     """Return the identified model with the estimate that a model file stores (covariance, errors, findings)."""
     orders = {n: round(values_by_name[n], 9) for n in problem.orders}
-    delays = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
+    delays = {free.signal: values_by_name[free.name] for free in problem.structure.free_input_parameters}
     structure = problem.structure.with_delays(delays).with_orders(orders)
     structure = structure.with_coefficients({n: values_by_name[n] for n in problem.coefficients})
     coefficient_covariance = None
@@ -708,7 +708,7 @@ def _model(
                     if isinstance(term.coefficient, str):
                         row[problem.names.index(term.coefficient)] = term.factor
                     rows.append(row)
-        rows += [np.array([float(n == name) for n in problem.names]) for name in structure.fixed_inputs]
+        rows += [np.array([float(n == name) for n in problem.names]) for name in structure.fixed_input_parameters]
         coefficient_covariance = tuple(tuple(row) for row in propagated_covariance(np.array(rows), covariance).tolist())
     units: dict[str, str] = {}
     if all(r.unit == "Ω" for r in records):

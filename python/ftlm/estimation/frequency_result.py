@@ -420,7 +420,7 @@ class FrequencyIdentification:
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the parameters: value, standard error, 95 % interval, unit, nominal value."""
         return parameter_frame(
-            self.parameters.values(), self.system.structure.reference if isinstance(self.system, Model) else {}
+            self.parameters.values(), self.system.structure.nominal_values if isinstance(self.system, Model) else {}
         )
 
     @property
@@ -545,7 +545,7 @@ class FrequencyIdentification:
 
     def _page(self, validation: FrequencyValidation | None) -> Page:
         """Return the content of the report."""
-        from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
+        from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, model_title, verdict_box
 
         main_findings, further_findings = first_findings(self.findings)
         source = self.system
@@ -581,7 +581,7 @@ class FrequencyIdentification:
             collapsed=bool(validation_data),
         )
         return Page(
-            f"Impedance of {source}" if isinstance(source, Circuit) else title_of(source),
+            f"Impedance of {source}" if isinstance(source, Circuit) else model_title(source),
             [charts, data_section, residuals],
             "",
             verdict_box(self.verdict if validation is None else validation.verdict),

@@ -35,7 +35,7 @@ from ftlm.utils.validation import Floats, check_choice, check_threads, short_rep
 #: Increment to which orders are rounded, as in the tables of the paper. Candidates with equal orders share regressors.
 ORDER_RESOLUTION = 0.001
 #: Bounds of a coefficient with a nominal value: plus and minus this multiple of it.
-STATED_RANGE = 2.0
+NOMINAL_RANGE = 2.0
 #: Bounds of any other coefficient: plus and minus this multiple of the value at which its term alone is as large as the
 #: output.
 SCALE_RANGE = 4.0
@@ -207,9 +207,9 @@ def default_bounds(
     name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float]:
     """Return the default bounds (low, high) of a coefficient; see :class:`GeneticAlgorithm`."""
-    reference = structure.reference.get(name, 0.0)
-    if reference:
-        return -STATED_RANGE * abs(reference), STATED_RANGE * abs(reference)
+    nominal = structure.nominal_values.get(name, 0.0)
+    if nominal:
+        return -NOMINAL_RANGE * abs(nominal), NOMINAL_RANGE * abs(nominal)
     midpoints = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
     equation, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
     eta = max(equation.order.at(midpoints) - term.order.at(midpoints), 0.0)

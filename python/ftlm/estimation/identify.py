@@ -44,7 +44,7 @@ from ftlm.estimation.prior_knowledge import Bounds, Priors
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
-from ftlm.findings import MISSING_PART_CODES, Finding, make_finding, unique
+from ftlm.findings import MISSING_PART_CODES, Finding, make_finding, unique_findings
 from ftlm.model.model import Estimate
 from ftlm.order_search.search import check_executor, threads_per_task
 from ftlm.progress import FractionTracker
@@ -78,7 +78,7 @@ SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Codes of reported effects that have a nonzero mean. The test for an offset would report this mean as well.
 HAVE_MEAN_CODES = ("square_fits", "offset_missing", "drift_fits", "friction_fits")
 #: Fraction of the progress of an identification that is reached when its initial conditions are selected.
-INITIAL_CONDITIONS_SHARE = 0.7
+INITIAL_CONDITIONS_PROGRESS = 0.7
 
 
 @check_arguments
@@ -228,7 +228,7 @@ def _fit_runs(
             partial(
                 estimate,
                 method=preliminary_method,
-                report=tracker.subtask(INITIAL_CONDITIONS_SHARE, 0.9),
+                report=tracker.subtask(INITIAL_CONDITIONS_PROGRESS, 0.9),
                 is_preliminary=True,
             ),
             may_add_offset,
@@ -366,7 +366,7 @@ def assess_fit(fit: Fit) -> Identification:
         findings += extension_findings
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
-    all_findings = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
+    all_findings = unique_findings(msgspec.structs.replace(f, method=fit.method) for f in findings)
     estimate = _estimate(fit, comparison, criteria, all_findings)
     result = Identification(
         replace(model, estimate=estimate),
@@ -382,7 +382,7 @@ def assess_fit(fit: Fit) -> Identification:
         fit.errors,
         _offset_errors(fit, comparison),
     )
-    limiting = tuple(f.to_file() for f in unique(result_findings(result)))
+    limiting = tuple(f.to_file() for f in unique_findings(result_findings(result)))
     if not limiting:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=limiting)))
@@ -462,7 +462,7 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
         if test.response
     }
     runs = fit.task.runs
-    is_supported = fit.task.structure.is_linear and all(run.sample_times is None for run in runs)
+    is_supported = fit.task.structure.is_linear and all(run.nonuniform_samples is None for run in runs)
     if fit.joint is None or not fed or has_loop_noise_model(fit.settings) or not is_supported:
         return tests
     noise_free_runs = [

@@ -75,7 +75,7 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
             f"{label} requires a linear model without saturations and dead zones, because its filter does not commute "
             f"with them; omit {label}"
         )
-    if any(run.sample_times is not None for run in runs):
+    if any(run.nonuniform_samples is not None for run in runs):
         raise ModelError(f"{label} needs uniform samples; resample the runs, or leave it out")
 
 

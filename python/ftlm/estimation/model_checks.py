@@ -110,11 +110,13 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
         if item.name in unidentifiable:
             continue
         if not errors[item.name] <= high - low and not _has_bounded_interval(joint, item.name):
-            findings.append(make_finding("input_parameter_not_identifiable", parameter=item.name, words=item.words))
-        elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
-            unit = " s" if item.law == "delay" else ""
             findings.append(
-                make_finding("on_bound", parameter=item.name, what=f"the {item.words}", value=f"{value:g}{unit}")
+                make_finding("input_parameter_not_identifiable", parameter=item.name, words=item.description)
+            )
+        elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
+            unit = " s" if item.kind == "delay" else ""
+            findings.append(
+                make_finding("on_bound", parameter=item.name, what=f"the {item.description}", value=f"{value:g}{unit}")
             )
     for name, value in joint.coefficients.items():
         # If the cost is not quadratic, the profile is more accurate than the standard error.
@@ -279,7 +281,9 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
         findings += _outlier_findings(runs, problem.structure, joint, output)
         findings += _quantization_findings(runs, problem.structure, output, joint.noise[output])
     run_names = [
-        run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
+        run.name
+        for run in runs
+        if run.nonuniform_samples is not None and not has_nonuniform_samples(run, problem.structure)
     ]
     if run_names:
         findings.append(make_finding("sample_times_interpolated", run=", ".join(run_names)))
@@ -317,7 +321,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
     With a zero-order hold the change acts from that sample on, so a strictly proper model responds one sample later.
     """
     row = evidence.rows
-    if not START_SETTINGS.quiet_rows <= row < run.length - 1 or run.sample_times is not None:
+    if not START_SETTINGS.quiet_rows <= row < run.length - 1 or run.nonuniform_samples is not None:
         return []
     changes = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
     findings = []

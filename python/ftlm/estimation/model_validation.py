@@ -15,7 +15,7 @@ from ftlm.errors import FtlmError
 from ftlm.estimation.model_checks import discretization_findings, enumerate_names
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import UNSTABLE_PLANT_CODES
-from ftlm.findings import Finding, make_finding, unique
+from ftlm.findings import Finding, make_finding, unique_findings
 from ftlm.model.model import Model
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import (
@@ -35,13 +35,17 @@ def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
     """Return a comparison of the model with validation runs; see :meth:`ftlm.Identification.validate`."""
     comparison = validate_model(result.model, runs)
     findings = [*comparison.findings, *validation_findings(result.comparison, comparison)]
-    return replace(comparison, findings=unique([*findings, *discretization_findings(result.model, comparison)]))
+    return replace(
+        comparison, findings=unique_findings([*findings, *discretization_findings(result.model, comparison)])
+    )
 
 
 def validate_model(model: Model, runs: Run | Sequence[Run]) -> Comparison:
     """Return a comparison of a model, such as a saved one, with validation runs and their findings."""
     comparison = compare(model, runs)
-    return replace(comparison, findings=unique([*comparison.findings, *_residual_findings(model, runs, comparison)]))
+    return replace(
+        comparison, findings=unique_findings([*comparison.findings, *_residual_findings(model, runs, comparison)])
+    )
 
 
 def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comparison) -> list[Finding]:

@@ -42,7 +42,7 @@ from ftlm.simulation.output_samples import initial_exponents, is_in_motion, meas
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.structure.structure import History, Initial, Structure, offset_exponents
+from ftlm.structure.structure import History, Initial, Structure, offset_exponents, unused_names
 from ftlm.utils.linalg import (
     column_norms,
     dot,
@@ -79,7 +79,7 @@ MAX_SCREENING_EVALUATIONS = 12
 SCREENING_LIKELIHOOD_TOLERANCE = 0.01
 #: RMS residual that a complete fit may reach, relative to that of the screening: if the screening has converged, and if
 #: it has not.
-CONVERGED_RESIDUAL_SHARE, SCREENING_RESIDUAL_SHARE = 0.9, 0.5
+CONVERGED_RESIDUAL_FRACTION, SCREENING_RESIDUAL_FRACTION = 0.9, 0.5
 #: Change when the step is halved, relative to the largest value, at which simulations with a history have converged.
 HISTORY_SIMULATION_TOLERANCE = 1e-3
 
@@ -177,10 +177,7 @@ def offset_test(
     one-step prediction errors. `values` are consistent estimates by name, and `pulses_per_sample` is the number of
     block pulses per sampling interval.
     """
-    reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
-    constant_name = next(
-        n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names
-    )
+    (constant_name,) = unused_names("one", 1, structure, runs[0].signals)
     names = [f"{constant_name}_{k}" for k in range(len(structure.equations))]
     equations = tuple(
         replace(e, terms=(*e.terms, Term(constant_name, Order(), n)))
@@ -571,7 +568,7 @@ def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
 def _fitted_structure(joint: JointFit, structure: Structure) -> Structure:
     """Return a structure with the orders, coefficients and input parameters of a joint fit."""
     coefficients = FreeProblem.of(structure).coefficients_by_name(list(joint.coefficients.values()))
-    return structure.with_orders(joint.orders).with_coefficients(coefficients).with_inputs(joint.inputs)
+    return structure.with_orders(joint.orders).with_coefficients(coefficients).with_input_parameters(joint.inputs)
 
 
 def refit_after_screening(
@@ -585,10 +582,11 @@ def refit_after_screening(
     """Return the refit of a linear structure with other initial conditions or offsets; None if screened out or failed.
 
     First, the cost is minimized from the optimum of `joint` with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
-    RMS residuals are multiplied by `CONVERGED_RESIDUAL_SHARE` if this minimization converged, otherwise by
-    `SCREENING_RESIDUAL_SHARE`. The products are an optimistic estimate of the residuals of a complete fit. If `accepts`
-    rejects this estimate, the result is None. Otherwise the structure is fitted with the time step of `joint`. With
-    `refine`, an accepted fit is repeated with a refined step. The returned fit may be one that `accepts` rejects.
+    RMS residuals are multiplied by `CONVERGED_RESIDUAL_FRACTION` if this minimization converged, otherwise by
+    `SCREENING_RESIDUAL_FRACTION`. The products are an optimistic estimate of the residuals of a complete fit. If
+    `accepts` rejects this estimate, the result is None. Otherwise the structure is fitted with the time step of
+    `joint`. With `refine`, an accepted fit is repeated with a refined step. The returned fit may be one that `accepts`
+    rejects.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
@@ -599,7 +597,7 @@ def refit_after_screening(
         # Limit of the increase of twice the log-likelihood in one step, per sample.
         tolerance = SCREENING_LIKELIHOOD_TOLERANCE / joint.samples
         screening = objective.minimize(initial, MAX_SCREENING_EVALUATIONS, linear_scale=True, tolerance=tolerance)
-        factor = CONVERGED_RESIDUAL_SHARE if screening.has_converged else SCREENING_RESIDUAL_SHARE
+        factor = CONVERGED_RESIDUAL_FRACTION if screening.has_converged else SCREENING_RESIDUAL_FRACTION
         deviation = objective.rms_residuals(screening)
         if joint.robust is not None:
             deviation = {o: robust_deviation(e) for o, e in objective.pooled_residuals(screening).items()}

@@ -19,7 +19,7 @@ from ftlm.estimation.estimators import fit_at_best_orders
 from ftlm.estimation.identify import assess_fit
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import MAX_ORDER_ERROR, verdict_from
-from ftlm.findings import Finding, make_finding, unique
+from ftlm.findings import Finding, make_finding, unique_findings
 from ftlm.order_search.options import Coefficients, Criterion, Norm, OrderGrid, RowBasis, SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
@@ -167,7 +167,7 @@ def with_verdict(
         failed = make_finding("rank_not_validated", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
     equivalent_rows = [] if result.residuals is None else _tied_rank_findings(search, result.residuals)
-    findings = unique([*equivalent_rows, *result.findings])
+    findings = unique_findings([*equivalent_rows, *result.findings])
     return replace(search, verdict=result.verdict, model_findings=findings, best=result)
 
 

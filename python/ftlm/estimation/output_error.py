@@ -117,7 +117,7 @@ class RobustLossSummary:
 
 
 #: Residual that counts as 1 in the cost of a coarse fit, as a fraction of the standard deviation of the output.
-COARSE_SHARE = 0.01
+COARSE_FRACTION = 0.01
 #: Relative difference of two costs below which both fits have ended at the same optimum.
 SAME_COST = 1e-3
 

@@ -123,7 +123,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     """
     check_intervals(bounds or {})
     out, limits = {}, bounds or {}
-    inputs = {item.name: item for item in structure.free_inputs}
+    inputs = {item.name: item for item in structure.free_input_parameters}
     _check_not_in_law("bounds", limits, structure)
     laws = {name for name, _, _ in structure.coefficient_law}
     free = [n for n in structure.coefficient_names if n not in laws]
@@ -132,7 +132,7 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
         if name in inputs:
             item = inputs[name]
             raise ModelError(
-                f"{parameter('bounds')} has {name}, but the bounds of the {item.words}, {item.bounds[0]:g} to "
+                f"{parameter('bounds')} has {name}, but the bounds of the {item.description}, {item.bounds[0]:g} to "
                 f"{item.bounds[1]:g}, are part of the structure; change them there"
             )
         low, high = map(float, pair)

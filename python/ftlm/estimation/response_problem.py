@@ -70,8 +70,8 @@ class ResponseProblem:
         self.structure = structure
         self.orders = structure.order_names
         self.coefficients = tuple(dict.fromkeys(structure.coefficient_names))
-        self.delays = tuple(item.signal for item in structure.free_inputs)
-        self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_inputs))
+        self.delays = tuple(item.signal for item in structure.free_input_parameters)
+        self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_input_parameters))
         #: Free orders of an impedance for which the user gives no values. They are exponents of constant-phase elements
         #: and at most 1. A sum such as alpha + 0.5 may exceed 1.
         self.exponents = tuple(
@@ -291,14 +291,14 @@ class ResponseProblem:
         for name in self.exponents:
             text = f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
             add(Order(0.0, ((name, 1.0),)), MAX_EXPONENT, text, name=name)
-        for free in self.structure.free_inputs:
+        for free in self.structure.free_input_parameters:
             for sign, end in ((1.0, free.bounds[1]), (-1.0, free.bounds[0])):
                 row = np.zeros(len(self.names))
                 row[self._delay[free.signal]] = sign
                 rows.append(row)
                 limits.append(sign * end * self.unit)
                 descriptions.append(
-                    ConstraintText(f"{free.words} is {'at most' if sign > 0 else 'at least'} {end:g} s")
+                    ConstraintText(f"{free.description} is {'at most' if sign > 0 else 'at least'} {end:g} s")
                 )
         table = np.array(rows) if rows else np.zeros((0, len(self.names)))
         return table, np.array(limits), descriptions
@@ -357,7 +357,10 @@ def _order_delay_grid(problem: ResponseProblem) -> Floats:
     """Return feasible grid points of orders and delays, of shape (points, parameters); coefficients are 0."""
     axes = list(problem.search_ranges().values())
     has_values = [n in problem.structure.order_values for n in problem.orders]
-    delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
+    delays = [
+        (item.bounds[0] * problem.unit, item.bounds[1] * problem.unit)
+        for item in problem.structure.free_input_parameters
+    ]
     # The fit still converges from a delay error of a third of a period at the highest frequency.
     fastest = max(float(r.frequency.max()) for r in problem.records)
     delay_counts = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]

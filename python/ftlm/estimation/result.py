@@ -477,7 +477,7 @@ class Identification:
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the parameters: value, standard error, 95 % interval, unit, nominal value."""
-        return parameter_frame(self.parameters.values(), self.model.structure.reference)
+        return parameter_frame(self.parameters.values(), self.model.structure.nominal_values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
@@ -566,13 +566,13 @@ class Identification:
 
         lines = [f"{self.model.structure.name}: {self.method}, {settings_text(self.settings)}"]
         lines += [f"  {self.model.structure.equation_text(e)}" for e in self.model.equations]
-        reference = self.model.structure.reference
+        reference = self.model.structure.nominal_values
         errors = self.standard_errors
         for name, value in self.values.items():
             error_text = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
                 error_text += f"   {self.profiles[name]}"
-            reference_text = f"   (stated {reference[name]:.6g})" if name in reference else ""
+            reference_text = f"   (nominal {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{error_text}{reference_text}")
         if self.joint is not None:
             lines.append(f"  {self.joint.origin_text}")

@@ -85,7 +85,7 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
         for run in runs
         for k in range(int(run.length * run.step / seconds + 1e-9))
     ]
-    if len(pieces) < MIN_PIECES or any(run.sample_times is not None for run in runs):
+    if len(pieces) < MIN_PIECES or any(run.nonuniform_samples is not None for run in runs):
         return None
     sample_pieces = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MAX_PIECES).astype(int))]
     model_in_motion = replace(model, structure=replace(model.structure, initial="caputo"))

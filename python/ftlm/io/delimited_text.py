@@ -31,9 +31,9 @@ from ftlm.io.cell_parsing import (
     split_unit,
 )
 from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Layout, TableDialect, find_table
-from ftlm.io.table import Column, FileTable, dates_problem
+from ftlm.io.table import Column, FileTable, dates_error
 from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
-from ftlm.utils.validation import bad_rows
+from ftlm.utils.validation import bad_rows_error
 
 _BLOCK_BYTES = 8 << 20
 #: Size of the beginning of a text from which the layout is detected: characters, and minimum number of lines.
@@ -116,7 +116,7 @@ class _BadCells:
             )
         else:
             description = f"{cell_text} is not a number"
-        return bad_rows(thing, description, self.row, self.count, way_out)
+        return bad_rows_error(thing, description, self.row, self.count, way_out)
 
 
 @dataclass
@@ -214,7 +214,7 @@ def parse_text(
     if sheet is not None:
         dialect = replace(dialect, layout=replace(dialect.layout, separator=None, decimal=None))
     kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[dialect.separator]} between cells)"
-    assumed = () if header is not None else guessed + dialect.assumed
+    assumed = () if header is not None else guessed + dialect.assumptions
     if rows.footer:
         first, last = rows.footer[0], rows.footer[-1]
         which = f"lines {first} to {last} are" if last > first else f"line {first} is"
@@ -222,7 +222,9 @@ def parse_text(
         assumed = (*assumed, Assumption("", rows.count, text, "remove the empty line above them"))
     if dialect.names is None:
         assumed = tuple(_with_remark(a, remark, dialect.width) for a in assumed)
-    return FileTable(path, columns, True, header, layout=used_layout.under(dialect.layout), assumed=assumed, kind=kind)
+    return FileTable(
+        path, columns, True, header, layout=used_layout.under(dialect.layout), assumptions=assumed, kind=kind
+    )
 
 
 def _dialect_with_empty_rows(
@@ -257,7 +259,9 @@ def _dialect_with_empty_rows(
     if len(gaps) > 1:
         text = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
     header = 1 if dialect.units is None else 2
-    return replace(dialect, assumed=(*dialect.assumed, Assumption("header", header, text, layout_parameter(header=1))))
+    return replace(
+        dialect, assumptions=(*dialect.assumptions, Assumption("header", header, text, layout_parameter(header=1)))
+    )
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
@@ -268,7 +272,9 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
-    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)!r})")
+    return replace(
+        assumption, evidence=f"{assumption.evidence} (a remark above them has as many words: {' '.join(words)!r})"
+    )
 
 
 def _first_lines(
@@ -409,7 +415,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
             timestamps = None
         elif timestamps is not None:
             description = f"dates or times of day, not numbers ({timestamps.first!r})"
-            problem = dates_problem(f"{source}: column {name!r}", description, rows.count)
+            problem = dates_error(f"{source}: column {name!r}", description, rows.count)
         unit = (
             (dialect.units[k] if dialect.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         )
@@ -474,14 +480,14 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
         description = (
             f"no UTF-8 (byte {head[error.start]:#04x}), read as cp1252 of Windows, which does not affect numbers"
         )
-        otherwise = layout_parameter(encoding=Placeholder("NAME"))
+        override = layout_parameter(encoding=Placeholder("NAME"))
         try:
             head.decode("cp1252")
         except UnicodeDecodeError:
             return "latin-1", (
-                Assumption("encoding", "latin-1", description.replace("cp1252 of Windows", "latin-1"), otherwise),
+                Assumption("encoding", "latin-1", description.replace("cp1252 of Windows", "latin-1"), override),
             )
-        return "cp1252", (Assumption("encoding", "cp1252", description, otherwise),)
+        return "cp1252", (Assumption("encoding", "cp1252", description, override),)
     return "utf-8", ()
 
 
@@ -494,7 +500,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
         try:
             data = incomplete_line + decoder.decode(block, final=not block)
         except UnicodeError as error:
-            raise _undecodable(path, error, line_number + incomplete_line.count("\n"), encoding) from None
+            raise _undecodable_error(path, error, line_number + incomplete_line.count("\n"), encoding) from None
         if not block:
             # Old programs write Ctrl-Z at the end of a text.
             data = data.removesuffix("\x1a")
@@ -521,7 +527,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
             return
 
 
-def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
+def _undecodable_error(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
     if not isinstance(error, UnicodeDecodeError):
         return DataError(
             f"{path.name}: the text is not {encoding} ({error}); give {layout_parameter(encoding=Placeholder('NAME'))}"
@@ -553,11 +559,13 @@ def _numbers(
         try:
             values[:, index] = list(map(parse_cell, column))
         except ValueError:
-            _not_numbers(rows, index, column, lines, values)
+            _store_other_cells(rows, index, column, lines, values)
     return values
 
 
-def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
+def _store_other_cells(
+    rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]
+) -> None:
     """Store the timestamps or invalid cells of a column in `rows`; not all cells of the column are numbers.
 
     `column` has the texts of the cells in a block, `index` is the index of the column, and `lines` are the line numbers

@@ -154,19 +154,19 @@ class Assumption:
         Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that replaces the assumption; empty if none.
     value : str or int
         Assumed value.
-    words : str
+    evidence : str
         Evidence in the file, as text.
-    otherwise : str
+    override : str
         Text of the argument that replaces the assumption; empty if there is none.
-    counts : bool
+    affects_run : bool
         Whether values or rows of the run depend on the assumption; the warnings of the run then list it.
     """
 
     option: str
     value: str | int
-    words: str
-    otherwise: str = ""
-    counts: bool = True
+    evidence: str
+    override: str = ""
+    affects_run: bool = True
 
     def __str__(self) -> str:
         return str(self.note)
@@ -174,7 +174,7 @@ class Assumption:
     @property
     def note(self) -> Note:
         """Note on the assumption for the run."""
-        return Note(self.words, self.otherwise)
+        return Note(self.evidence, self.override)
 
 
 def _word(option: str, value: object, characters_by_name: Mapping[str, str | None]) -> str:
@@ -236,7 +236,7 @@ class TableDialect:
         Number of cells per row.
     layout
         Detected options as a :class:`Layout`.
-    assumed
+    assumptions
         Assumptions of the detection.
     """
 
@@ -247,7 +247,7 @@ class TableDialect:
     first_line: int
     width: int
     layout: Layout
-    assumed: tuple[Assumption, ...]
+    assumptions: tuple[Assumption, ...]
     thousands_separator: str | None = None
 
 
@@ -357,7 +357,7 @@ def find_table(
         and layout_options.header is None
     ):
         # A first row with words and numbers may be a header.
-        raise _mixed_line(table_lines[top], source)
+        raise _mixed_line_error(table_lines[top], source)
     if names is not None and not is_ftlm_file and layout_options.separator is None:
         _check_mixed(table_lines, top, separator, comma, source)
     first_line = table_lines[top].at if top < len(table_lines) else table_lines[-1].at + 1
@@ -575,7 +575,7 @@ def _header(
     line = lines[top - count]
     names = fit_names(line)
     if not is_ftlm_file and count == 1 and line.count and layout.header is None:
-        raise _mixed_line(line, source)
+        raise _mixed_line_error(line, source)
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
     if commas and not is_ftlm_file and count == 1:
         raise DataError(
@@ -622,7 +622,7 @@ def _check_above(preceding: list[_Line], width: int, source: str, number_format:
         )
 
 
-def _mixed_line(line: _Line, source: str) -> DataError:
+def _mixed_line_error(line: _Line, source: str) -> DataError:
     words = [cell.strip() for cell, is_n in zip(line.cells, line.numbers, strict=True) if cell.strip() and not is_n]
     commas = [word for word in words if DECIMAL_COMMA.fullmatch(word)]
     if commas:
@@ -693,11 +693,11 @@ def _layout_assumptions(
     assumed = []
     if requested.separator is None:
         text = f"{SEPARATOR_WORDS[SEPARATOR_CHARACTERS[str(layout.separator)]]} between cells"
-        otherwise = layout_parameter(separator=Placeholder("NAME"))
-        assumed.append(Assumption("separator", str(layout.separator), text, otherwise, False))
+        override = layout_parameter(separator=Placeholder("NAME"))
+        assumed.append(Assumption("separator", str(layout.separator), text, override, False))
     if requested.decimal is None and layout.decimal == "comma":
-        text, otherwise = f"decimal commas, as in {_decimal_comma(lines)!r}", layout_parameter(decimal="point")
-        assumed.append(Assumption("decimal", "comma", text, otherwise))
+        text, override = f"decimal commas, as in {_decimal_comma(lines)!r}", layout_parameter(decimal="point")
+        assumed.append(Assumption("decimal", "comma", text, override))
     if requested.thousands is None and (thousands_separator := layout.thousands) is not None:
         cells, comma = (c for line in lines for c in line.cells), layout.decimal == "comma"
         example = next(c.strip() for c in cells if detect_thousands_separator(c, comma=comma) == thousands_separator)

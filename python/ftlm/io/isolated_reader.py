@@ -23,7 +23,7 @@ from ftlm.errors import DataError
 from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.io.table import Column, FileTable, dates_problem
+from ftlm.io.table import Column, FileTable, dates_error
 from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import Placeholder, layout_parameter
 from ftlm.utils.resources import subprocess_arguments
@@ -258,7 +258,7 @@ def _sheet(path: Path, sheet: str, other_sheets: list[str], cells: bytes, layout
     if layout.sheet is None and other_sheets:
         text = f"sheet {sheet!r}, the only one that is not empty"
         assumed = Assumption("sheet", sheet, text, layout_parameter(sheet=Placeholder("NAME")))
-        table = replace(table, assumed=(assumed, *table.assumed))
+        table = replace(table, assumptions=(assumed, *table.assumptions))
     return table
 
 
@@ -293,5 +293,5 @@ def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Colu
     timestamps = Timestamps(
         np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first_text
     )
-    problem = dates_problem(thing, f"dates, not numbers ({first_text})", values.size)
+    problem = dates_error(thing, f"dates, not numbers ({first_text})", values.size)
     return Column(name, name, path, values, problem, timestamps=timestamps)

@@ -225,10 +225,10 @@ def run_from_tables(
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
     is_batch = len(tables) > 1
     facts: tuple[str, ...] = tuple(
-        Note(f"{table.path.name}: {a.words}", a.otherwise) if is_batch else a.note
+        Note(f"{table.path.name}: {a.evidence}", a.override) if is_batch else a.note
         for table in tables
-        for a in table.assumed
-        if a.counts
+        for a in table.assumptions
+        if a.affects_run
     )
     facts += (*(a.note for a in roles), *clock.notes, *conversion_notes(selection.units))
     arguments = RunArguments(

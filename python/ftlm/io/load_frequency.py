@@ -153,7 +153,7 @@ def load_frequency(
     pool = ColumnTable([table])
     if table.header is not None:
         raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")
-    notes = [str(a) for a in table.assumed if a.counts]
+    notes = [str(a) for a in table.assumptions if a.affects_run]
     if columns is None and table.layout.header == 0 and len(pool.columns) == len(HEADERLESS_PARTS):
         columns = dict(zip(HEADERLESS_PARTS, pool.names, strict=True))
         way_out = parameter("columns", PART_COLUMNS)

@@ -62,7 +62,7 @@ class FileColumn:
         Unit in the file; "" if there is none.
     first, low, high : float or None
         First, lowest and highest value; None if the column has no numbers.
-    words : str
+    description : str
         Description of the content if the column has no numbers; otherwise "".
     """
 
@@ -73,7 +73,7 @@ class FileColumn:
     first: float | None
     low: float | None
     high: float | None
-    words: str = ""
+    description: str = ""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class OpenedFile:
         Summaries of the columns.
     layout : Layout
         Layout of the file, with given and detected options.
-    assumed : tuple of Assumption
+    assumptions : tuple of Assumption
         Assumptions about layout, time and roles, each with the argument that replaces it.
     options : dict
         Arguments with which :func:`ftlm.load` returns the previewed run without assumptions.
@@ -109,7 +109,7 @@ class OpenedFile:
     rows: int
     columns: tuple[FileColumn, ...]
     layout: Layout
-    assumed: tuple[Assumption, ...]
+    assumptions: tuple[Assumption, ...]
     options: dict[str, Any]
     step: float | None
     problem: str
@@ -181,7 +181,7 @@ class OpenedFile:
             lines.append(f"… and {len(self.columns) - _MAX_LISTED_COLUMNS} more")
         if self.step is not None:
             lines.append(f"step {self.step:.6g} s, {self.step * (self.rows - 1):.6g} s in all")
-        lines += [f"assumed: {assumption}" for assumption in self.assumed]
+        lines += [f"assumed: {assumption}" for assumption in self.assumptions]
         lines += [f"note: {note}" for note in self.notes]
         if self.problem:
             lines.append(f"to do: {self.problem}")
@@ -196,7 +196,7 @@ class OpenedFile:
         """Return the command-line arguments that correspond to `options`, without those that equal a default."""
         options = self.options
         # Options that are detected reliably or equal the default are omitted.
-        stated_options = {a.option for a in self.assumed if not a.counts and a.option != "time"}
+        stated_options = {a.option for a in self.assumptions if not a.affects_run and a.option != "time"}
         arguments = []
         for key in ("time", "step", "time_unit", "resample", "missing"):
             if key in options and key not in stated_options:
@@ -287,7 +287,7 @@ class _FilePreview:
         clock, assumed, problem = self._time(all_columns)
         of_clock = () if clock is None or selection.step is not None else self._time_assumptions(clock)
         roles, role_assumptions, open_roles = self._roles(all_columns, clock)
-        assumed = (*table.assumed, *assumed, *of_clock, *role_assumptions)
+        assumed = (*table.assumptions, *assumed, *of_clock, *role_assumptions)
         step, notes = None, tuple[str, ...]()
         if not problem:
             problem = open_roles
@@ -397,7 +397,7 @@ class _FilePreview:
         for key in ("inputs", "outputs", "units", "intersample"):
             if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):
                 options[key] = dict(getattr(selection, key))
-        keys = {*selection.layout.to_dict(), *(a.option for a in self.table.assumed)}
+        keys = {*selection.layout.to_dict(), *(a.option for a in self.table.assumptions)}
         layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in keys})
         for assumption in of_clock:
             if assumption.option == "dates":
@@ -417,13 +417,13 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
     role, signal = roles.get(column.name, ("", ""))
     summary, values = FileColumn(column.name, role, signal, column.file_unit, None, None, None), column.values
     if column.timestamps is not None:
-        return replace(summary, words=f"from {column.timestamps.first}")
+        return replace(summary, description=f"from {column.timestamps.first}")
     if values is None or not values.size or not has_numbers(column):
         problem = _first_bad_cell(column)
-        return replace(summary, words=f"no numbers ({problem})" if problem else "no numbers")
+        return replace(summary, description=f"no numbers ({problem})" if problem else "no numbers")
     finite = values[~np.isnan(values)]
     if not finite.size:
-        return replace(summary, words="empty")
+        return replace(summary, description="empty")
     return replace(summary, first=float(values[0]), low=float(finite.min()), high=float(finite.max()))
 
 
@@ -434,7 +434,7 @@ def _toml(value: object) -> str:
 
 def _figures(column: FileColumn) -> tuple[str, str, str]:
     if column.first is None or column.low is None or column.high is None:
-        return _truncate_text(column.words), "", ""
+        return _truncate_text(column.description), "", ""
     return f"{column.first:.5g}", f"{column.low:.5g}", f"{column.high:.5g}"
 
 

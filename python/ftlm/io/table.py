@@ -17,7 +17,7 @@ from ftlm.errors import DataError
 from ftlm.io.cell_parsing import Timestamps, is_time_unit, split_slash_unit, split_unit
 from ftlm.io.dialect import Assumption, Layout
 from ftlm.utils.parameters import Placeholder, choose_text, layout_parameter, parameter
-from ftlm.utils.validation import bad_rows, join_names, nearest
+from ftlm.utils.validation import bad_rows_error, join_names, nearest
 
 _RELATIVE_TIME_TOLERANCE = 1e-9
 #: Further names of time columns besides t, time and seconds, case-folded and without word separators.
@@ -79,9 +79,9 @@ class Column:
         return self.values
 
 
-def dates_problem(thing: str, description: str, rows: int) -> DataError:
+def dates_error(thing: str, description: str, rows: int) -> DataError:
     """Return the DataError for a column of dates or times of day that is used as numbers."""
-    return bad_rows(thing, description, 0, rows, f"name it with {parameter('time')}, or choose another column")
+    return bad_rows_error(thing, description, 0, rows, f"name it with {parameter('time')}, or choose another column")
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class FileTable:
         Header of a run that ftlm wrote; None for other files.
     skipped
         Reason why a part of the file was not read, by name.
-    layout, assumed
+    layout, assumptions
         Layout of a text or sheet, and assumptions about it.
     kind
         File format, as text.
@@ -112,7 +112,7 @@ class FileTable:
     header: Header | None = None
     skipped: dict[str, str] = field(default_factory=dict)
     layout: Layout = field(default_factory=Layout)
-    assumed: tuple[Assumption, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
     kind: str = ""
 
     @property
@@ -337,4 +337,4 @@ def _check_agreement(reference: Column, compared: Column) -> None:
     if rows.size:
         difference_text = f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}"
         remedy = f"give files of one record, or name the time to use with {parameter('time')}"
-        raise bad_rows(names, difference_text, int(rows[0]), rows.size, remedy)
+        raise bad_rows_error(names, difference_text, int(rows[0]), rows.size, remedy)

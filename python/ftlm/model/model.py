@@ -139,8 +139,8 @@ class Model:
         if self.m is not None:
             check_pulses(self.m)
         check_offset_resolved(self.structure.offset)
-        if self.structure.free_inputs:
-            names = ", ".join(item.words for item in self.structure.free_inputs)
+        if self.structure.free_input_parameters:
+            names = ", ".join(item.description for item in self.structure.free_input_parameters)
             method = "with_delays" if self.structure.free_delays else "with_limits"
             raise ModelError(f"the {names} is still free; identify it first, or set it by {method}")
         for item in self.structure.equations:

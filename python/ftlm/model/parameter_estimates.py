@@ -120,7 +120,7 @@ def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[s
             "high": p.interval[1],
             "unit": p.unit,
             "fixed": p.fixed,
-            "stated": reference_values.get(p.name, math.nan),
+            "nominal": reference_values.get(p.name, math.nan),
         }
         for p in parameters
     ]

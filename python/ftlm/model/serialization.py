@@ -65,7 +65,7 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
 
     def friction(self) -> Friction:
         """Return the friction from its file form."""
-        return Friction(self.coefficient, self.factor, self.name, self.stribeck or UNSET)
+        return Friction(self.coefficient, self.factor, self.name, self.stribeck)
 
     @property
     def count(self) -> int:
@@ -91,7 +91,7 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     def equation(self) -> Equation:
         """Return the equation from its file form."""
         terms = tuple(t.term() for t in self.terms)
-        friction = UNSET if self.friction is None else self.friction.friction()
+        friction = None if self.friction is None else self.friction.friction()
         return Equation(self.output, Order(self.order), terms, friction)
 
     @property
@@ -160,7 +160,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             input_nonlinearities=self.limits or UNSET,
         )
         if self.estimate is not None and self.estimate.covariance is not None:
-            count = sum(e.count for e in self.equations) + len(structure.fixed_inputs)
+            count = sum(e.count for e in self.equations) + len(structure.fixed_input_parameters)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance does not have {count} by {count} elements, as its equations require")

@@ -14,7 +14,7 @@ from ftlm.errors import FtlmError, ModelError
 from ftlm.order_search.options import DEFAULT_INCREMENT, OrderGrid, SearchSettings
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
-from ftlm.simulation.discretization import check_linear, named_signals
+from ftlm.simulation.discretization import check_linear, error_with_signal_names
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import plural
@@ -141,7 +141,7 @@ def certify_orders(
             progress=None if progress is None else lambda count, total, _pruned: progress(count, total),
         )
     except ModelError as error:
-        raise named_signals(error, record.signals) from None
+        raise error_with_signal_names(error, record.signals) from None
     values = [result["alpha"], *result["orders"]] if result["orders"] else []
     orders = {o.names[0]: v for o, v in zip(single_equation.orders, values, strict=False) if o.names}
     nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)

@@ -7,7 +7,15 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, group_findings, make_finding, texts, unique
+from ftlm.findings import (
+    LEVEL_DO_NOT_USE,
+    LEVEL_WITH_CARE,
+    Finding,
+    group_findings,
+    make_finding,
+    texts,
+    unique_findings,
+)
 from ftlm.model.best_identification import BestIdentification
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates
@@ -317,7 +325,7 @@ class SearchResult(BestIdentification):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the table, followed by those on the model of rank 1, without duplicates."""
-        return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "order_on_edge")])
+        return unique_findings([*self.search_findings, *(f for f in self.model_findings if f.code != "order_on_edge")])
 
     @property
     def warnings(self) -> tuple[str, ...]:

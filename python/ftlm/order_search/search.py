@@ -42,8 +42,8 @@ from ftlm.simulation.discretization import (
     check_derivative_orders,
     check_frictionless,
     check_linear,
+    error_with_signal_names,
     named_coefficients,
-    named_signals,
     order_grid_tuple,
     prepare,
 )
@@ -321,7 +321,7 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
     try:
         found = search_equation(job.equation_problem(), execution)
     except ModelError as error:
-        raise named_signals(error, job.records[0].signals) from None
+        raise error_with_signal_names(error, job.records[0].signals) from None
     return _result(job, *_equation_rows(job.structure, found), found["counts"], found["boxed"])
 
 

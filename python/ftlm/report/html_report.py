@@ -32,7 +32,7 @@ from ftlm.findings import (
     make_finding,
     mark_validation,
     texts,
-    unique,
+    unique_findings,
 )
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
@@ -102,7 +102,7 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
     return main, further
 
 
-def title_of(model: Model) -> str:
+def model_title(model: Model) -> str:
     """Return the page title for a model: the name of its structure, or its outputs and inputs."""
     structure = model.structure
     if structure.name != "equation":
@@ -312,7 +312,7 @@ def _content(
     `compared` has (role of the data, comparison) pairs, whose fits are summarized below the title.
     """
     all_sections = [*sections, *(replace(section, collapsed=True) for section in details)]
-    return Page(title_of(model), all_sections, fit_sentences(compared), verdict_box(overall_verdict))
+    return Page(model_title(model), all_sections, fit_sentences(compared), verdict_box(overall_verdict))
 
 
 def main_sections(
@@ -351,7 +351,7 @@ def main_sections(
     ]
     if not validated:
         verdict_texts.append("No validation run was given, so the prediction of other data is unknown.")
-    distinct_findings = unique(findings)
+    distinct_findings = unique_findings(findings)
     alerts, notes = ([f for f in distinct_findings if (f.level == LEVEL_NOTE) == is_note] for is_note in (False, True))
     main_findings, further_findings = first_findings(alerts)
     verdict_texts += [f"{note}." for note in texts(notes)]
@@ -467,7 +467,7 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
     fractional = ", without an approximation of fractional orders" if any(order % 1.0 for order in orders) else ""
     text = f"Exact response of all equations together{fractional}."
     effects = ["friction"] if structure.has_friction else []
-    effects += list(dict.fromkeys(INPUT_EFFECT_LABELS[limit.law] for limit in structure.limits))
+    effects += list(dict.fromkeys(INPUT_EFFECT_LABELS[limit.kind] for limit in structure.limits))
     if effects:
         model = linear_part(model)
         conditions = ["every output keeps its direction of motion"] if structure.has_friction else []
@@ -631,7 +631,7 @@ def settings_table(result: Identification) -> Table:
     ]
     rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
     rows += [
-        [f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", f"{limit.value:g}"]
+        [f"{INPUT_EFFECT_LABELS[limit.kind]} of {symbol(limit.signal)}", f"{limit.value:g}"]
         for limit in structure.limits
     ]
     if structure.sensor_filter is not None:

@@ -51,7 +51,7 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
     lines = []
     for equation in model.equations:
         offset = _offset_text(equation.output, comparison)
-        tail = structure.offset_in_words if offset is None else offset
+        tail = structure.offset_text if offset is None else offset
         lines.append(format_equation(_rounded_equation(equation), structure.describe_inputs(".6g")) + tail)
     return lines
 
@@ -81,7 +81,7 @@ def parameter_lines(result: Identification) -> list[str]:
 
     The list is empty without parameters.
     """
-    offsets, reference = result.offsets, result.model.structure.reference
+    offsets, reference = result.offsets, result.model.structure.nominal_values
     rows = []
     for name, p in result.parameters.items():
         has_error = not math.isnan(p.standard_error)
@@ -89,7 +89,7 @@ def parameter_lines(result: Identification) -> list[str]:
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
         tail = "(offset of one run, not part of the model)" if name in offsets else tail
         if name in reference:
-            tail = f"{tail}  (stated {reference[name]:.6g})".strip()
+            tail = f"{tail}  (nominal {reference[name]:.6g})".strip()
         rows.append((name, f"{p.value:.6g}", error_text, p.unit, tail))
     if not rows:
         return []

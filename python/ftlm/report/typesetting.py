@@ -101,7 +101,7 @@ def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, flo
             structure.delay,
             structure.limits,
             # An offset of kind "level" is omitted: it is added to the output, and is not a term of the equation.
-            "" if "level" in own_offsets.get(e.output, {}) else own_offsets.get(e.output) or structure.offset_in_words,
+            "" if "level" in own_offsets.get(e.output, {}) else own_offsets.get(e.output) or structure.offset_text,
         )
         for e in model.equations
     ]
@@ -143,7 +143,7 @@ def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequ
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
             text = _LIMITED_INPUT.format(
-                INPUT_EFFECT_ABBREVIATIONS[limit.law], text, _number_math(_rounded_number(float(limit.value)))
+                INPUT_EFFECT_ABBREVIATIONS[limit.kind], text, _number_math(_rounded_number(float(limit.value)))
             )
     operator = _operator_math(order)
     return Markup("{}{}{}").format(operator, THIN_SPACE, text) if operator else text
@@ -236,7 +236,7 @@ def parameter_table(
     offsets
         Offsets of the estimation runs by name; see :attr:`ftlm.Identification.offsets`.
     """
-    reference = model.structure.reference
+    reference = model.structure.nominal_values
     units = parameter_units(model)
     errors: Mapping[str, float | None] = {}
     extra: Mapping[str, float] = {}
@@ -297,7 +297,7 @@ def parameter_table(
     inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
-            inputs[limit.name] = (f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", limit.value)
+            inputs[limit.name] = (f"{INPUT_EFFECT_LABELS[limit.kind]} of {symbol(limit.signal)}", limit.value)
     inputs = {n: delay_texts for n, delay_texts in inputs.items() if n in errors}
     rows += [
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in names and n not in inputs
@@ -308,7 +308,7 @@ def parameter_table(
         cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
         kind = OFFSET_PLACES[name.partition("_")[0]]
         rows.append([symbol_html(name), p.value, *cells, None, p.unit, f"{kind}, for this run only"])
-    columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
+    columns = ["parameter", "value", "standard error", "from", "to", "nominal", "unit", "what it is"]
     if has_errors:
         note = "Intervals assume that the model is correct. A coefficient without one is fixed or follows from the law."
         if profiles:
@@ -317,7 +317,7 @@ def parameter_table(
         note = "Without standard errors, the number of significant digits is unknown."
     omitted_columns = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
-        note += " Stated values belong to the integer orders of the manufacturer's model."
+        note += " Nominal values belong to the integer orders of the manufacturer's model."
     column_indices = [i for i in range(len(columns)) if i not in omitted_columns]
     groups = (("", 3), ("95 % interval", 2), ("", len(column_indices) - 5)) if has_errors else ()
     shown_rows = [[cells[i] for i in column_indices] for cells in rows]

@@ -277,7 +277,7 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
     return combine_cases(cases), {
         "values": ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(a)}" for k, a in last.items()),
         "orders": "; ".join(orders),
-        "stated": _printed_text("a", last[PRIOR_COVARIANCES[0]]),
+        "printed_text": _printed_text("a", last[PRIOR_COVARIANCES[0]]),
     }
 
 
@@ -293,7 +293,7 @@ def recomputed_tables(reproduction: Reproduction) -> Evidence:
         "away": ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in tables.items()),
         "ratios": by_angle({o: [t.ratios[c][-1] for c in "bdg"] for o, t in tables.items()}),
         "settings": "; ".join(settings),
-        "stated": _printed_text("a", tables),
+        "printed_text": _printed_text("a", tables),
     }
 
 
@@ -332,7 +332,7 @@ def innovation_length(reproduction: Reproduction) -> Evidence:
     """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error."""
     return _of_trials(reproduction.cases.trials, error_falls), {
         "errors": _by_prior(reproduction, lambda t: t.errors.values()),
-        "stated": _printed_text("error", ANGLE_NAMES, printed.INNOVATION_LENGTHS),
+        "printed_text": _printed_text("error", ANGLE_NAMES, printed.INNOVATION_LENGTHS),
     }
 
 
@@ -402,7 +402,7 @@ def optimizers(reproduction: Reproduction) -> Evidence:
         "errors": by_angle(both),
         "budgets": ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values())),
         "seeds": " to ".join(dict.fromkeys(map(str, (min(seeds), max(seeds))))),
-        "stated": by_angle({o: [part[0] for part in printed.TABLE_7_CRITERIA[o]] for o in own}, 5),
+        "printed_text": by_angle({o: [part[0] for part in printed.TABLE_7_CRITERIA[o]] for o in own}, 5),
     }
 
 
@@ -415,7 +415,7 @@ def manual(reproduction: Reproduction) -> Evidence:
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
     return _of_trials(reproduction.cases.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
-        "stated": by_angle(both, 4),
+        "printed_text": by_angle(both, 4),
     }
 
 
@@ -447,7 +447,7 @@ def close_orders(reproduction: Reproduction) -> Evidence:
     holding = {o: free < ratio * equation and free < most for o, (equation, free) in nr.items()}
     return _of_angles(holding, of_the_machine=reproduction.simulated), {
         "errors": by_angle(nr),
-        "stated": _printed_text("nr", near, digits=4),
+        "printed_text": _printed_text("nr", near, digits=4),
     }
 
 
@@ -528,7 +528,7 @@ def table_3(_: Reproduction) -> Evidence:
         "worst": worst,
         "ratio": ratios[worst],
         "effective": 100 * max(abs(e / p - 1) for _, e, p in rows.values()),
-        "stated": rows[worst][2],
+        "printed_text": rows[worst][2],
     }
 
 

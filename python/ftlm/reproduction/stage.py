@@ -283,7 +283,7 @@ def compare_optimizers(
         If PyGAD or SciPy is not installed, or the run does not start at rest.
     """
     # Reference values of a structure would influence the bounds of the optimizers.
-    single = replace(single, reference={})
+    single = replace(single, nominal_values={})
     work: dict[str, Any] = {"threads": threads, "progress": progress}
     searches = {k: printed.best_orders(run, single, order_grid, LAST_P, k, **work) for k in PRIOR_COVARIANCES}
     count = searches[PRIOR_COVARIANCES[0]].candidates

@@ -83,10 +83,10 @@ def _driver() -> ModuleType:
             ) from None
         raise RigFault(NO_PACKAGE) from None
     except OSError as error:
-        raise _no_library(error) from None
+        raise _no_library_error(error) from None
 
 
-def _no_library(error: OSError) -> RigFault:
+def _no_library_error(error: OSError) -> RigFault:
     return RigFault(
         f"the vendor's Python package is installed, but its library (hil) cannot be loaded ({error}); install the "
         "vendor's runtime"
@@ -168,7 +168,7 @@ class QuanserBoard:
             self._hil = None
             raise self._fault("opening the board", error) from None
         except OSError as error:
-            raise _no_library(error) from None
+            raise _no_library_error(error) from None
         if not valid:
             self._hil = None
             raise RigFault(f"Q8-USB: {ERROR_MESSAGES[-108]}")

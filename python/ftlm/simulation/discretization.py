@@ -192,7 +192,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
         {
             "name": run.name,
             "step": run.step,
-            "times": None if run.sample_times is None else run.sample_times.times,
+            "times": None if run.nonuniform_samples is None else run.nonuniform_samples.times,
             "signals": [_channel(run, structure, name) for name in signals],
             "outputs": [signals.index(name) for name in structure.outputs],
             "filter": None if sensor is None else (sensor.numerator, sensor.denominator),
@@ -200,7 +200,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
             "at_rest": initial == "rest",
             "coupled": structure.coupling == "simulated",
             "friction": not structure.is_linear,
-            "free": [(signals.index(item.signal), item.law) for item in structure.free_inputs],
+            "free": [(signals.index(item.signal), item.kind) for item in structure.free_input_parameters],
         }
     )
 
@@ -269,19 +269,19 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     return {
         **channel,
         "samples": run[name],
-        "nonuniform": None if run.sample_times is None else run.sample_times.data[name],
+        "nonuniform": None if run.nonuniform_samples is None else run.nonuniform_samples.data[name],
         "role": run.intersample.get(name, "output"),
         "delay": delay,
-        "limits": [(limit.law, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
+        "limits": [(limit.kind, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
     }
 
 
 def _check_known_inputs(structure: Structure) -> None:
     """Raise ModelError if the structure has a free delay, saturation or dead zone."""
-    for item in structure.free_inputs:
-        description, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
+    for item in structure.free_input_parameters:
+        description, value = ("delays", "value in seconds") if item.kind == "delay" else ("limits", "value")
         raise ModelError(
-            f"the {item.words} is free: only {parameter('method', 'output-error')} estimates {description}; give "
+            f"the {item.description} is free: only {parameter('method', 'output-error')} estimates {description}; give "
             f"its {value}"
         )
 
@@ -533,7 +533,7 @@ def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) ->
     return fixed_terms if offset == "none" else (*fixed_terms, ("none", "constant", "ramp", "level").index(offset))
 
 
-def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
+def error_with_signal_names(error: ModelError, signals: Sequence[str]) -> ModelError:
     """Return a copy of an error of the Rust core, with names in place of signal indices in its message."""
     return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
 
@@ -616,21 +616,21 @@ def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
 
     The uniform grid is used instead if a delay, saturation or dead zone is free, or if all signals are filtered.
     """
-    return run.sample_times is not None and not structure.free_inputs and not structure.all_filtered
+    return run.nonuniform_samples is not None and not structure.free_input_parameters and not structure.all_filtered
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:
     """Return the times [s since the first sample] at which a run is compared with a simulation."""
-    if run.sample_times is None or not has_nonuniform_samples(run, structure):
+    if run.nonuniform_samples is None or not has_nonuniform_samples(run, structure):
         return run.time
-    return run.sample_times.times[run.sample_times.indices_within(run.duration)]
+    return run.nonuniform_samples.times[run.nonuniform_samples.indices_within(run.duration)]
 
 
 def compared_values(run: Run, structure: Structure, name: str) -> Floats:
     """Return the measured values of a signal at the times of :func:`compared_times`; NaN for missing samples."""
-    if run.sample_times is None or not has_nonuniform_samples(run, structure):
+    if run.nonuniform_samples is None or not has_nonuniform_samples(run, structure):
         return run[name]
-    return run.sample_times.data[name][run.sample_times.indices_within(run.duration)]
+    return run.nonuniform_samples.data[name][run.nonuniform_samples.indices_within(run.duration)]
 
 
 def values_at_residuals(run: Run, structure: Structure, name: str) -> Floats:

@@ -154,7 +154,7 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
 
     Quiet samples are those before an input changes. The result is None if there is no such evidence.
     """
-    if run.sample_times is not None and run.missing_samples:
+    if run.nonuniform_samples is not None and run.missing_samples:
         return None
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
         # A constant output gives no evidence, for example in a run that is only an input for a simulation.
@@ -193,7 +193,7 @@ def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]
     The inputs may be arbitrary.
     """
     series = [run[n] for n in outputs]
-    if run.sample_times is not None or not all(map(is_rest, series)) or not _starts_slowly(series):
+    if run.nonuniform_samples is not None or not all(map(is_rest, series)) or not _starts_slowly(series):
         return None
     return RestEvidence(1, dict.fromkeys(outputs, 0.0), dict.fromkeys(inputs, 0.0), shows_level=False)
 
@@ -290,7 +290,7 @@ def deviations(
     if not levels_nonzero:
         return run, levels
     samples = {n: run[n] - v for n, v in levels_nonzero.items()}
-    nonuniform = run.sample_times
+    nonuniform = run.nonuniform_samples
     shifted_samples = None if nonuniform is None else {n: nonuniform.data[n] - v for n, v in levels_nonzero.items()}
     shifted = run.with_samples(samples, shifted_samples)
     if run.unmasked_run is not None:

@@ -179,20 +179,14 @@ class Friction:
         Known factor of the coefficient. It is negative, because friction dissipates energy.
     name
         Name of a free coefficient that has been fixed to its value.
-    more
-        Optional Stribeck term. The breakaway force is then the sum of both coefficients.
+    stribeck
+        Stribeck term; None if there is none. The breakaway force is then the sum of both coefficients.
     """
 
     coefficient: str | float
     factor: float = -1.0
     name: str | None = None
-    # Omitted from digests and files when unset.
-    more: Stribeck | UnsetType = UNSET
-
-    @property
-    def stribeck(self) -> Stribeck | None:
-        """Stribeck term of the friction; None if there is none."""
-        return self.more if isinstance(self.more, Stribeck) else None
+    stribeck: Stribeck | None = None
 
     @property
     def strength(self) -> float | None:
@@ -224,7 +218,7 @@ class Friction:
         return {name: float(value) for name, value in pairs if name is not None}
 
     @property
-    def numbers(self) -> list[float]:
+    def parameter_values(self) -> list[float]:
         """Coulomb coefficient and, with a Stribeck term, its coefficient and speed; no parameter may be free."""
         return [float(v) for v in self._parameters]
 
@@ -233,18 +227,19 @@ class Friction:
         stribeck = self.stribeck
         return [self.coefficient, *([] if stribeck is None else [stribeck.coefficient, stribeck.speed])]
 
-    def with_numbers(self, values: Sequence[float]) -> Friction:
-        """Return the friction with new parameter values, given in the sequence of :attr:`numbers`."""
+    def with_parameter_values(self, values: Sequence[float]) -> Friction:
+        """Return the friction with new parameter values, given in the sequence of :attr:`parameter_values`."""
         coefficient, *rest = values
-        stribeck_term = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=rest[0], speed=rest[1])
-        return replace(self, coefficient=coefficient, more=stribeck_term)
+        stribeck = None if self.stribeck is None else replace(self.stribeck, coefficient=rest[0], speed=rest[1])
+        return replace(self, coefficient=coefficient, stribeck=stribeck)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free parameters fixed to values; the others stay free."""
         fixed = _fix_parameter(self, values)
         if self.stribeck is None:
             return fixed
-        return replace(fixed, more=_fix_parameter(_fix_parameter(self.stribeck, values), values, "speed", "speed_name"))
+        stribeck = _fix_parameter(_fix_parameter(self.stribeck, values), values, "speed", "speed_name")
+        return replace(fixed, stribeck=stribeck)
 
     def as_text(self, output: str) -> str:
         """Return the friction terms in the equation of an output as text."""
@@ -275,8 +270,9 @@ class Equation:
         Orders above alpha occur, for example, if the measured hub angle of an arm is an input of the link. For
         simulation they must be below alpha + 1, and for zero-order-hold inputs at most alpha, because jumps have no
         derivative.
-    coulomb
-        Optional Coulomb and Stribeck friction. Alpha must then lie in (1, 2], and all other orders below alpha.
+    friction
+        Coulomb friction with an optional Stribeck term; None if there is none. With friction, alpha must lie in (1, 2],
+        and all other orders below alpha.
 
     Raises
     ------
@@ -287,8 +283,7 @@ class Equation:
     output: str
     order: Order
     terms: tuple[Term, ...]
-    # Omitted from digests and files when unset.
-    coulomb: Friction | UnsetType = UNSET
+    friction: Friction | None = None
 
     def __post_init__(self) -> None:
         if not self.terms:
@@ -410,11 +405,6 @@ class Equation:
                 )
 
     @property
-    def friction(self) -> Friction | None:
-        """Friction of the output; None if there is none."""
-        return self.coulomb if isinstance(self.coulomb, Friction) else None
-
-    @property
     def nonlinear_terms(self) -> tuple[Term, ...]:
         """Non-linear terms, in the sequence in which they occur."""
         return tuple(t for t in self.terms if t.nonlinear is not None)
@@ -449,7 +439,7 @@ class Equation:
             If an order is out of range.
         """
         terms = tuple(replace(t, order=t.order.substitute(values)) for t in self.terms)
-        return Equation(self.output, self.order.substitute(values), terms, self.coulomb)
+        return Equation(self.output, self.order.substitute(values), terms, self.friction)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with some free coefficients fixed to values; the others stay free.
@@ -460,8 +450,8 @@ class Equation:
             If a value is not a finite number.
         """
         terms = tuple(_fix_parameter(t, values) for t in self.terms)
-        coulomb = self.coulomb.with_coefficients(values) if isinstance(self.coulomb, Friction) else self.coulomb
-        return Equation(self.output, self.order, terms, coulomb)
+        friction = None if self.friction is None else self.friction.with_coefficients(values)
+        return Equation(self.output, self.order, terms, friction)
 
     @property
     def is_identified(self) -> bool:

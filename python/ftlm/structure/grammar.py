@@ -8,7 +8,7 @@ expression in parentheses. Blanks between names, numbers and symbols do not matt
 
     equation    = sum "=" (sum | "0")  |  transfer
     sum         = {sign} item {sign {sign} item}      (a sign is + or -)
-    item        = "c"  |  "(c + ramp t)"  |  "(c if the runs ask for it)"  |  friction  |  term
+    item        = "c"  |  "(c + ramp t)"  |  "(c if significant)"  |  friction  |  term
                 |  number ["*"] "(" sum ")" ["/" number]
     term        = {number ["*" | "/"]} [name ["*"]] (derivative | product | "D" ["^" order] group) ["/" number]
     derivative  = ["D" ["^" order]] signal  |  signal {"'"}  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
@@ -51,7 +51,7 @@ from ftlm.structure.expression import (
 )
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
 from ftlm.structure.order import Order
-from ftlm.structure.token_reader import FUNCTION_NAMES, IDENTIFIER_PATTERN, TokenReader
+from ftlm.structure.token_reader import FUNCTION_LIST_TEXT, FUNCTION_NAMES, IDENTIFIER_PATTERN, TokenReader
 
 #: Input non-linearities with a syntax in equation texts.
 NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
@@ -65,7 +65,7 @@ _LEIBNIZ_PATTERN = re.compile(
 )
 MAX_LEIBNIZ_TOKENS = 11
 #: Tokens after the name of an offset in parentheses, by the kind of offset.
-OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
+OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "significant")}
 #: Maximum nesting depth of parentheses and functions in a non-linear term.
 MAX_DEPTH = 30
 #: Maximum power of a polynomial in s that is multiplied out.
@@ -220,7 +220,7 @@ class EquationParser(TokenReader):
                     "numbers first"
                 )
             if self._next_is("(") and self._is_plain_sum():
-                raise self._multiplied_sum(name, position)
+                raise self._multiplied_sum_error(name, position)
         start = self._peek()[2]
         order, operand = self._operand()
         if isinstance(operand, str):
@@ -232,12 +232,12 @@ class EquationParser(TokenReader):
         if expression.is_linear:
             if not expression.channels:
                 raise self._error(f"the term at character {start + 1} is a constant without a signal; leave it out")
-            raise self._multiplied_sum(name or f"{factor:g}", position)
+            raise self._multiplied_sum_error(name or f"{factor:g}", position)
         if len(expression.program({c: 0 for c in expression.channels})) > MAX_INSTRUCTIONS:
             raise self._error(f"the non-linear term at character {start + 1} has too many operations; shorten it")
         return [ParsedTerm(factor, name, order, expression.channels[0][0], expression)]
 
-    def _multiplied_sum(self, name: str, position: int) -> ModelError:
+    def _multiplied_sum_error(self, name: str, position: int) -> ModelError:
         return self._error(
             f"{name} at character {position + 1} multiplies a sum; multiply it out, with a coefficient of its own in "
             "each term"
@@ -462,9 +462,8 @@ class EquationParser(TokenReader):
         """Parse a function of an expression, and return it."""
         _, name, position = self._take()
         if name not in EXPRESSION_FUNCTIONS:
-            reason = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
             friction = "; friction is '- fc*sign(D y)', and drag '- w abs(D y)*D y'" if name == "sign" else ""
-            raise self._error(f"{name}(…) at character {position + 1}: {reason}{friction}")
+            raise self._error(f"{name}(…) at character {position + 1}: {FUNCTION_LIST_TEXT}{friction}")
         argument = self._group()
         try:
             return apply(name, argument)
@@ -726,7 +725,7 @@ class EquationParser(TokenReader):
             elif not divides and self._ends_ratio(kind, value, symbols, is_named=common is None and signal is None):
                 return num, den, delay, signal
             elif not divides and (kind == "end" or value in "+-"):
-                raise self._missing_input(start)
+                raise self._missing_input_error(start)
             elif divides:
                 den = self._times(den, self._factor())
             else:
@@ -735,7 +734,7 @@ class EquationParser(TokenReader):
             if not divides:
                 self._accept("*")
 
-    def _missing_input(self, start: int) -> ModelError:
+    def _missing_input_error(self, start: int) -> ModelError:
         """Return the error for a transfer function without an input at its end; `start` is its first token."""
         text = "the transfer function has no input at its end; write "
         factors = itertools.takewhile(lambda token: token[1] not in "/(", self._tokens[start : self._index])

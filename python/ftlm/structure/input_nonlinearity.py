@@ -24,9 +24,9 @@ INPUT_EFFECT_LABELS: dict[InputEffect, str] = {"delay": "delay", "saturation": "
 INPUT_EFFECT_ABBREVIATIONS: dict[InputEffect, str] = {"delay": "delay", "saturation": "sat", "dead_zone": "dead"}
 
 
-def input_name(law: InputEffect, signal: str) -> str:
+def input_name(kind: InputEffect, signal: str) -> str:
     """Return the parameter name of a delay, saturation or dead zone, such as ``delay_u`` or ``sat_u``."""
-    return f"{INPUT_EFFECT_ABBREVIATIONS[law]}_{signal}"
+    return f"{INPUT_EFFECT_ABBREVIATIONS[kind]}_{signal}"
 
 
 @dataclass(frozen=True)
@@ -37,25 +37,25 @@ class FreeInputParameter:
     ----------
     signal
         Name of the input.
-    law
+    kind
         Kind: ``"delay"``, ``"saturation"`` or ``"dead_zone"``.
     bounds
         Lower and upper bound, in seconds for a delay, otherwise in the unit of the input.
     """
 
     signal: str
-    law: InputEffect
+    kind: InputEffect
     bounds: tuple[float, float]
 
     @property
     def name(self) -> str:
         """Parameter name; see :func:`input_name`."""
-        return input_name(self.law, self.signal)
+        return input_name(self.kind, self.signal)
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Description of the parameter, such as ``delay of u``."""
-        return f"{INPUT_EFFECT_LABELS[self.law]} of {self.signal}"
+        return f"{INPUT_EFFECT_LABELS[self.kind]} of {self.signal}"
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class InputNonlinearity:
     ----------
     signal
         Name of the input.
-    law
+    kind
         ``"saturation"`` or ``"dead_zone"``.
     value
         Limit in the unit of the input, positive for a saturation and not negative for a dead zone; (lower, upper)
@@ -82,13 +82,13 @@ class InputNonlinearity:
     """
 
     signal: str
-    law: NonlinearityKind
+    kind: NonlinearityKind
     value: Value
 
     def __post_init__(self) -> None:
         subject, relation = (
-            f"{INPUT_EFFECT_LABELS[self.law]} of {self.signal}",
-            "above" if self.law == "saturation" else "from",
+            f"{INPUT_EFFECT_LABELS[self.kind]} of {self.signal}",
+            "above" if self.kind == "saturation" else "from",
         )
         if isinstance(self.value, (tuple, list)):
             if len(self.value) != 2:
@@ -102,7 +102,7 @@ class InputNonlinearity:
                 )
             return
         value = real_number(subject, self.value)
-        if not (0 <= value < math.inf and (value > 0 or self.law == "dead_zone")):
+        if not (0 <= value < math.inf and (value > 0 or self.kind == "dead_zone")):
             raise ModelError(
                 f"{subject} = {self.value} is out of range; give a number {relation} 0, in the unit of {self.signal}"
             )
@@ -110,12 +110,12 @@ class InputNonlinearity:
     @property
     def free(self) -> FreeInputParameter | None:
         """Parameter to estimate, or None if the value is fixed."""
-        return FreeInputParameter(self.signal, self.law, self.value) if isinstance(self.value, tuple) else None
+        return FreeInputParameter(self.signal, self.kind, self.value) if isinstance(self.value, tuple) else None
 
     @property
     def name(self) -> str:
         """Parameter name of the value; see :func:`input_name`."""
-        return input_name(self.law, self.signal)
+        return input_name(self.kind, self.signal)
 
     def apply(self, values: Floats) -> Floats:
         """Return input values with the non-linearity applied.
@@ -126,9 +126,9 @@ class InputNonlinearity:
             If the value of the non-linearity is free.
         """
         if isinstance(self.value, tuple):
-            raise ModelError(f"the {INPUT_EFFECT_LABELS[self.law]} of {self.signal} is still free; give its value")
+            raise ModelError(f"the {INPUT_EFFECT_LABELS[self.kind]} of {self.signal} is still free; give its value")
         clipped = np.clip(values, -self.value, self.value)
-        return np.asarray(clipped if self.law == "saturation" else values - clipped)
+        return np.asarray(clipped if self.kind == "saturation" else values - clipped)
 
     def as_text(self, inner: str, digits: str = "r") -> str:
         """Return text such as ``sat(u, 0.94)``; `inner` is the text of the input.
@@ -137,24 +137,25 @@ class InputNonlinearity:
         """
         values = self.value if isinstance(self.value, tuple) else (self.value,)
         texts = [repr(float(v)) if digits == "r" else format(v, digits) for v in values]
-        return f"{INPUT_EFFECT_ABBREVIATIONS[self.law]}({inner}, {':'.join(texts)})"
+        return f"{INPUT_EFFECT_ABBREVIATIONS[self.kind]}({inner}, {':'.join(texts)})"
 
 
 def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlinearity]:
     """Return non-linearities in the sequence in which they act: dead zones, then saturations."""
-    return sorted(limits, key=lambda limit: limit.law == "saturation")
+    return sorted(limits, key=lambda limit: limit.kind == "saturation")
 
 
 def replace_nonlinearities(
-    limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
+    limits: Sequence[InputNonlinearity], kind: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
     """Return the non-linearities in the sequence in which they act, with one kind of them replaced.
 
-    Those of the kind `law` are replaced by new ones with `values` by input.
+    Those of the kind `kind` are replaced by new ones with `values` by input.
     """
-    others = [limit for limit in limits if limit.law != law or limit.signal not in values]
+    others = [limit for limit in limits if limit.kind != kind or limit.signal not in values]
     new = [
-        InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()
+        InputNonlinearity(s, kind, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v)
+        for s, v in values.items()
     ]
     return tuple(sort_nonlinearities([*others, *new]))
 
@@ -168,21 +169,21 @@ def check_nonlinearities(
     dead zone with a saturation. `delays` are the fixed delays and `free_delays` the free delays, by input.
     """
     for k, limit in enumerate(limits):
-        if any((o.signal, o.law) == (limit.signal, limit.law) for o in limits[:k]):
-            raise ModelError(f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is given twice; give it once")
+        if any((o.signal, o.kind) == (limit.signal, limit.kind) for o in limits[:k]):
+            raise ModelError(f"the {INPUT_EFFECT_LABELS[limit.kind]} of {limit.signal} is given twice; give it once")
         if limit.free is None:
             continue
-        name, subject = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is free"
+        name, subject = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.kind]} of {limit.signal} is free"
         other = next((o for o in limits if o.signal == name and o is not limit), None)
         if name in free_delays or (other is not None and other.free is not None):
-            other_label = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.law]
+            other_label = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.kind]
             raise ModelError(
                 f"{subject}, and so is its {other_label}; only one parameter of an input can be estimated: give the "
                 "other one"
             )
         if delays.get(name):
             raise ModelError(f"{subject}, and {name} has a delay; shift the input by it, or give the limit")
-        if other is not None and limit.law == "dead_zone":
+        if other is not None and limit.kind == "dead_zone":
             raise ModelError(
                 f"{subject}, and {name} saturates after it; free the saturation instead, or give both values"
             )

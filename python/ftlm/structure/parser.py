@@ -231,7 +231,7 @@ def _equation_of(parser: EquationParser) -> Equation:
             terms.append(Term(item.signal, item.order, factor, expression=expression))
         else:
             terms.append(Term(item.signal, item.order, item.name, factor, expression=expression))
-    return Equation(lead.signal, lead.order, tuple(terms), _friction_of(parser, lead.signal, divisor) or UNSET)
+    return Equation(lead.signal, lead.order, tuple(terms), _friction_of(parser, lead.signal, divisor))
 
 
 def _division_reason(parser: EquationParser, lead: ParsedTerm) -> str | None:
@@ -346,7 +346,7 @@ def _friction_of(parser: EquationParser, output: str, divisor: float) -> Frictio
     scaled = replace(parser.friction[0], factor=parser.friction[0].factor / divisor)
     if parser.stribeck is None:
         return scaled
-    return replace(scaled, more=replace(parser.stribeck[0], factor=parser.stribeck[0].factor / divisor))
+    return replace(scaled, stribeck=replace(parser.stribeck[0], factor=parser.stribeck[0].factor / divisor))
 
 
 def _merge_nonlinearities(parsers: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
@@ -364,7 +364,7 @@ def _merge_nonlinearities(parsers: Sequence[EquationParser]) -> tuple[InputNonli
             f"{conflict} occurs with and without its limit, but an actuator limits all of its effects; limit it in "
             "each term, or give the limited input as another signal of the run"
         )
-    return tuple(sort_nonlinearities([InputNonlinearity(s, law, value) for (s, law), value in limits.items()]))
+    return tuple(sort_nonlinearities([InputNonlinearity(s, kind, value) for (s, kind), value in limits.items()]))
 
 
 def _merge_delays(parsers: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -130,7 +131,7 @@ class Structure:
         Known filter through which some signals were measured.
     coefficient_law
         Laws between coefficients, each as (name, sign, factors): the named coefficient is sign * product of factors.
-    reference
+    nominal_values
         Nominal values of coefficients by name, which are printed next to the estimates.
     name
         Name of the structure.
@@ -161,7 +162,7 @@ class Structure:
     initial: Initial = "auto"
     sensor_filter: SensorFilter | None = None
     coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
-    reference: Mapping[str, float] = field(default_factory=dict)
+    nominal_values: Mapping[str, float] = field(default_factory=dict)
     name: str = "equation"
     hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
     offset: Offset = "none"
@@ -192,9 +193,11 @@ class Structure:
                 raise ModelError(f"delay of {name} from {low} to {high} s is not an interval; give two rising times")
         check_known("limited input", [limit.signal for limit in self.limits], external)
         check_nonlinearities(self.limits, self.delay, self.free_delays)
-        for item in self.free_inputs:
+        for item in self.free_input_parameters:
             if item.name in names or item.name in self.order_names:
-                raise ModelError(f"{item.name} is the name of the {item.words}; give the coefficient another name")
+                raise ModelError(
+                    f"{item.name} is the name of the {item.description}; give the coefficient another name"
+                )
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
@@ -498,18 +501,18 @@ class Structure:
         return () if isinstance(self.input_nonlinearities, UnsetType) else self.input_nonlinearities
 
     @property
-    def free_inputs(self) -> tuple[FreeInputParameter, ...]:
+    def free_input_parameters(self) -> tuple[FreeInputParameter, ...]:
         """Parameters of inputs to estimate: free delays, then free saturations and dead zones."""
         delay_parameters = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*delay_parameters, *(limit.free for limit in self.limits if limit.free is not None)])
 
     @property
-    def fixed_inputs(self) -> dict[str, float]:
+    def fixed_input_parameters(self) -> dict[str, float]:
         """Values of fixed delays, saturations and dead zones by name, such as ``delay_u``, ``sat_u``."""
         delays = {input_name("delay", n): delay for n, delay in self.delay.items()}
         return delays | {limit.name: limit.value for limit in self.limits if not isinstance(limit.value, tuple)}
 
-    def with_inputs(self, values: Mapping[str, float]) -> Structure:
+    def with_input_parameters(self, values: Mapping[str, float]) -> Structure:
         """Return the structure with delays and limits fixed to values by name, such as ``delay_u``, ``sat_u``."""
         names = {n: input_name("delay", n) for n in (*self.delay, *self.free_delays)}
         delays = {n: values[name] for n, name in names.items() if name in values}
@@ -518,7 +521,7 @@ class Structure:
         )
         return replace(self.with_delays(delays), input_nonlinearities=_or_unset(limits))
 
-    def without_input_nonlinearities(self) -> Structure:
+    def without_free_input_parameters(self) -> Structure:
         """Return the structure without its free delays, free saturations and free dead zones; fixed ones are kept."""
         fixed_limits = [limit for limit in self.limits if limit.free is None]
         return replace(self, free_delays={}, input_nonlinearities=_or_unset(fixed_limits))
@@ -537,21 +540,23 @@ class Structure:
 
     def __str__(self) -> str:
         inputs = self.describe_inputs()
-        return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
+        return "\n".join(f"{e.as_text(inputs)}{self.offset_text}" for e in self.equations)
 
     def equation_text(self, item: Equation) -> str:
         """Return an identified equation as text with six significant digits, with input effects and offset."""
-        return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words
+        return format_equation(item, self.describe_inputs(".6g")) + self.offset_text
 
     @property
-    def offset_in_words(self) -> str:
+    def offset_text(self) -> str:
         """Text of the offset at the end of an equation, such as " + c"; empty for ``"none"`` and ``"level"``."""
-        names = {*self.coefficient_names, *self.order_names, *self.signals}
-        name = next(n for n in ("c", *(f"c{k}" for k in range(len(names) + 1))) if n not in names)
-        auto_text = f" + ({name} if the runs ask for it)"
-        return {"none": "", "level": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": auto_text}[
-            self.offset
-        ]
+        (name,) = unused_names("c", 1, self)
+        return {
+            "none": "",
+            "level": "",
+            "constant": f" + {name}",
+            "ramp": f" + ({name} + ramp t)",
+            "auto": f" + ({name} if significant)",
+        }[self.offset]
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
@@ -565,6 +570,17 @@ def _format(value: float, digits: str) -> str:
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:
     """Return the non-linearities as a tuple, or msgspec's UNSET if there are none, so that files omit the field."""
     return tuple(limits) or UNSET
+
+
+def unused_names(base: str, count: int, structure: Structure, signals: Iterable[str] = ()) -> list[str]:
+    """Return `count` names, built from `base`, that no parameter or signal of a structure and none of `signals` has.
+
+    A single name is `base` itself if it is unused. Other names are `base` with a number.
+    """
+    reserved_names = {*structure.order_names, *structure.coefficient_names, *structure.signals, *signals}
+    numbered = (f"{base}{k}" for k in itertools.count(1))
+    names = itertools.chain([base] if count == 1 else [], numbered)
+    return list(itertools.islice((n for n in names if n not in reserved_names), count))
 
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:

@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Iterator
 
 from ftlm.errors import ModelError
+from ftlm.structure.expression import EXPRESSION_FUNCTIONS
 from ftlm.structure.input_nonlinearity import Value
 from ftlm.structure.order import Order
 from ftlm.utils.parameters import parameter
@@ -40,6 +41,9 @@ def _prime_notation(dotted: re.Match[str]) -> str:
 
 #: Names that are parsed as functions before a parenthesis; for an unsupported one, the error message names it.
 FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
+#: Functions that an equation may have, with sign for friction.
+KNOWN_FUNCTIONS = (*EXPRESSION_FUNCTIONS, "sat", "dead", "sign")
+FUNCTION_LIST_TEXT = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
 
 
 class TokenReader:
@@ -118,7 +122,7 @@ class TokenReader:
         elif kind == "name" and self._index > 1 and self._peek(-2)[1] == "^":
             remedy = f"a power of a coefficient is a coefficient: write one name for it, as in 'a1 {value}'"
         elif before[0] == "name" and value == "(":
-            remedy = f"{before[1]!r} is no function{nearest(before[1], FUNCTION_NAMES)}"
+            remedy = f"{before[1]!r} is no known function{nearest(before[1], KNOWN_FUNCTIONS)}; {FUNCTION_LIST_TEXT}"
         return self._error(f"expected {expectation} at character {position + 1}, found {found}; {remedy}")
 
     def _signs(self) -> Iterator[float]:

@@ -23,7 +23,7 @@ from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import values_at_residuals
 from ftlm.structure.expression import derivative_text
 from ftlm.structure.parser import equation
-from ftlm.structure.structure import Structure, check_offset
+from ftlm.structure.structure import Structure, check_offset, unused_names
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import Trial, fit, fit_criterion, residual_variance_inflation
 from ftlm.structure_selection.stepwise import CandidateEvaluator
@@ -401,9 +401,7 @@ class AutomaticSelection:
             else np.sign(np.gradient(samples.outputs[row]))
             for samples in simulations
         ]
-        name = "friction_force"
-        while name in runs[0].signals:
-            name += "_"
+        (name,) = unused_names("friction_force", 1, without.structure, runs[0].signals)
         with_force = _fit_form(
             replace(
                 problem,
@@ -471,7 +469,7 @@ class AutomaticSelection:
             }
             # The coefficients of the inputs are eliminated at every iterate.
             gains = dict.fromkeys(structure.coefficient_names, frequency**alpha)
-            delays = {i.name: delay_values.get(i.name, i.bounds[0]) for i in structure.free_inputs}
+            delays = {i.name: delay_values.get(i.name, i.bounds[0]) for i in structure.free_input_parameters}
             names = (*structure.order_names, *structure.coefficient_names)
             values = {**gains, **{n + suffix: v for n, v in values_of_form.items()}}
             return {n: v for n, v in values.items() if n in names} | delays

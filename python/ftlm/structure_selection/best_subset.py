@@ -140,7 +140,7 @@ def screen_subsets(nested: NestedStructures, folds: Folds, pool: TaskPool) -> li
     if (
         len(structure.equations) > 1
         or not structure.is_linear
-        or structure.free_inputs
+        or structure.free_input_parameters
         or sum(t.coefficient in nested.droppable for t in input_terms) < MIN_INPUT_TERMS
         or any(f.rows is not None for f in folds.parts)
     ):

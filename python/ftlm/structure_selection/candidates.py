@@ -108,10 +108,10 @@ class NestedStructures:
         if friction is None:
             return equation
         if friction_name in choices and friction_name not in frictions:
-            return replace(equation, coulomb=UNSET)
+            return replace(equation, friction=None)
         stribeck_name = f"{friction_name} near rest"
         return (
-            replace(equation, coulomb=replace(friction, more=UNSET))
+            replace(equation, friction=replace(friction, stribeck=None))
             if stribeck_name in choices and stribeck_name not in frictions
             else equation
         )
@@ -131,7 +131,7 @@ class NestedStructures:
                 t for t in equation.terms if t.coefficient not in droppable or t.coefficient in variant.coefficients
             )
             equations.append(self._with_frictions(replace(equation, terms=terms), variant.frictions))
-        dropped = {i.name for i in structure.free_inputs} - variant.inputs
+        dropped = {i.name for i in structure.free_input_parameters} - variant.inputs
         candidate = restrict_structure(
             structure,
             tuple(equations),
@@ -308,7 +308,7 @@ class NestedStructures:
                 yield Change(f"{name} free", variant.with_integer_orders({name: None}))
         if self.offset_allowed and not variant.offset:
             yield Change("an offset of each run", replace(variant, offset=True))
-        for parameter in self.structure.free_inputs:
+        for parameter in self.structure.free_input_parameters:
             if parameter.name not in variant.inputs:
                 yield Change(f"{parameter.name} free", replace(variant, inputs=variant.inputs | {parameter.name}))
         for name, simpler_name in self.frictions.items():
@@ -362,7 +362,7 @@ def signature(structure: Structure) -> str:
         parts.append(f"{equation.output} {'free' if equation.order.is_single else equation.order} {terms}")
     frictions = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
     options = (structure.offset, structure.initial, structure.coupling, frictions)
-    return f"{parts} {options} {[i.name for i in structure.free_inputs]}"
+    return f"{parts} {options} {[i.name for i in structure.free_input_parameters]}"
 
 
 def name_candidates(structures: Sequence[Structure | str] | Mapping[str, Structure | str]) -> dict[str, Structure]:

@@ -73,7 +73,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
 def _run_content(run: Run) -> list[object]:
     """Return all data of a run that affect a fit, for a digest."""
-    nonuniform_samples = run.sample_times
+    nonuniform_samples = run.nonuniform_samples
     times = (
         []
         if nonuniform_samples is None

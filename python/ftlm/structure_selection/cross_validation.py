@@ -345,7 +345,7 @@ def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structu
     :func:`resolve_start`.
     """
     if structure.initial == "auto":
-        start = prepare(runs, structure.without_input_nonlinearities(), None, power_of_two=False, gaps=True)[0].initial
+        start = prepare(runs, structure.without_free_input_parameters(), None, power_of_two=False, gaps=True)[0].initial
         structure = replace(structure, initial="rest" if start == "rest" else "caputo")
     return resolve_start(runs, structure)
 

@@ -225,7 +225,7 @@ def select(
         # Raise here once, instead of a failure of every candidate.
         prepare(
             folds.runs,
-            replace(structure.without_input_nonlinearities(), offset="none"),
+            replace(structure.without_free_input_parameters(), offset="none"),
             None,
             power_of_two=False,
             gaps=True,
@@ -366,8 +366,8 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
 
 def _have_common_delays(winners: Sequence[Trial]) -> bool:
     """Whether the delay estimates of each input agree within their errors in all equations."""
-    for name in {i.name for w in winners for i in w.structure.free_inputs}:
-        signal = next(i.signal for w in winners for i in w.structure.free_inputs if i.name == name)
+    for name in {i.name for w in winners for i in w.structure.free_input_parameters}:
+        signal = next(i.signal for w in winners for i in w.structure.free_input_parameters if i.name == name)
         concerned = [w for w in winners if signal in w.structure.signals]
         if any(name not in w.values for w in concerned):
             return False
@@ -379,8 +379,8 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
 
 def _without_free_delays(choice: Choice) -> Choice:
     """Return the choice among candidates without free delays, or the same choice if there are none."""
-    ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_inputs]
-    if not choice.winner.structure.free_inputs or not ranked:
+    ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_input_parameters]
+    if not choice.winner.structure.free_input_parameters or not ranked:
         return choice
     close = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], ranked[0])]
     winner = _winner([ranked[k] for k in close])

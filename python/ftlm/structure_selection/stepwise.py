@@ -16,7 +16,7 @@ from ftlm.data.run import Run
 from ftlm.errors import FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Objective
-from ftlm.estimation.output_error import COARSE_SHARE, JointFit, output_deviations, start_from_values
+from ftlm.estimation.output_error import COARSE_FRACTION, JointFit, output_deviations, start_from_values
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.best_subset import ScreenedSubset, TaskPool, screen_subsets
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, describe_structure, signature
@@ -80,7 +80,7 @@ def _prescreen_cost(
     objective = Objective(
         problem,
         runs,
-        [1.0 / (COARSE_SHARE * size) for size in output_deviations(runs, structure)],
+        [1.0 / (COARSE_FRACTION * size) for size in output_deviations(runs, structure)],
         decimation=decimation,
     )
     cost = math.inf

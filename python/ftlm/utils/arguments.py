@@ -8,6 +8,7 @@ import functools
 import inspect
 import math
 import os
+import re
 import sys
 import types
 import warnings
@@ -45,6 +46,12 @@ _KIND_WORDS: dict[Any, str] = {
     types.NoneType: "None",
     tuple: "a tuple",
     **dict.fromkeys((Sequence, Iterable, Collection, list), "a list"),
+}
+#: Public functions and classes that construct an argument, by the name of the argument.
+_CONSTRUCTORS = {
+    "structure": ("equation", "flexible_link"),
+    "equation": ("equation", "flexible_link"),
+    "method": ("OutputError", "MultiInnovation", "InstrumentalVariables", "LeastSquares", "GeneticAlgorithm"),
 }
 #: Maximum number of items of a mapping or list whose types are checked.
 _MAX_CHECKED_ITEMS = 1000
@@ -118,19 +125,40 @@ def _is_raised_by_caller(error: BaseException) -> bool:
     return False
 
 
-def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, Any], error: Exception) -> None:
-    """Raise TypeError with the known keywords if a given keyword is not a parameter of the function."""
+def _unknown_keyword_hint(unknown: str, names: Sequence[str], arguments: Mapping[str, Any]) -> str:
+    """Return a hint for an unknown keyword: where it belongs, a similar keyword, or the known keywords.
+
+    `names` are the known keywords, and `arguments` the arguments with known keywords.
+    """
+    for argument in [n for n in names if n in _CONSTRUCTORS]:
+        functions = [
+            f"ftlm.{function}(…, {unknown}=…)"
+            for function in _CONSTRUCTORS[argument]
+            if unknown in inspect.signature(getattr(sys.modules["ftlm"], function)).parameters
+        ]
+        if functions:
+            return f"it is an argument of {argument}={' or '.join(functions)}"
+    for argument in [n for n in arguments if "equation" in _CONSTRUCTORS.get(n, ())]:
+        if re.search(rf"\b{re.escape(unknown)}\b", str(arguments[argument])):
+            return (
+                f"{unknown} is in the equation: write its value there, or fix an order with "
+                f"ftlm.equation(…, orders={{{unknown!r}: …}}) and a coefficient with fixed={{{unknown!r}: …}}"
+            )
+    match = difflib.get_close_matches(unknown, names, 1)
+    known = ", ".join(n for n in names if n not in ("self", "cls"))
+    return f"did you mean {match[0]}=?" if match else f"known: {known}"
+
+
+def _raise_unknown_keyword(
+    signature: inspect.Signature, args: Any, kwargs: Mapping[str, Any], error: Exception
+) -> None:
+    """Raise TypeError with a hint if a given keyword is not a parameter of the function."""
     names = [n for n, p in signature.parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     takes_any = any(p.kind == p.VAR_KEYWORD for p in signature.parameters.values())
     unknown = next((name for name in kwargs if name not in names), None)
     if unknown is not None and not takes_any:
-        match = difflib.get_close_matches(unknown, names, 1)
-        hint = (
-            f"did you mean {match[0]}=?"
-            if match
-            else f"known: {', '.join(n for n in names if n not in ('self', 'cls'))}"
-        )
-        raise TypeError(f"{error}; {hint}") from None
+        known_arguments = {**dict(zip(names, args, strict=False)), **{n: v for n, v in kwargs.items() if n in names}}
+        raise TypeError(f"{error}; {_unknown_keyword_hint(unknown, names, known_arguments)}") from None
 
 
 def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:
@@ -142,7 +170,7 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
     try:
         bound = signature.bind(*args, **kwargs)
     except TypeError:
-        _raise_unknown_keyword(signature, kwargs, error)
+        _raise_unknown_keyword(signature, args, kwargs, error)
         return
     names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
     for name, value in bound.arguments.items():

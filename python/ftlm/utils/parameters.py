@@ -54,21 +54,21 @@ class Note(str):
     ----------
     fact
         Text without the parameter, for readers to whom its syntax means nothing.
-    otherwise
-        Reference to the parameter; empty if there is none.
+    override
+        Text of the parameter; empty if there is none.
     """
 
     fact: str
-    otherwise: str
+    override: str
 
-    def __new__(cls, fact: str, otherwise: str = "") -> Note:
+    def __new__(cls, fact: str, override: str = "") -> Note:
         """Create the note from its parts."""
-        note = super().__new__(cls, f"{fact}; otherwise {otherwise}" if otherwise else fact)
-        note.fact, note.otherwise = fact, otherwise
+        note = super().__new__(cls, f"{fact}; otherwise {override}" if override else fact)
+        note.fact, note.override = fact, override
         return note
 
     def __reduce__(self) -> tuple[type[Note], tuple[str, str]]:
-        return Note, (self.fact, self.otherwise)
+        return Note, (self.fact, self.override)
 
 
 class Placeholder(str):

@@ -149,7 +149,7 @@ def nearest(word: object, names: Iterable[object]) -> str:
     return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
-def bad_rows(label: str, problem: str, first: int, count: int, remedy: str) -> DataError:
+def bad_rows_error(label: str, problem: str, first: int, count: int, remedy: str) -> DataError:
     """Return a DataError for invalid rows.
 
     The message states the object, what is wrong, the first invalid row (from 0), the number of such rows and the
@@ -270,7 +270,7 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
     if gaps and array.dtype.kind in _NUMBER_DTYPE_KINDS:
         return np.where(mask, np.nan, array)
     first = int(np.argwhere(np.atleast_1d(mask))[0][0])
-    raise bad_rows(name, "masked (missing) value", first, int(mask.sum()), "remove or fill these rows yourself")
+    raise bad_rows_error(name, "masked (missing) value", first, int(mask.sum()), "remove or fill these rows yourself")
 
 
 def _check_sequence(name: str, values: object) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
-from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique
+from ftlm.findings import LEVEL_FACT, LEVEL_NOTE, Finding, make_finding, unique_findings
 from ftlm.kernels import pulse_means
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
@@ -594,14 +594,14 @@ def inspect_run(run: Run) -> Inspection:
     for s in signals:
         if s.constant:
             findings.append(make_finding("signal_constant", run=run.name, **{s.role: s.name}, level=s.first))
-    return Inspection(run.name, run.length, run.step, run.duration, signals, unique(findings))
+    return Inspection(run.name, run.length, run.step, run.duration, signals, unique_findings(findings))
 
 
 def data_notes(run: Run) -> list[Finding]:
     """Return notes, as findings, on how a run was read and processed, and on whether the rig stopped it."""
     notes = []
     for note in run.warnings:
-        texts = {"text": note.fact, "otherwise": note.otherwise} if isinstance(note, Note) else {"text": note}
+        texts = {"text": note.fact, "override": note.override} if isinstance(note, Note) else {"text": note}
         notes.append(make_finding("data_note", run=run.name, **texts))
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):
