@@ -182,7 +182,7 @@ BAD = {
     ),
     "a parameter of the equation as keyword": (
         TypeError,
-        "alpha is in the equation: write its value there, or fix an order with ftlm.equation(…, orders={'alpha': …})",
+        "alpha is in the equation: write its value there, or give it to ftlm.equation by orders= or fixed=",
         lambda: ftlm.identify(run(), ftlm.equation("D^alpha y = a y + b u"), alpha=1.5),
     ),
     "a keyword that belongs nowhere": (

@@ -51,7 +51,14 @@ from ftlm.structure.expression import (
 )
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
 from ftlm.structure.order import Order
-from ftlm.structure.token_reader import FUNCTION_LIST_TEXT, FUNCTION_NAMES, IDENTIFIER_PATTERN, TokenReader
+from ftlm.structure.token_reader import (
+    FUNCTION_LIST_TEXT,
+    FUNCTION_NAMES,
+    IDENTIFIER_PATTERN,
+    KNOWN_FUNCTIONS,
+    TokenReader,
+)
+from ftlm.utils.validation import nearest
 
 #: Input non-linearities with a syntax in equation texts.
 NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
@@ -68,6 +75,8 @@ MAX_LEIBNIZ_TOKENS = 11
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "significant")}
 #: Maximum nesting depth of parentheses and functions in a non-linear term.
 MAX_DEPTH = 30
+#: Minimum similarity of a name right before a parenthesis to a function, from which it is a misspelled function.
+MIN_FUNCTION_SIMILARITY = 0.7
 #: Maximum power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
 #: Maximum number of terms of a polynomial in s with named coefficients.
@@ -213,6 +222,12 @@ class EquationParser(TokenReader):
         if kind == "name" and value != "D" and self._leibniz() is None and self._continues_after_name():
             name = value
             self._take()
+            is_call = self._next_is("(") and self._peek()[2] == position + len(name)
+            if is_call and nearest(name, (*FUNCTION_NAMES, *KNOWN_FUNCTIONS), MIN_FUNCTION_SIMILARITY):
+                raise self._error(
+                    f"{name!r} at character {position + 1} is no known function{nearest(name, KNOWN_FUNCTIONS)}; if it "
+                    f"is a coefficient, write '{name}*('"
+                )
             self._accept("*")
             if self._peek()[0] == "number":
                 raise self._error(

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_o
 import numpy as np
 
 from ftlm.errors import FtlmError, ModelError
-from ftlm.utils.parameters import setting, type_name
+from ftlm.utils.parameters import parameter, setting, type_name
 from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, whole_number
 
 #: Exceptions that an argument of a wrong type can cause.
@@ -48,7 +48,7 @@ _KIND_WORDS: dict[Any, str] = {
     **dict.fromkeys((Sequence, Iterable, Collection, list), "a list"),
 }
 #: Public functions and classes that construct an argument, by the name of the argument.
-_CONSTRUCTORS = {
+_ARGUMENT_CONSTRUCTORS = {
     "structure": ("equation", "flexible_link"),
     "equation": ("equation", "flexible_link"),
     "method": ("OutputError", "MultiInnovation", "InstrumentalVariables", "LeastSquares", "GeneticAlgorithm"),
@@ -130,19 +130,19 @@ def _unknown_keyword_hint(unknown: str, names: Sequence[str], arguments: Mapping
 
     `names` are the known keywords, and `arguments` the arguments with known keywords.
     """
-    for argument in [n for n in names if n in _CONSTRUCTORS]:
+    for argument in [n for n in names if n in _ARGUMENT_CONSTRUCTORS]:
         functions = [
             f"ftlm.{function}(…, {unknown}=…)"
-            for function in _CONSTRUCTORS[argument]
+            for function in _ARGUMENT_CONSTRUCTORS[argument]
             if unknown in inspect.signature(getattr(sys.modules["ftlm"], function)).parameters
         ]
         if functions:
             return f"it is an argument of {argument}={' or '.join(functions)}"
-    for argument in [n for n in arguments if "equation" in _CONSTRUCTORS.get(n, ())]:
+    for argument in [n for n in arguments if "equation" in _ARGUMENT_CONSTRUCTORS.get(n, ())]:
         if re.search(rf"\b{re.escape(unknown)}\b", str(arguments[argument])):
             return (
-                f"{unknown} is in the equation: write its value there, or fix an order with "
-                f"ftlm.equation(…, orders={{{unknown!r}: …}}) and a coefficient with fixed={{{unknown!r}: …}}"
+                f"{unknown} is in the equation: write its value there, or give it to ftlm.equation by "
+                f"{parameter('orders')} or {parameter('fixed')}"
             )
     match = difflib.get_close_matches(unknown, names, 1)
     known = ", ".join(n for n in names if n not in ("self", "cls"))

@@ -141,11 +141,15 @@ def join_names(names: Iterable[object], max_count: int = 40) -> str:
     return ", ".join(texts[:max_count]) + (f", … and {len(texts) - max_count} more" if len(texts) > max_count else "")
 
 
-def nearest(word: object, names: Iterable[object]) -> str:
+def nearest(word: object, names: Iterable[object], min_similarity: float = 0.5) -> str:
     """Return text such as " (did you mean …?)" with the name most similar to `word`, or "" if none is similar."""
     options = [str(name) for name in names]
     prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
-    matches = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    matches = (
+        [max(prefixes, key=len)]
+        if prefixes
+        else difflib.get_close_matches(str(word), options, n=1, cutoff=min_similarity)
+    )
     return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
