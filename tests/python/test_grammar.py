@@ -205,8 +205,10 @@ def test_what_is_printed_is_read(structure):
         ("D y = tan(y) + u", r"tan(…) at character 7: of the functions of signals only"),
         (
             "D y = tahn(y) + u",
-            "'tahn' is no known function (did you mean 'tanh'?); of the functions of signals only sin",
+            "'tahn' at character 7 is no known function (did you mean 'tanh'?); if it is a coefficient",
         ),
+        ("D y = log10(y) + u", "'log10' at character 7 is no known function; if it is a coefficient, write 'log10*('"),
+        ("D y = y*tahn(y) + u", "'tahn' is no known function (did you mean 'tanh'?); of the functions of signals only"),
         ("D y = a y*sign(y) + u", "sign(…) at character 11: of the functions of signals only"),
         ("D y = abs(D^nu y) + u", "the order nu at character 11 is free inside a non-linear term"),
         ("D y = k D^0.5 (y^2)*u", "'*' at character 20 follows the derivative of an expression"),

@@ -145,12 +145,8 @@ def nearest(word: object, names: Iterable[object], min_similarity: float = 0.5) 
     """Return text such as " (did you mean …?)" with the name most similar to `word`, or "" if none is similar."""
     options = [str(name) for name in names]
     prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
-    matches = (
-        [max(prefixes, key=len)]
-        if prefixes
-        else difflib.get_close_matches(str(word), options, n=1, cutoff=min_similarity)
-    )
-    return f" (did you mean {matches[0]!r}?)" if matches else ""
+    similar_names = prefixes or difflib.get_close_matches(str(word), options, n=1, cutoff=min_similarity)
+    return f" (did you mean {max(similar_names, key=len)!r}?)" if similar_names else ""
 
 
 def bad_rows_error(label: str, problem: str, first: int, count: int, remedy: str) -> DataError:
