@@ -93,7 +93,7 @@ class Lqr:
     """State feedback on the maker's model of whole orders, rates by filtered differences; weights are ours."""
 
     def __init__(self):
-        arm = rig.ArmParameters.of("effective").stage1
+        arm = rig.ArmParameters.load("effective").stage1
         # theta11, theta12 and their rates; the link hangs on the hub.
         hub = np.array([0.0, arm.a, arm.b, arm.d])
         link = np.array([0.0, -arm.a * (arm.r - 1), 0.0, -arm.d * (arm.r - 1)]) - hub

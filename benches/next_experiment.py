@@ -55,7 +55,7 @@ def one(seed: int, criterion: str) -> dict[str, Any]:
         "shape": designed.shape,
         "efficiency": designed.efficiency,
         "binding": list(designed.active_constraints),
-        "predicted": {k: dict(designed.errors[k]) for k in ("now", "square", "designed", "both")},
+        "predicted": {k: dict(designed.standard_errors[k]) for k in ("now", "square", "designed", "both")},
         "found": {n: v for n, v in second.standard_errors.items() if n in designed.values},
         "estimates": {n: p.value for n, p in second.parameters.items()},
         "correlated": np.asarray(second.joint.covariance).tolist() if second.joint is not None else [],

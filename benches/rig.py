@@ -30,7 +30,7 @@ PATIENT = Limits(max_write_delay=60.0, max_missed_deadlines=10**9, standstill=1e
 CHILD = """
 import sys
 from ftlm import rig
-rig.record(rig.VirtualBoard(page=sys.argv[1], real_time=True), input="sine", amplitude=0.2, duration=25.0)
+rig.record(rig.VirtualBoard(register_file=sys.argv[1], real_time=True), input="sine", amplitude=0.2, duration=25.0)
 """
 
 
@@ -38,9 +38,9 @@ def real_time(rate: float, seconds: float) -> None:
     excitation = rig.Excitation("multisine", 0.25, period=10.0, band=(0.1, 10.0))
     commands = excitation.commands(rate, seconds)
     structure = ftlm.flexible_link(form="published", stage=1, laws=("orders",), coupling="measured")
-    arm = rig.ArmParameters.of("effective")
+    arm = rig.ArmParameters.load("effective")
     stream = rig.Streaming(
-        structure.with_orders(arm.stage1.orders(1)), step=1.0 / rate, longest=seconds + 1.0, prior_covariance=1e8
+        structure.with_orders(arm.stage1.orders(1)), step=1.0 / rate, max_duration=seconds + 1.0, prior_covariance=1e8
     )
     columns = [rig.rig.COLUMNS.index(name) for name in stream.signals]
     late = []
@@ -92,7 +92,7 @@ def stopped(number: signal.Signals, times: int = 8) -> None:
 
 def cost() -> None:
     for rate in (500.0, 1000.0, 8000.0):
-        arm = rig.ArmParameters.of("effective").arm(1.0 / rate, 600.0)
+        arm = rig.ArmParameters.load("effective").arm(1.0 / rate, 600.0)
         n = 5000
         start = time.perf_counter()
         for _ in range(n):
@@ -100,10 +100,10 @@ def cost() -> None:
         each = 1e6 * (time.perf_counter() - start) / n
         print(f"one sample of the arm at {rate:g} Hz: {each:.1f} us, {arm.memory} numbers hold the past of 600 s")
     structure = ftlm.flexible_link(form="published", stage=1, laws=("orders",), coupling="measured")
-    structure = structure.with_orders(rig.ArmParameters.of("effective").stage1.orders(1))
+    structure = structure.with_orders(rig.ArmParameters.load("effective").stage1.orders(1))
     rng = np.random.default_rng(0)
     for n in (1_000, 10_000, 100_000):
-        stream = rig.Streaming(structure, step=0.002, longest=600.0, prior_covariance=1e8)
+        stream = rig.Streaming(structure, step=0.002, max_duration=600.0, prior_covariance=1e8)
         rows = np.cumsum(rng.standard_normal((n, len(stream.signals))), axis=0) * 1e-3
         start = time.perf_counter()
         stream.push(rows)
@@ -112,7 +112,7 @@ def cost() -> None:
 
 
 def truth() -> None:
-    linear = replace(rig.ArmParameters.of("linear"), form="published")
+    linear = replace(rig.ArmParameters.load("linear"), form="published")
     run = rig.record(duration=10.0, parameters=linear)
     clean = {}
     for stage in (1, 2):

@@ -61,7 +61,8 @@ def arm(threads: int) -> Iterator[str]:
     selection = ftlm.select(runs, everything_inside(), threads=threads)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     yield from ("```", *str(selection).splitlines(), "```", "")
-    yield f"- {wall:.0f} s, {cpu:.0f} s of processor time on {threads} threads; {selection.fitted} candidates fitted"
+    times = f"{wall:.0f} s, {cpu:.0f} s of processor time on {threads} threads"
+    yield f"- {times}; {selection.fitted_count} candidates fitted"
 
 
 def motor(seed: int, rows: int = 400, late: int = 4, step: float = 0.02) -> ftlm.Run:
@@ -131,7 +132,7 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
     runs, rich, true = plant(name, seed)
     selection = ftlm.select(runs, rich, threads=threads)
     row = {
-        "fitted": selection.fitted,
+        "fitted": selection.fitted_count,
         "spent": time.process_time() - start_time,
         "wall": time.perf_counter() - wall,
         "chosen": selection.winner.name,
@@ -148,7 +149,7 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
         there = validate_fit(describe_structure(structure), structure, folds, fit(folds.runs, structure, []))
         there = replace(there, bic=schwarz_criterion(there.joint, scatter_of(selection)))
     for word, trial in {"truth": there, "winner": selection.winner, "best": selection.trials[0]}.items():
-        row[word] = {"name": trial.name, "numbers": trial.parameters, "bic": trial.bic, "scores": trial.scores}
+        row[word] = {"name": trial.name, "numbers": trial.parameter_count, "bic": trial.bic, "scores": trial.scores}
     return row
 
 

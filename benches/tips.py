@@ -156,7 +156,7 @@ def stable(seed=0):
     """Whether each loop is stable on the arm's own linear law: stiffness of link 1 times, delay of the angles."""
     _, loops = contenders(seed)
     w = np.geomspace(0.01, 0.999 * np.pi * RATE, 4000)
-    arm = rig.ArmParameters.of("linear")
+    arm = rig.ArmParameters.load("linear")
     acting = {name: (design.acting(w)[:2], integrals(design)) for name, design in loops.items()}
     acting["LQR of the maker's model"] = (("theta11", "theta12"), maker(w)), 0.0
     results = {name: [] for name in acting}
@@ -217,7 +217,7 @@ def still(seed=0):
             ends,
         ),
     }
-    arm = rig.ArmParameters.of("effective")
+    arm = rig.ArmParameters.load("effective")
     results = {n: [] for n in runs}
     for times in moves.STIFFNESS:
         other = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * times))

@@ -808,7 +808,7 @@ def of_guard(deflection):
 
 @functools.cache
 def of_arm():
-    return made_by("VirtualArm", lambda: rig.ArmParameters.of("linear").arm(0.002, 1.0))
+    return made_by("VirtualArm", lambda: rig.ArmParameters.load("linear").arm(0.002, 1.0))
 
 
 #: Entries whose last arguments are given by name.

@@ -105,7 +105,7 @@ def objects():
         rate=500.0,
     )
     search = ftlm.search_orders(run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(increment=0.5), threads=1)
-    stream = rig.Streaming(ftlm.equation("D y = a y + b u"), step=STEP, inputs=["u"], longest=10.0)
+    stream = rig.Streaming(ftlm.equation("D y = a y + b u"), step=STEP, inputs=["u"], max_duration=10.0)
     tests = ftlm.resid(model, run)
     made = {
         "ftlm.Run": run,
@@ -135,8 +135,8 @@ def objects():
         "control.Realization": lqg.realization,
         "control.Shaper": control.input_shaper(-2 + 17j),
         "kernels.Candidates": kernels.Candidates(np.stack([U, T]), [0, 1], step=STEP),
-        "rig.ArmParameters": rig.ArmParameters.of("effective"),
-        "rig.StageParameters": rig.ArmParameters.of("effective").stage1,
+        "rig.ArmParameters": rig.ArmParameters.load("effective"),
+        "rig.StageParameters": rig.ArmParameters.load("effective").stage1,
         "rig.Excitation": rig.Excitation(),
         "rig.Limits": rig.Limits(),
         "rig.Streaming": stream,
@@ -182,7 +182,7 @@ def objects():
         "limit": 5.0,
         "limits": [],
         "lines": [("y", [1.0, 2.0])],
-        "longest": 10.0,
+        "max_duration": 10.0,
         "m": 16,
         "mapping": {"u": "w"},
         "max_deviation": {"theta": 0.02},
@@ -273,7 +273,7 @@ def own_arguments(sound):
         "ftlm.metrics": {"measured": T, "predicted": U},
         "ftlm.design_input": {"duration": 2.0, "step": 0.1},
         "ftlm.Structure.filter_states": {"initial": {}},
-        "ftlm.Layout.of": {"given": {"decimal": "comma"}},
+        "ftlm.Layout.from_argument": {"given": {"decimal": "comma"}},
         "ftlm.Layout.under": {"other": ftlm.Layout()},
         "ftlm.SensorFilter.low_pass": {"signals": ["y"]},
         "ftlm.Model.from_control": {"system": object()},

@@ -19,8 +19,8 @@ class Planar:
         first, second, k = arm.stage1, arm.stage2, arm.coupling
         j11, j21 = first.r - 1.0, arm.inertia_ratio
         j22 = j21 / (second.r - 1.0)
-        lever = arm.reach * j22
-        own = 1.0 - k**2 * (arm.rotating_share * j21 + j22 + 2.0 * lever)
+        lever = arm.link_coupling_ratio * j22
+        own = 1.0 - k**2 * (arm.rotating_inertia_fraction * j21 + j22 + 2.0 * lever)
         # Rates that the energy is quadratic in, by the rates of the angles: of hub 1, of link 1, of what of hub 2 turns
         # with link 1 and of its rotor, which does not, of link 2.
         link1, hub2 = np.array([1.0, 1.0, 0.0, 0.0]), np.array([k, k, 1.0, 0.0])
@@ -28,8 +28,8 @@ class Planar:
         self.inertia = (
             j11 * np.outer([1, 0, 0, 0], [1, 0, 0, 0])
             + own * np.outer(link1, link1)
-            + arm.rotating_share * j21 * np.outer(hub2, hub2)
-            + (1.0 - arm.rotating_share) * j21 * np.outer([0, 0, 1, 0], [0, 0, 1, 0])
+            + arm.rotating_inertia_fraction * j21 * np.outer(hub2, hub2)
+            + (1.0 - arm.rotating_inertia_fraction) * j21 * np.outer([0, 0, 1, 0], [0, 0, 1, 0])
             + j22 * np.outer(link2, link2)
             + k * lever * (np.outer(link1, link2) + np.outer(link2, link1))
         )

@@ -52,7 +52,7 @@ class Board:
     """What is plugged in: settings and log that outlive a handle."""
 
     def __init__(self, parameters="linear", *, page=None, form=2025, seed=0):
-        self.parameters = rig.ArmParameters.of(parameters)
+        self.parameters = rig.ArmParameters.load(parameters)
         self.form = form
         self.violations = []
         self.log = []

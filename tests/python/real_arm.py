@@ -48,7 +48,7 @@ def beside(real: ftlm.Run, name: str) -> ftlm.Run:
         path = Path(folder) / "currents.csv"
         columns = np.column_stack([real.time, real["I1"], real["I2"]])
         np.savetxt(path, columns, delimiter=",", header="t_s,I1,I2", comments="")
-        arm = replace(rig.ArmParameters.of(name), travel=(9.0, 9.0))
+        arm = replace(rig.ArmParameters.load(name), travel=(9.0, 9.0))
         return rig.record(input="csv", file=path, duration=real.duration, parameters=arm, sensor_filter="stock", seed=1)
 
 

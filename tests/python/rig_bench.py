@@ -37,10 +37,10 @@ class Bench:
 
     def __init__(self, kind, tmp_path, monkeypatch, parameters="linear", rate=500.0):
         self.kind, self.rate, self.acted = kind, rate, False
-        self.parameters = rig.ArmParameters.of(parameters)
+        self.parameters = rig.ArmParameters.load(parameters)
         if kind == "virtual":
             self.page = tmp_path / "page"
-            self.board = Watched(parameters=self.parameters, page=self.page)
+            self.board = Watched(parameters=self.parameters, register_file=self.page)
         else:
             self.hardware = Board(self.parameters)
             self.hardware.install(monkeypatch)

@@ -43,7 +43,7 @@ def regressor():
 
 
 def stream(samples):
-    made = rig.Streaming(ftlm.equation("D y = a y + b u"), step=STEP, inputs=["u"], longest=10.0)
+    made = rig.Streaming(ftlm.equation("D y = a y + b u"), step=STEP, inputs=["u"], max_duration=10.0)
     made.push(samples)
     return made.coefficients
 
@@ -116,12 +116,12 @@ CALLS = {
     "control.Lqg.__call__": [(lambda x: LQG.controller(x, 0.1), np.ones(1))],
     "control.Lqg.response": [(LQG.controller.response, W)],
     "control.LqgDesign.controller_response": [(LQG.controller_response, W)],
-    "control.Observer.rest": [(OBSERVER.rest, np.ones(1))],
+    "control.Observer.equilibrium_state": [(OBSERVER.equilibrium_state, np.ones(1))],
     "control.PidDesign.controller_response": [(DESIGN.controller_response, W)],
     "control.Realization.response": [(OBSERVER.realization.response, W)],
-    "control.Shaper.residual": [
-        (lambda x: control.input_shaper(-2 + 17j).residual(x, 0.1), W),
-        (lambda x: control.input_shaper(-2 + 17j).residual(17.0, x), W / 20),
+    "control.Shaper.residual_vibration": [
+        (lambda x: control.input_shaper(-2 + 17j).residual_vibration(x, 0.1), W),
+        (lambda x: control.input_shaper(-2 + 17j).residual_vibration(17.0, x), W / 20),
     ],
     "control.Shaper.filter": [(lambda x: control.input_shaper(-2 + 17j).filter(x, 500.0), U)],
     "control.inverse_dynamics": [(lambda x: control.inverse_dynamics(DESIGN, x), MOVE)],
@@ -152,7 +152,10 @@ CALLS = {
     ],
     "kernels.Candidates.coefficients": [
         (TUPLES.coefficients, ORDER_TUPLES),
-        (lambda x: TUPLES.coefficients(ORDER_TUPLES, p=3, prior_covariance=x, rows="time"), np.array([1.0, 2.0])),
+        (
+            lambda x: TUPLES.coefficients(ORDER_TUPLES, innovation_length=3, prior_covariance=x, row_basis="time"),
+            np.array([1.0, 2.0]),
+        ),
     ],
     "kernels.Candidates.score": [
         (TUPLES.score, ORDER_TUPLES),

@@ -128,10 +128,10 @@ def test_a_candidate_that_fails_is_a_row_with_its_reason(monkeypatch: pytest.Mon
     monkeypatch.setattr(stepwise, "fit", refuse)
     run, _ = record([7.0], [1.0, 4.0], seed=1, hold=20)
     found = ftlm.select(run, "auto", threads=1)
-    failed = [t for t in found.trials if t.failed is not None]
+    failed = [t for t in found.trials if t.failure is not None]
     assert failed
-    assert all(t.failed == "no finite simulation" for t in failed)
-    assert found.winner.failed is None
+    assert all(t.failure == "no finite simulation" for t in failed)
+    assert found.winner.failure is None
 
 
 def test_a_given_delay_narrows_auto() -> None:
@@ -408,6 +408,6 @@ def test_the_report_of_an_automatic_structure_has_the_choice(tmp_path):
     assert f"chosen: {typeset(found['chosen'])}</th>" in part
     for candidate in found["candidates"]:
         row = part[part.index(f"{typeset(candidate['structure'])}") :]
-        assert candidate["failed"] or f'<data value="{candidate["parameters"]}.0">' in row
+        assert candidate["failure"] or f'<data value="{candidate["parameter_count"]}.0">' in row
     assert "Fit by number of parameters" in part
     assert all(typeset(text) in page for text in found["warnings"])

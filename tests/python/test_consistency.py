@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import ftlm
 from ftlm.cli.main import app
-from ftlm.estimation.consistency import differences, joint_distance
+from ftlm.estimation.consistency import differences, joint_statistic
 
 SECOND = ftlm.equation("D^2 y = d D y + a y + b u")
 
@@ -45,10 +45,10 @@ def changed():
 
 def test_a_machine_that_stays_is_one_model(same):
     assert same.consistent is True
-    assert same.names == ("motor 0 to 6 s", "motor 6 to 12 s")
+    assert same.segments == ("motor 0 to 6 s", "motor 6 to 12 s")
     assert same.reason.startswith("The same model within its uncertainty: the 95 % intervals of every")
-    assert same.distance < same.limit
-    assert same.degrees == 3
+    assert same.statistic < same.limit
+    assert same.degrees_of_freedom == 3
     # Each part predicts the other as well as itself.
     assert all(fit["y"] > 97 for row in same.cross_validation for fit in row)
 
@@ -65,7 +65,7 @@ def test_a_machine_that_changes_is_named_with_number_parts_and_distance(changed)
     assert words.startswith("Not the same model: a is -")
     assert "in motor 0 to 6 s and -4" in words
     assert f"in motor 6 to 12 s, {changed.differences[0].difference_in_errors:.2g} standard errors apart" in words
-    assert changed.distance > changed.limit
+    assert changed.statistic > changed.limit
 
 
 def test_what_parts_are_is_what_is_identified_of_them(changed):
@@ -96,9 +96,9 @@ def test_a_part_begins_as_its_own_fit_found():
 def test_several_runs_are_parts_by_themselves():
     runs = [replace_name(changing([v], seed=k), f"day {k}") for k, v in enumerate([40.0, 40.0, 50.0])]
     found = ftlm.consistency(runs, SECOND, threads=1)
-    assert found.names == ("day 0", "day 1", "day 2")
-    assert {d.parts for d in found.differences if d.disjoint and d.name == "a"} == {(0, 2), (1, 2)}
-    assert found.degrees == 6
+    assert found.segments == ("day 0", "day 1", "day 2")
+    assert {d.segments for d in found.differences if d.disjoint and d.name == "a"} == {(0, 2), (1, 2)}
+    assert found.degrees_of_freedom == 6
     assert found.consistent is False
 
 
@@ -113,14 +113,14 @@ def test_all_numbers_together_are_told_by_their_covariances():
     points = [r.joint.values for r in results]
     spreads = [r.joint.covariance for r in results]
     apart = points[0] - points[1]
-    assert joint_distance(results[:2]) == (
+    assert joint_statistic(results[:2]) == (
         pytest.approx(float(apart @ np.linalg.solve(spreads[0] + spreads[1], apart))),
         3,
     )
     weights = [np.linalg.inv(s) for s in spreads]
     centre = np.linalg.solve(sum(weights), sum(w @ p for w, p in zip(weights, points, strict=True)))
     far = sum((p - centre) @ w @ (p - centre) for w, p in zip(weights, points, strict=True))
-    assert joint_distance(results) == (pytest.approx(float(far), rel=1e-6), 6)
+    assert joint_statistic(results) == (pytest.approx(float(far), rel=1e-6), 6)
 
 
 def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
@@ -131,14 +131,16 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     consistency = {d.name: d for d in differences(half)}
     assert math.isnan(consistency[place].difference_in_errors)
     assert not consistency[place].disjoint
-    assert joint_distance(half)[1] == 2
+    assert joint_statistic(half)[1] == 2
     found = replace(same, results=tuple(half), differences=tuple(differences(half)))
     assert found.not_identifiable == (place,)
     assert f"{place} is not identifiable from at least one segment" in str(found)
     nothing = replace(second.joint, covariance=np.diag([np.inf] * 3))
     none = [first, replace(second, joint=nothing)]
-    assert joint_distance(none) == (None, 0)
-    found = replace(same, results=tuple(none), differences=tuple(differences(none)), distance=None, degrees=0)
+    assert joint_statistic(none) == (None, 0)
+    found = replace(
+        same, results=tuple(none), differences=tuple(differences(none)), statistic=None, degrees_of_freedom=0
+    )
     assert found.consistent is None
     assert found.reason == "Inconclusive: no parameter is identifiable from two segments"
 
@@ -165,7 +167,7 @@ def test_intervals_by_profile_are_compared_by_the_ends_that_face_each_other(same
     (found,) = [d for d in differences([wide[0], bent(order[1], math.inf, 1.0)]) if d.name == name]
     assert math.isnan(found.difference_in_errors)
     # A covariance says little of numbers like these.
-    assert joint_distance(wide)[1] == 2
+    assert joint_statistic(wide)[1] == 2
 
 
 def values(result):
@@ -184,7 +186,7 @@ def test_a_page_a_frame_and_json(changed, tmp_path):
         changed.report(tmp_path / "parts.html")
     consistency = json.loads(json.dumps(changed.to_dict()))
     assert consistency["consistent"] is False
-    assert consistency["segments"] == list(changed.names)
+    assert consistency["segments"] == list(changed.segments)
     assert consistency["differences"][0]["parameter"] == "a"
     frame = changed.to_frame()
     assert len(frame) == 6

@@ -76,7 +76,7 @@ def test_what_a_shaper_says_is_left_is_what_is_simulated(kind):
     shaped = shaper.filter(np.r_[0.0, np.ones(3000)], rate)
     arrived = round(shaper.delay * rate) + 1
     for w, z in ((1.2 * W, Z), (0.8 * W, 0.05), (W, 0.3)):
-        said = float(shaper.residual(w, z))
+        said = float(shaper.residual_vibration(w, z))
         one = left_after(np.r_[0.0, np.ones(3000)], rate, w, z, 1)
         assert left_after(shaped, rate, w, z, arrived) / one == pytest.approx(said, rel=0.01)
 
@@ -86,9 +86,9 @@ def test_two_modes_are_shaped_together():
     modes = sorted((m for m in model.modes() if m.oscillatory), key=lambda m: m.damping)
     shaper = control.input_shaper(model, modes=2)
     for mode in modes:
-        assert float(shaper.residual(mode.frequency, mode.damping)) < 1e-12
+        assert float(shaper.residual_vibration(mode.frequency, mode.damping)) < 1e-12
     assert sum(shaper.amplitudes) == pytest.approx(1.0)
-    assert float(control.input_shaper(model).residual(modes[1].frequency, modes[1].damping)) > 0.05
+    assert float(control.input_shaper(model).residual_vibration(modes[1].frequency, modes[1].damping)) > 0.05
 
 
 def test_a_fractional_models_own_pole_is_shaped():
@@ -139,10 +139,10 @@ def test_intervals_too_wide_for_a_shaper_are_refused_in_words():
     text = "D^2 y = -300 y - 4 D y + 300 u"
     # Of the coefficient of y: 10 % are 5 % of the frequency, a fifth of it leaves too much.
     good = control.input_shaper(uncertain(text, {2: 10.0}))
-    assert 0 < good.worst < 0.2
+    assert 0 < good.max_residual_vibration < 0.2
     with pytest.raises(ftlm.ModelError, match=r"too uncertain for a shaper.* may leave .* longer run.*kind='zvd'"):
         control.input_shaper(uncertain(text, {2: 60.0}))
-    assert control.input_shaper(uncertain(text, {2: 40.0}), "zvd").worst < 0.1
+    assert control.input_shaper(uncertain(text, {2: 40.0}), "zvd").max_residual_vibration < 0.1
 
 
 REFUSED = [
@@ -227,7 +227,7 @@ def test_a_tuned_loop_has_the_margins_that_were_asked_for():
     assert min(pid.kp, pid.ki, pid.kd) >= 0.0
     assert design.nominal.stable
     assert design.nominal.phase == pytest.approx(60.0, abs=0.1)
-    assert all(abs(phase - 60.0) < 8.0 for phase in design.flat)
+    assert all(abs(phase - 60.0) < 8.0 for phase in design.phase_margin_at_gains)
 
 
 @pytest.mark.parametrize(("gain", "stable"), [(1.0, True), (3.0, True), (11.0, True), (30.0, True), (38.0, False)])
@@ -255,7 +255,7 @@ def test_designs_are_made_over_the_intervals():
     model = uncertain(HUB, {4: 0.01, 2: 3.0})
     design = control.fractional_pid(model, crossover=40.0, samples=60)
     assert len(design.samples) == 60
-    assert design.stable_share == 1.0
+    assert design.stable_fraction == 1.0
     low, high = design.margin_interval("phase")
     assert low < 59.9
     assert high > 60.05 or low > 50.0
@@ -327,10 +327,10 @@ def test_what_runs_is_the_exact_controller_within_what_it_says():
 
 def test_its_memory_is_bounded_and_of_the_size_it_says():
     realised = control.DiscretePid(PID, 500.0, order=4)
-    assert realised.memory == 2 * 9 + 2  # an integral and the error before besides
+    assert realised.state_count == 2 * 9 + 2  # an integral and the error before besides
     for v in np.random.default_rng(0).standard_normal(5000):
         assert math.isfinite(realised(float(v)))
-    assert realised.memory == 20
+    assert realised.state_count == 20
 
 
 def test_its_step_is_that_of_the_sum_over_the_whole_past():
@@ -425,7 +425,7 @@ def test_what_is_no_model_and_no_controller_is_named(given):
 
 def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():
     """Tuned on the arm's linear fractional model, run on the arm with friction, coupling, offset and noise."""
-    arm = ftlm.rig.ArmParameters.of("linear").model()
+    arm = ftlm.rig.ArmParameters.load("linear").model()
     design = control.fractional_pid(arm, output="theta11", input="I1", crossover=100.0)
     loops = control.JointControllers(
         control.DiscretePid(design.pid, 500.0, limit=0.94), control.DiscretePid(design.pid, 500.0, limit=1.2)
@@ -435,7 +435,7 @@ def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():
     assert run.metadata["faults"] == []
     assert np.abs(run["theta11"][-200:] - 0.3).max() < 0.002
     assert np.abs(run["theta21"]).max() < 0.01
-    assert run.metadata["control"]["controller"]["settings"]["hub1"]["memory"] > 10
+    assert run.metadata["control"]["controller"]["settings"]["hub1"]["state_count"] > 10
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -108,7 +108,7 @@ def test_the_parameter_file_of_the_rig_page_is_read(tmp_path: Path) -> None:
     (text,) = blocks(ROOT / "docs" / "rig.md", "toml")
     path = tmp_path / "arm.toml"
     path.write_text(text, encoding="utf-8")
-    assert ftlm.rig.ArmParameters.of(path).stage1.coulomb == 0.08
+    assert ftlm.rig.ArmParameters.load(path).stage1.coulomb == 0.08
 
 
 def commands_of(text: str) -> list[str]:

@@ -51,7 +51,7 @@ def test_more_poles_come_closer():
 
 def test_whole_orders_are_exact():
     found = exports.approximate(model("D^3 y = -6 D^2 y - 11 D y - 6 y + 2 D u"), band=(0.01, 100))
-    assert found.states <= 6
+    assert found.state_count <= 6
     assert max(found.gain_error.values()) < 1e-9
 
 

@@ -238,10 +238,10 @@ def test_zeros_are_those_of_the_numerator():
 
 def test_stability_without_a_common_base_is_that_of_the_argument_principle():
     assert model("D^1.31 y = -2 D^0.4301 y - y + u").stability().method == "argument principle"
-    assert model("D^1.3 y = -2 D^0.4 y - y + u").stability().base == pytest.approx(0.1)
+    assert model("D^1.3 y = -2 D^0.4 y - y + u").stability().commensurate_order == pytest.approx(0.1)
     # Two equations without coupling, with bases 0.5 and 0.3.
     for text in ("D^1.5 y = -y + u; D^0.6 z = -2 D^0.3 z - z + u", "D^0.6 z = -2 D^0.3 z - z + u; D^1.5 y = -y + u"):
-        assert model(text).stability().base == pytest.approx(0.3)
+        assert model(text).stability().commensurate_order == pytest.approx(0.3)
 
 
 # ------------------------------------------------------------------------------------------------ steps
@@ -365,7 +365,7 @@ def test_information_criteria_of_spectra_are_those_of_normal_residuals():
     given = ftlm.identify_frequency(stated, "R0-p(R1,CPE1)")
     left = stated.response - given.circuit.impedance(stated.frequency)
     squares = np.sum(np.abs(left / 1e-4) ** 2)
-    assert given.information.parameters == 4
+    assert given.information.parameter_count == 4
     assert given.information.log_likelihood == pytest.approx(-40 * np.log(2 * np.pi * 1e-8) - 0.5 * squares, rel=1e-9)
     poorer = ftlm.identify_frequency(cell, "R0-p(R1,C1)", weights="uniform")
     assert poorer.information.aicc > known.aicc + 10

@@ -361,7 +361,7 @@ def test_what_is_linear_refuses_it() -> None:
     with pytest.raises(ModelError, match="has friction"):
         ftlm.search_orders(cart_run(0)[0], free)
     with pytest.raises(ModelError, match="has friction"):
-        Streaming(ftlm.equation(CART), step=0.01, longest=1.0, inputs=["u"])
+        Streaming(ftlm.equation(CART), step=0.01, max_duration=1.0, inputs=["u"])
     with pytest.raises(ModelError, match="has friction"):
         ftlm.identify(cart_run(0)[0], ftlm.equation(CART), offset="auto")
 

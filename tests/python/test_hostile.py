@@ -233,7 +233,7 @@ def test_a_number_of_thousands_of_digits_is_an_error_in_words(written, tmp_path)
 SMALL_FILES = {
     "model": lambda path, written: ftlm.load_model(path),
     "controller": lambda path, written: control.load_controller(path),
-    "parameters": lambda path, written: rig.ArmParameters.of(path),
+    "parameters": lambda path, written: rig.ArmParameters.load(path),
     "columns": lambda path, written: ftlm.load(written, columns=path),
 }
 

@@ -51,7 +51,10 @@ def fitted(words: str, free: str, start: dict[str, float], **options: object) ->
         structure.with_orders(joint.orders).with_coefficients(joint.coefficients).with_input_parameters(joint.inputs)
     )
     estimate = ftlm.Estimate(
-        "output-error", ("first",), values, free=structs.replace(parameter_set(joint, structure), refinement=8)
+        "output-error",
+        ("first",),
+        values,
+        free_parameters=structs.replace(parameter_set(joint, structure), refinement=8),
     )
     return ftlm.Model(solved, joint.orders, estimate=estimate)
 
@@ -97,7 +100,7 @@ def test_of_whole_orders_it_is_what_scipy_differenced_says() -> None:
         return np.asarray(dlsim(discrete, u[:, None])[1][:, 0])
 
     errors = by_differences(answer, made, 1e-4)
-    assert [made.errors["designed"][n] for n in made.values] == pytest.approx(errors, rel=2e-3)
+    assert [made.standard_errors["designed"][n] for n in made.values] == pytest.approx(errors, rel=2e-3)
 
 
 def test_of_fractional_orders_it_is_what_the_laplace_transform_differenced_says(found: ftlm.Identification) -> None:
@@ -110,7 +113,7 @@ def test_of_fractional_orders_it_is_what_the_laplace_transform_differenced_says(
         return oracles.held_response(transfer, u, STEP, aliases=200)
 
     errors = by_differences(answer, made, 1e-4)
-    assert [made.errors["designed"][n] for n in made.values] == pytest.approx(errors, rel=5e-3)
+    assert [made.standard_errors["designed"][n] for n in made.values] == pytest.approx(errors, rel=5e-3)
 
 
 COUPLED = (
@@ -184,14 +187,16 @@ def test_the_errors_now_are_those_of_the_model_and_both_is_less_than_either(
     found: ftlm.Identification, designed: ftlm.DesignedInput
 ) -> None:
     for name in designed.values:
-        assert designed.errors["now"][name] == pytest.approx(found.standard_errors[name], rel=1e-9)
-        assert designed.errors["both"][name] < min(designed.errors["now"][name], designed.errors["designed"][name])
+        assert designed.standard_errors["now"][name] == pytest.approx(found.standard_errors[name], rel=1e-9)
+        assert designed.standard_errors["both"][name] < min(
+            designed.standard_errors["now"][name], designed.standard_errors["designed"][name]
+        )
     assert designed.parameters == ("alpha",)
-    ratio = designed.errors["square"]["alpha"] / designed.errors["designed"]["alpha"]
+    ratio = designed.standard_errors["square"]["alpha"] / designed.standard_errors["designed"]["alpha"]
     assert designed.gain == pytest.approx(ratio, rel=1e-9)
     assert designed.gain > 1.5
     low, high = designed.intervals["alpha"]
-    assert (high - low) == pytest.approx(2 * 1.959964 * designed.errors["designed"]["alpha"], rel=1e-6)
+    assert (high - low) == pytest.approx(2 * 1.959964 * designed.standard_errors["designed"]["alpha"], rel=1e-6)
 
 
 def test_fits_of_the_designed_run_scatter_as_foretold(designed: ftlm.DesignedInput) -> None:
@@ -206,7 +211,7 @@ def test_fits_of_the_designed_run_scatter_as_foretold(designed: ftlm.DesignedInp
         fit = fit_output_error([run], structure, start=true)
         off.append([fit.values[fit.names.index(n)] - true[n] for n in true])
         expected_information.append([fit.standard_errors[n] for n in true])
-    foretold = np.array([designed.errors["designed"][n] for n in true])
+    foretold = np.array([designed.standard_errors["designed"][n] for n in true])
     # One model's noise is known to 5 % of so few samples.
     assert np.sqrt(np.mean(np.array(expected_information) ** 2, axis=0)) == pytest.approx(foretold, rel=0.2)
     assert 0.7 < float(np.sqrt(np.mean((np.array(off) / foretold) ** 2))) < 1.3
@@ -373,7 +378,7 @@ def test_the_same_is_designed_from_a_result_and_from_its_file(
     again = ftlm.design_input(read, duration=5.0, peak=1.0, limits={"y": 0.9})
     assert again.step == STEP
     assert np.array_equal(again.run["u"], designed.run["u"])
-    assert again.errors == designed.errors
+    assert again.standard_errors == designed.standard_errors
     read.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "m.json").read_bytes()
 
@@ -391,7 +396,7 @@ def test_laws_of_orders_and_coefficients_come_back_from_a_file(tmp_path: Path) -
         covariance=tuple(map(tuple, np.eye(10).tolist())),
         refinement=2,
     )
-    estimate = ftlm.Estimate("output-error", ("A",), {**values, **model.coefficients}, free=free)
+    estimate = ftlm.Estimate("output-error", ("A",), {**values, **model.coefficients}, free_parameters=free)
     named = structure.with_orders(model.orders).with_coefficients(model.coefficients)
     ftlm.Model(replace(named, initial="rest"), model.orders, estimate=estimate).save(tmp_path / "a.json")
     laid = ModelFit.of(ftlm.load_model(tmp_path / "a.json"), noise)
@@ -459,7 +464,7 @@ def altered(values: dict[str, float], **more: object):
         for term in terms:
             term["coefficient"] = values.get(term["name"], term["coefficient"])
         document["estimate"]["values"].update(values)
-        document["estimate"]["free"].update(more)
+        document["estimate"]["free_parameters"].update(more)
 
     return change
 
@@ -512,7 +517,7 @@ def test_it_prints_goes_into_a_frame_and_json_and_is_drawn(designed: ftlm.Design
     assert "D-optimal for alpha" in text
     assert "% of that of the best periodic input in steady state" in text
     frame = designed.to_frame()
-    assert frame.loc["a0", "designed"] == designed.errors["designed"]["a0"]
+    assert frame.loc["a0", "designed"] == designed.standard_errors["designed"]["a0"]
     document = json.loads(json.dumps(designed.to_dict(), allow_nan=False))
     assert document["parameters"] == ["alpha"]
     assert document["predicted_extremes"]["y"]["limit"] == 0.9

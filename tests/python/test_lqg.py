@@ -54,7 +54,7 @@ def test_the_poles_of_whole_orders_are_found_and_no_others():
     a, _, _ = whole_system()
     own = np.exp(np.array(made.poles) / RATE)
     own = np.sort_complex(np.concatenate([own, own[own.imag != 0].conjugate()]))
-    assert made.states == 4
+    assert made.state_count == 4
     assert np.allclose(own, np.sort_complex(np.linalg.eigvals(a)), atol=1e-7)
     # What is left is what a hold folds back above half the rate.
     assert max(made.gain_error.values()) < 0.1
@@ -63,7 +63,7 @@ def test_the_poles_of_whole_orders_are_found_and_no_others():
 
 def test_a_fractional_model_is_realised_within_the_error_that_is_said():
     made = designed(samples=0).realization
-    assert made.states <= 14
+    assert made.state_count <= 14
     w = np.geomspace(*made.band, 333)
     turn = 1j * w / RATE
     quotient = made.response(w) / (by_powers(w) * -np.expm1(-turn) / turn)
@@ -125,7 +125,7 @@ def test_a_bend_that_nothing_measures_is_observed_from_the_hub():
     """The run is the exact one of fractional orders."""
     clean, noisy = driven(BROKEN, noise=1e-4)
     seen = control.observer(model(BROKEN), measured=["hub"], noise={"hub": 1e-4}, process_noise=0.05)
-    found = seen.over(noisy)
+    found = seen.estimate_run(noisy)
     assert np.std(found["bend"] - clean["bend"]) < 0.03 * np.std(clean["bend"])
     assert "observer from hub" in str(seen)
 
@@ -133,10 +133,10 @@ def test_a_bend_that_nothing_measures_is_observed_from_the_hub():
 def test_an_observer_along_a_run_is_the_recursion_and_takes_noise_away():
     clean, noisy = driven(BROKEN, noise=2e-3)
     seen = control.observer(model(BROKEN), noise={"hub": 2e-3, "bend": 2e-3}, process_noise=0.05)
-    found = seen.over(noisy)
+    found = seen.estimate_run(noisy)
     a, b, c = seen.matrices
     y = np.array([noisy["hub"], noisy["bend"]])
-    state = np.append(seen.rest(y[:, 0]), 0.0)
+    state = np.append(seen.equilibrium_state(y[:, 0]), 0.0)
     for k in range(1, 300):
         ahead = a @ state + b[:, 0] * noisy["I"][k - 1]
         state = ahead + seen.gain @ (y[:, k] - c @ ahead)
@@ -209,7 +209,7 @@ def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
     controller.reset()
     # A hub that stands still whatever is asked for, for two seconds; then it is where it should be.
     assert {controller([0.0, 0.0], 1.0) for _ in range(1000)} == {0.9}
-    assert controller.memory == len(design.realization.a) + 2
+    assert controller.state_count == len(design.realization.a) + 2
     free = design.with_limit(math.inf)
     for _ in range(1000):
         free([0.0, 0.0], 1.0)
@@ -223,7 +223,7 @@ def test_designs_are_made_over_the_intervals_or_refused_in_words():
     options = {"max_deviation": {"y": 0.02}, "max_input": 1.0, "noise": {"y": 3e-4}, "samples": 40}
     good = control.lqg(uncertain(text, {4: 0.01, 2: 3.0}), **options)
     assert len(good.samples) == 40
-    assert good.stable_share == 1.0
+    assert good.stable_fraction == 1.0
     low, high = good.margin_interval("phase")
     assert low < good.nominal.phase < high
     assert "over the intervals (40 samples, 100 % stable)" in str(good)
@@ -235,7 +235,7 @@ def test_designs_are_made_over_the_intervals_or_refused_in_words():
 
 def test_a_tip_comes_to_rest_on_the_virtual_arm_without_any_shaper():
     """Designed on the arm's linear fractional law; run with friction, coupling, offset and noise."""
-    arm = ftlm.rig.ArmParameters.of("linear").model()
+    arm = ftlm.rig.ArmParameters.load("linear").model()
     design = control.lqg(
         arm,
         input="I1",
@@ -354,9 +354,9 @@ def test_an_observer_reads_a_run_that_fits_it():
     seen = control.observer(model(WHOLE), noise=QUIET, process_noise=0.3)
     run = driven(WHOLE, seconds=0.2)[0]
     with pytest.raises(ftlm.DataError, match="has no bend; the observer reads I, hub, bend"):
-        seen.over(run.select(["I", "hub"]))
+        seen.estimate_run(run.select(["I", "hub"]))
     with pytest.raises(ftlm.DataError, match="design it with rate=250"):
-        seen.over(run.resample(0.004))
+        seen.estimate_run(run.resample(0.004))
     with pytest.raises(ftlm.ModelError, match="process_noise = 0"):
         control.observer(model(WHOLE), noise=QUIET, process_noise=0)
 
@@ -375,7 +375,7 @@ def test_a_planned_command_moves_the_exact_model_along_the_path():
     moved = model(BROKEN).simulate(run)
     assert np.max(np.abs(moved["hub"] + moved["bend"] - path)) < 1e-3 * 0.3
     assert np.max(np.abs(moved["bend"] - planned.outputs["bend"])) < 1e-3 * 0.3
-    assert planned.plain > 5e-3
+    assert planned.uncompensated_vibration > 5e-3
     assert planned.residual_vibration is None
 
 
@@ -406,7 +406,7 @@ def test_a_fractional_pid_moves_a_hub_along_the_path():
     )
     assert np.max(np.abs(hub.simulate(run)["theta"] - path)) < 1e-3 * 0.3
     # What is off behind the path without it is a loop's lag, and its integral's.
-    assert planned.plain > 5e-4
+    assert planned.uncompensated_vibration > 5e-4
 
 
 def test_a_move_begins_and_ends_at_rest():
@@ -459,7 +459,7 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
     options = {"crossover": 40.0, "samples": 0}
     path = control.point_to_point(0.3, 0.5)
     good = control.inverse_dynamics(control.fractional_pid(uncertain(text, {4: 0.002, 2: 0.2}), **options), path)
-    assert 0 < good.residual_vibration < good.plain
+    assert 0 < good.residual_vibration < good.uncompensated_vibration
     with pytest.raises(ftlm.ModelError, match=r"too wide to design on: within them .* longer or richer run"):
         control.inverse_dynamics(control.fractional_pid(uncertain(text, {2: 20.0}), **options), path)
 

@@ -115,7 +115,7 @@ def test_noise_beyond_the_instruments_is_said() -> None:
 
 def test_physical_parameters_follow_from_one_of_them(fitted: ftlm.Identification) -> None:
     inertia = 0.0635
-    found = fitted.physical(J_11=inertia)
+    found = fitted.physical_parameters(J_11=inertia)
     c = fitted.joint.coefficients
     assert found["J_11"].value == inertia
     assert found["J_11"].standard_error < 1e-9
@@ -135,9 +135,9 @@ def test_physical_parameters_follow_from_one_of_them(fitted: ftlm.Identification
 
 
 def test_any_known_parameter_gives_the_same_arm(fitted: ftlm.Identification) -> None:
-    first = fitted.physical(J_11=0.0635)
+    first = fitted.physical_parameters(J_11=0.0635)
     for name in first:
-        again = fitted.physical(**{name: first[name].value})
+        again = fitted.physical_parameters(**{name: first[name].value})
         for other in first:
             assert again[other].value == pytest.approx(first[other].value, rel=1e-9)
         assert again[name].standard_error < 1e-6 * again[name].value
@@ -156,14 +156,14 @@ def test_any_known_parameter_gives_the_same_arm(fitted: ftlm.Identification) -> 
 )
 def test_physical_parameters_refuse_what_means_nothing(fitted, known, words) -> None:
     with pytest.raises(ftlm.ModelError, match=words):
-        fitted.physical(**known)
+        fitted.physical_parameters(**known)
 
 
 def test_an_equation_error_method_has_no_physical_intervals() -> None:
     run = plants.noisy_run("3T", 40, 0)
     found = ftlm.identify(run, ftlm.equation("D^2.2 y = a1 D^0.9 y + a0 y + b0 u"), method="least-squares")
     with pytest.raises(ftlm.ModelError, match="method='output-error'"):
-        found.physical(J_11=1.0)
+        found.physical_parameters(J_11=1.0)
 
 
 def test_coefficients_of_the_law_have_standard_errors(fitted: ftlm.Identification) -> None:

@@ -216,7 +216,7 @@ LINEAR_ONLY = {
     ),
     "certificate": lambda m, run: ftlm.certify_orders(run, ftlm.equation("D^q y = a y^2 + b u", initial="rest")),
     "stream": lambda m, run: ftlm.estimation.linear.Streaming(
-        ftlm.equation("D y = a y^2 + b u"), step=0.1, longest=9.0, inputs=["u"]
+        ftlm.equation("D y = a y^2 + b u"), step=0.1, max_duration=9.0, inputs=["u"]
     ),
     "trace": lambda m, run: ftlm.estimation.linear.multi_innovation_trace(run, ftlm.equation("D y = a y^2 + b u")),
 }

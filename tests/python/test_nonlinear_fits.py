@@ -93,17 +93,17 @@ def test_order_search_ranks_by_free_runs(runs, tmp_path, monkeypatch):
     assert result.orders["mu"] == pytest.approx(0.6, abs=0.06)
     scores = [row.score for row in result.table]
     assert scores == sorted(scores)
-    assert (result.free_runs, result.candidates) == (99, 99)
+    assert (result.simulated_candidates, result.candidates) == (99, 99)
     assert sum(result.exclusion_counts.values()) + len(result.table) == 99
     assert result.settings["criterion"] == "output-error"
     monkeypatch.setattr("ftlm.order_search.search.FREE_RUN_CANDIDATES", 30)
     few = ftlm.search_orders(runs["duffing"], structure, GRID, store=tmp_path / "search.store")
-    assert few.free_runs == 30
+    assert few.simulated_candidates == 30
     assert "only the best 30 of 99 candidates by equation error were simulated and ranked" in str(few)
     assert few.table[0].orders == result.table[0].orders
     again = ftlm.resume_search(tmp_path / "search.store")["y"]
     assert again.table == few.table
-    assert ftlm.search_orders(runs["duffing"], structure, GRID, criterion="equation-error").free_runs == 0
+    assert ftlm.search_orders(runs["duffing"], structure, GRID, criterion="equation-error").simulated_candidates == 0
 
 
 def test_candidates_whose_free_run_diverges_are_left_out(runs):

@@ -253,7 +253,7 @@ def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
     with pytest.raises(ftlm.ModelError, match="the genetic baseline does not estimate an offset"):
         ftlm.identify(fractional_run(1, 0.5), structure, method=ftlm.GeneticAlgorithm(seeds=(1,)))
     with pytest.raises(ftlm.ModelError, match="not supported in a stream"):
-        Streaming(structure, step=0.1, longest=10.0, inputs=("u",))
+        Streaming(structure, step=0.1, max_duration=10.0, inputs=("u",))
 
 
 def test_a_model_keeps_its_offset_and_one_without_is_as_it_was(tmp_path):

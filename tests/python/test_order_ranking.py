@@ -115,7 +115,7 @@ def test_a_certificate_names_a_free_run_that_grows():
         method="least-squares",
     ).model
     grows = model.stability().unstable_poles > 0
-    assert grows or not proof.free_run_nr <= 0.5
+    assert grows or not proof.simulation_nr <= 0.5
     assert [f.code for f in proof.findings] == ["best_orders_unstable" if grows else "best_orders_poor_fit"]
     assert "the model with the best orders" in str(proof) or "the simulation with the best orders" in str(proof)
 
@@ -123,5 +123,5 @@ def test_a_certificate_names_a_free_run_that_grows():
 def test_a_certificate_of_a_good_model_says_nothing_more():
     proof = ftlm.certify_orders(record(4, 0.0), ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(0.1))
     assert proof.findings == ()
-    assert proof.free_run_nr < 0.5
-    assert math.isfinite(proof.to_dict()["free_run_nr"])
+    assert proof.simulation_nr < 0.5
+    assert math.isfinite(proof.to_dict()["simulation_nr"])

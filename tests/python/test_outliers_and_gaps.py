@@ -144,7 +144,7 @@ def test_what_stood_in_a_gap_changes_nothing_and_all_figures_count_what_is_there
     near_truth(found)
     count = int(np.sum(~gaps[1:-1]))
     assert found.information is not None
-    assert found.information.samples == count
+    assert found.information.sample_count == count
     assert found.joint is not None
     assert found.joint.samples == count
     # The figures of the free run by hand, on what was read.

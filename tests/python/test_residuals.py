@@ -145,7 +145,7 @@ def test_inputs_that_the_model_does_not_read_are_tested_too(small_model, noisy):
     found = small_model.resid(run)
     assert set(found.outputs["y"].inputs) == {"u", "v"}
     assert not found.outputs["y"].inputs["v"].passed
-    assert found.outputs["y"].inputs["v"].largest[0] == 1
+    assert found.outputs["y"].inputs["v"].largest_correlation[0] == 1
     assert found.outputs["y"].inputs["u"].passed
 
 
@@ -210,8 +210,8 @@ def test_refusals_name_the_thing_and_the_way_out(small_model, small_run):
 def test_identify_reports_both_tests_and_the_criteria(noisy):
     found = ftlm.identify(noisy, ftlm.equation(WORDS), method="least-squares", m=512)
     assert found.residuals is not None
-    assert found.information.parameters == 4  # a, c, b and the noise level
-    assert found.information.samples == noisy.length - 2
+    assert found.information.parameter_count == 4  # a, c, b and the noise level
+    assert found.information.sample_count == noisy.length - 2
     assert "AIC " in found.details()
     assert "residuals white" in str(found)
     assert json.loads(json.dumps(found.to_dict(), default=list, allow_nan=False))["information"]["parameters"] == 4

@@ -56,7 +56,7 @@ def states_of(parameters, current, step):
 def test_published_linear_arm_is_the_series_solution(name, plant, drive):
     truth = plant(name).simulate(drive(name), tolerance=1e-7)
     stage = 1 if name == "A" else 2
-    parameters = replace(rig.ArmParameters.of("linear"), form="published")
+    parameters = replace(rig.ArmParameters.load("linear"), form="published")
     states = states_of(parameters, truth[f"I{stage}"], truth.step)
     hub, deflection = states[:, 2 * stage - 2], states[:, 2 * stage - 1]
     for values, output, allowed in ((hub, f"theta{stage}1", 3e-6), (deflection, f"theta{stage}2", 2e-5)):
@@ -66,7 +66,7 @@ def test_published_linear_arm_is_the_series_solution(name, plant, drive):
 @pytest.mark.parametrize("stage", [1, 2])
 def test_linear_arm_is_the_series_solution_of_the_lagrange_form(stage):
     truth = lagrange.clean_run(stage, "square")
-    states = states_of(rig.ArmParameters.of("linear"), truth[f"I{stage}"], truth.step)
+    states = states_of(rig.ArmParameters.load("linear"), truth[f"I{stage}"], truth.step)
     hub, deflection = states[:, 2 * stage - 2], states[:, 2 * stage - 1]
     for values, output, allowed in ((hub, f"theta{stage}1", 3e-6), (deflection, f"theta{stage}2", 2e-4)):
         assert np.abs(values - truth[output]).max() < allowed * truth[output].std(), output
@@ -89,7 +89,7 @@ def test_the_link_bends_against_the_current_as_the_real_one_does():
     current, early = truth["I1"], slice(0, 151)
     signs = {}
     for form in ("lagrange", "published"):
-        parameters = replace(rig.ArmParameters.of("linear"), form=form)
+        parameters = replace(rig.ArmParameters.load("linear"), form=form)
         bend = states_of(parameters, current, truth.step)[:, 1]
         signs[form] = np.corrcoef(bend, current)[0, 1], bend[early].mean()
     maker = maker_states(current, truth.step)[:, 1]
@@ -108,7 +108,7 @@ def test_whole_orders_make_both_forms_the_makers_model(form):
     whole = rig.StageParameters(
         a=628.8890, b=-62.95623, d=0.0, g=140.4711, r=(0.0635362 + 0.170434) / 0.170434, gamma=1.0, beta=0.0, mu=1.0
     )
-    linear = replace(rig.ArmParameters.of("linear"), stage1=whole, form=form)
+    linear = replace(rig.ArmParameters.load("linear"), stage1=whole, form=form)
     found, maker = states_of(linear, truth["I1"], truth.step), maker_states(truth["I1"], truth.step)
     for k in range(2):
         assert np.abs(found[:, k] - maker[:, k]).max() < 5e-5 * maker[:, k].std()
@@ -116,7 +116,7 @@ def test_whole_orders_make_both_forms_the_makers_model(form):
 
 @pytest.mark.parametrize("name", ["effective", "measured"])
 def test_every_set_bends_against_its_current(name):
-    parameters = replace(rig.ArmParameters.of(name), travel=(9.0, 9.0))
+    parameters = replace(rig.ArmParameters.load(name), travel=(9.0, 9.0))
     current = lagrange.current("square", 3000)
     states = states_of(parameters, current, 0.002)
     for stage in (1, 2):
@@ -124,13 +124,13 @@ def test_every_set_bends_against_its_current(name):
 
 
 def test_friction_holds_a_hub_below_its_limit_and_slows_it_above():
-    parameters = rig.ArmParameters.of("effective")
+    parameters = rig.ArmParameters.load("effective")
     arm = parameters.arm(0.002, 10.0)
     for _ in range(500):
         arm.advance([-0.9 * parameters.stage1.coulomb / 0.5, 0.0], True)
     assert arm.angles[0] == 0.0
     assert arm.angles[2] == 0.0
-    arms = [p.arm(0.002, 10.0) for p in (parameters, rig.ArmParameters.of("linear"))]
+    arms = [p.arm(0.002, 10.0) for p in (parameters, rig.ArmParameters.load("linear"))]
     for _ in range(250):
         for arm in arms:
             arm.advance([-0.3 / 0.5, 0.0], True)
@@ -140,7 +140,7 @@ def test_friction_holds_a_hub_below_its_limit_and_slows_it_above():
 def test_stage_2_feels_link_1_only_where_they_are_coupled():
     def bend(coupling):
         given = rig.ArmParameters(
-            **{**rig.ArmParameters.of("effective").__dict__, "coupling": coupling, "travel": (9.0, 9.0)}
+            **{**rig.ArmParameters.load("effective").__dict__, "coupling": coupling, "travel": (9.0, 9.0)}
         )
         arm = given.arm(0.002, 10.0)
         peak = 0.0
@@ -154,7 +154,7 @@ def test_stage_2_feels_link_1_only_where_they_are_coupled():
 
 
 def test_sensors_count_convert_and_clip():
-    arm = rig.ArmParameters.of("effective").arm(0.002, 10.0)
+    arm = rig.ArmParameters.load("effective").arm(0.002, 10.0)
     analog, counts, switches = arm.read([0.0] * 4)
     step = 20.0 / 2**16
     assert np.abs(np.array(analog) / step - np.round(np.array(analog) / step)).max() < 1e-9
@@ -279,7 +279,7 @@ def test_parameters_come_from_a_toml_file(tmp_path):
         'base = "linear"\ncoupling = 0.5\nstrain_noise = [0.01, 0.02]\n[stage1]\na = 600.0\ncoulomb = 0.05\n',
         encoding="utf-8",
     )
-    found = rig.ArmParameters.of(path)
+    found = rig.ArmParameters.load(path)
     assert (found.coupling, found.stage1.a, found.stage1.coulomb, found.stage1.b) == (0.5, 600.0, 0.05, -62.956)
     assert found.strain_noise == (0.01, 0.02)
     run = rig.record(duration=0.5, parameters=path)
@@ -313,11 +313,11 @@ def test_parameters_that_cannot_be_used_are_refused(tmp_path, text, words):
         ("bits = 99", "whole number from 0 to 24"),
         ("bits = 9.5", "Expected `int`"),
         ("strain_noise = [-0.1, 0.1]", "must not be negative"),
-        ("reach = nan", "reach = nan in the file is not finite"),
-        ("reach = " + "9" * 400, "Number out of range"),
+        ("link_coupling_ratio = nan", "link_coupling_ratio = nan in the file is not finite"),
+        ("link_coupling_ratio = " + "9" * 400, "Number out of range"),
         ("bits = " + "9" * 5000, "is not a TOML file"),
-        ("reach = 1979-05-27", "Expected `float`, got `date`"),
-        ("reach = " + "[" * 50_000, "is not a TOML file"),
+        ("link_coupling_ratio = 1979-05-27", "Expected `float`, got `date`"),
+        ("link_coupling_ratio = " + "[" * 50_000, "is not a TOML file"),
         ('base = "other"', "base = 'other' is not known"),
         ("base = []", "Expected `str`, got `array`"),
         ('form = "newton"', "Invalid enum value 'newton'"),

@@ -446,6 +446,6 @@ def test_a_design_is_no_controller_and_says_so():
 
 def test_a_live_estimate_for_another_rate_is_refused():
     structure = ftlm.equation("D^2 theta11 = a D^0.95 theta11 + b I1")
-    live = rig.Streaming(structure, step=0.004, longest=1.0)
+    live = rig.Streaming(structure, step=0.004, max_duration=1.0)
     with pytest.raises(ftlm.ModelError, match=r"live = a stream with a step of 0.004 s, and the rig has 0.002 s"):
         rig.record(duration=0.1, live=live)

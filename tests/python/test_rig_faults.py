@@ -280,7 +280,7 @@ def test_the_stand_in_sees_lists_wrong_types_and_unknown_calls(hardware):
 def test_a_fault_that_could_not_be_the_one_that_was_named_is_refused(fault, words):
     with pytest.raises(ftlm.ModelError, match=words):
         rig.VirtualBoard(inject=(fault,))
-    board = rig.VirtualBoard(page=None)
+    board = rig.VirtualBoard(register_file=None)
     board.inject = (fault,)
     with pytest.raises(ftlm.ModelError, match=words):
         rig.record(board, duration=0.1)

@@ -21,7 +21,7 @@ from rig_bench import Bench, drive, recorded
 from slow_cases import slow_after
 
 HERE = Path(__file__).parent
-LOOSE = rig.ArmParameters(**{**rig.ArmParameters.of("effective").__dict__, "travel": (1e6, 1e6)})
+LOOSE = rig.ArmParameters(**{**rig.ArmParameters.load("effective").__dict__, "travel": (1e6, 1e6)})
 
 
 @pytest.fixture(params=["virtual", "q8"])
@@ -131,7 +131,9 @@ def test_a_second_ctrl_c_does_not_cut_the_way_out_short(bench, monkeypatch):
     bench.assert_safe()
 
 
-@pytest.mark.parametrize("stop", ["open", "configure", "set_expiration", "start_watchdog", "start", "rest", "enable"])
+@pytest.mark.parametrize(
+    "stop", ["open", "configure", "set_expiration", "start_watchdog", "start", "read_rest", "enable"]
+)
 def test_a_start_that_fails_leaves_the_motors_off(bench, stop, monkeypatch):
     real = getattr(bench.board, stop)
 
@@ -173,7 +175,7 @@ from ftlm import rig
 from ftlm.rig import recording, rig as rig_module
 rig_module.WATCHDOG_RANGE_S = 0.01, 60.0
 if {kind!r} == "virtual":
-    board = rig.VirtualBoard(page={page!r}, real_time=True)
+    board = rig.VirtualBoard(register_file={page!r}, real_time=True)
 else:
     from quanser_stand_in import Board
     from ftlm.rig.quanser import QuanserBoard

@@ -69,7 +69,7 @@ def chosen(runs):
 
 def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
     assert chosen.winner.name == "D^2 y = d D^1 y + a y + b0 u"
-    assert chosen.winner.parameters == 3
+    assert chosen.winner.parameter_count == 3
     truth = {"d": -5.0, "a": -40.0, "b0": 40.0}
     for name, value in truth.items():
         low, high = chosen.best.intervals[name]
@@ -89,8 +89,8 @@ def test_what_is_judged_was_not_fitted(runs, chosen):
 def test_any_number_of_threads_gives_the_same_bits(runs, chosen):
     again = ftlm.select(runs, rich(offset="auto"), threads=1)
     assert [(t.name, t.scores, t.values) for t in again.trials] == [(t.name, t.scores, t.values) for t in chosen.trials]
-    assert again.chosen == chosen.chosen
-    assert again.fitted == chosen.fitted
+    assert again.chosen_index == chosen.chosen_index
+    assert again.fitted_count == chosen.fitted_count
 
 
 def test_a_dead_time_is_found_where_there_is_one():
@@ -159,7 +159,7 @@ def test_a_list_is_ranked_by_prediction_and_failures_have_a_reason(runs):
         threads=2,
     )
     assert found.trials[0].name == found.winner.name == "second order"
-    assert found.fitted == 3
+    assert found.fitted_count == 3
     assert [t.score for t in found.trials] == sorted(t.score for t in found.trials)
     assert found.trials[0].validation_fit > 98.5
     assert found.trials[1].validation_fit < 90
@@ -275,7 +275,7 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
     assert f"alpha = {found.best.orders['alpha']:.3g}" in said.text
     if rival:
         free, lag = (next(t for t in found.trials if t.name == name) for name in ("free", "lag"))
-        gains = [free.parts[p] - lag.parts[p] for p in lag.parts]
+        gains = [free.fits_by_part[p] - lag.fits_by_part[p] for p in lag.fits_by_part]
         assert said.numbers["gain"] == pytest.approx(np.median(gains))
 
 
@@ -304,7 +304,7 @@ def test_auto_is_of_outputs_that_something_drives(runs):
 @pytest.mark.slow
 def test_auto_finds_order_and_terms(runs):
     found = ftlm.select(runs, "auto", threads=2)
-    assert found.winner.parameters == 3
+    assert found.winner.parameter_count == 3
     item = found.winner.structure.equations[0]
     assert item.order.constant == 2.0
     assert sorted((t.signal, t.order.constant) for t in item.terms) == [("u", 0.0), ("y", 0.0), ("y", 1.0)]
@@ -449,7 +449,7 @@ def test_many_candidates_are_told_how_long_they_take(runs):
     ticks = iter([0.0, 3.0])
 
     def judge(name, structure, joint, *, is_final):
-        return Trial(name, structure, 1, failed="not asked")
+        return Trial(name, structure, 1, failure="not asked")
 
     work = CandidateEvaluator(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))
     work.fit_candidate = lambda structure, starts: None
@@ -588,7 +588,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
     assert len(data["candidates"]) == len(chosen.trials)
     frame = chosen.to_frame()
     assert list(frame["chosen"]).count(True) == 1
-    assert frame["worst_fold"].iloc[chosen.chosen] == min(f["y"] for f in chosen.winner.validation.values())
+    assert frame["worst_fold"].iloc[chosen.chosen_index] == min(f["y"] for f in chosen.winner.validation.values())
 
 
 def test_the_command(tmp_path):

@@ -52,7 +52,7 @@ def test_a_selection_stopped_anywhere_goes_on_to_the_same_bits(runs, fits, tmp_p
     asked = ftlm.equation("D^2 y = d D^mu y + a y + b u", orders={"mu": (0.5, 1.5, 0.1)}, offset="auto")
     plain = ftlm.select(runs, asked, threads=2)
     needed, place = len(fits), tmp_path / "grown.ftlm"
-    for stop in (1, plain.fitted // 2, plain.fitted - 1):
+    for stop in (1, plain.fitted_count // 2, plain.fitted_count - 1):
 
         def interrupt(done, known, stop=stop):
             if done == stop:
@@ -141,7 +141,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         with pytest.raises(ftlm.DataError, match=f"contains a selection {words}; choose another file"):
             other()
     judged = ftlm.select(runs[0], [FIRST], validation=runs[1], store=tmp_path / "judged.ftlm")
-    assert judged.winner.failed is None
+    assert judged.winner.failure is None
     with pytest.raises(ftlm.DataError, match="with other validation data"):
         ftlm.select(runs[0], [FIRST], validation=motor(3, rows=200), store=tmp_path / "judged.ftlm")
     request = Request.of(*_asked(runs))
@@ -261,7 +261,7 @@ def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
         if what == "a fit":
             return kept.fit(FIRST, [], True, lambda: joint)
         if what == "a validation":
-            return kept.validation("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
+            return kept.validation("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failure="x"))
         return kept.subsets(FIRST, list)
 
     questions, answers = ("a fit", "a validation", "subsets"), {}

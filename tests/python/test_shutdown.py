@@ -110,7 +110,7 @@ def test_no_pair_or_triple_of_failing_calls_leaves_a_motor_live(monkeypatch, fai
 def virtual(tmp_path, monkeypatch, failing):
     """What a virtual board's outputs are after a way out with failing steps, and what was said."""
     page = tmp_path / "page"
-    board = rig.VirtualBoard(parameters=rig.ArmParameters.of("linear"), page=page)
+    board = rig.VirtualBoard(parameters=rig.ArmParameters.load("linear"), register_file=page)
     link = rig.Rig(board)
 
     def act():
@@ -250,7 +250,7 @@ def test_after_an_expiry_the_next_start_brings_nothing_back(monkeypatch):
 
 
 def test_a_watchdog_that_died_is_noticed_within_a_sample(tmp_path):
-    board = rig.VirtualBoard(page=tmp_path / "page")
+    board = rig.VirtualBoard(register_file=tmp_path / "page")
     link = rig.Rig(board)
 
     def outlived():

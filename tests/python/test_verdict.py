@@ -313,14 +313,14 @@ TRUSTED = ("none", "not very vague", "rough", "errors of instruments", "integrat
 def test_a_saved_model_keeps_the_records(found, tmp_path):
     path = tmp_path / "m.json"
     document = json.loads(found.model.save(path).read_text("utf-8"))
-    assert document["estimate"]["against"] == []
+    assert document["estimate"]["verdict_findings"] == []
     for bad in ([{"level": "trust", "reason": "x"}], [{"numbers": {}}], ["x"], {}, [{"code": 3}], [{"code": "later"}]):
-        document["estimate"]["against"] = bad
+        document["estimate"]["verdict_findings"] = bad
         path.write_text(json.dumps(document), encoding="utf-8")
         with pytest.raises(ftlm.DataError, match="is not an ftlm model"):
             ftlm.load_model(path)
     # A finding that lacks its numbers is shown by its code.
-    document["estimate"]["against"] = [{"code": "poor_fit"}]
+    document["estimate"]["verdict_findings"] = [{"code": "poor_fit"}]
     path.write_text(json.dumps(document), encoding="utf-8")
     judged = saved_verdict(ftlm.load_model(path), [])
     assert (judged.level, judged.reason) == ("do not use", "poor_fit")
@@ -411,7 +411,7 @@ def test_nothing_reads_a_sentence():
 
 def test_an_edited_sentence_changes_no_verdict(found, checked, monkeypatch, tmp_path):
     poor = replace(found, findings=(BOUND, TIED, make_finding("offset_missing", output="y", share=30.0, test="x")))
-    model = replace_estimate(found.model, findings=(BOUND.to_file(),), against=(BOUND.to_file(),))
+    model = replace_estimate(found.model, findings=(BOUND.to_file(),), verdict_findings=(BOUND.to_file(),))
     before = verdict(poor, checked), saved_verdict(model, [])
     for code, kind in finding_catalogue().kinds.items():
         reason = f"{code} a closed loop" if kind.reason else ""
@@ -566,7 +566,7 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
     judged = saved_verdict(estimate, [])
     assert (judged.level, judged.reason) == ("do not use", "not separately identifiable from the runs: b0")
-    warned = replace_estimate(saved, against=(BOUND,))
+    warned = replace_estimate(saved, verdict_findings=(BOUND,))
     assert saved_verdict(warned, [saved.compare(other)]).reason == (
         "an order or another parameter is on its bound: order alpha = 2 is on its bound"
     )

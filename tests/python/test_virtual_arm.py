@@ -36,7 +36,7 @@ def states_of(parameters, driven, step=STEP):
 
 def exact(name="effective", **changes):
     """A set whose converters do not round the commands."""
-    return replace(rig.ArmParameters.of(name), bits=0, **changes)
+    return replace(rig.ArmParameters.load(name), bits=0, **changes)
 
 
 def whole(parameters):
@@ -124,7 +124,7 @@ def test_the_whole_arm_is_its_model_with_friction(name):
 
 def test_a_hub_by_itself_is_the_body_with_friction_of_the_free_run():
     # The link weighs as much as no link: what is left is D^2 theta11 = b D^gamma theta11 + g (I1 - sign).
-    stage = replace(rig.ArmParameters.of("effective").stage1, a=0.0, d=0.0)
+    stage = replace(rig.ArmParameters.load("effective").stage1, a=0.0, d=0.0)
     parameters, driven = exact(coupling=0.0, stage1=stage), currents(1501)
     body = ftlm.equation(
         f"D^2 theta11 = {stage.b} D^{stage.gamma} theta11 + {stage.g} I1 - {stage.g * stage.coulomb}*sign(D theta11)",
@@ -166,7 +166,7 @@ def test_deflections_go_against_their_currents_and_with_their_hubs(shape):
 @pytest.mark.slow
 def test_the_links_of_a_noisy_run_with_friction_and_offset_are_recovered_with_intervals():
     # Friction, torque and offset are those of hubs: driven by these the links know nothing of them.
-    arm = rig.ArmParameters.of("effective")
+    arm = rig.ArmParameters.load("effective")
     run = rig.record(
         input="multisine",
         amplitude=(0.6, 0.8),
@@ -240,7 +240,7 @@ def test_an_offset_that_friction_holds_moves_nothing():
     ],
 )
 def test_a_stage_that_cannot_be_is_refused(changes, words):
-    arm = rig.ArmParameters.of("effective")
+    arm = rig.ArmParameters.load("effective")
     with pytest.raises(ftlm.ModelError) as refused:
         rig.record(duration=0.5, parameters=replace(arm, stage2=replace(arm.stage2, **changes)))
     assert words in str(refused.value)
@@ -249,18 +249,18 @@ def test_a_stage_that_cannot_be_is_refused(changes, words):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"reach": 20.0}, "the kinetic energy of the arm is not positive"),
+        ({"link_coupling_ratio": 20.0}, "the kinetic energy of the arm is not positive"),
         ({"inertia_ratio": 0.2}, "not positive definite"),
         ({"inertia_ratio": -0.1}, "inertia_ratio = -0.1 is outside [0, inf]"),
-        ({"reach": float("nan")}, "reach = nan is outside [0, inf]"),
-        ({"rotating_share": 1.5}, "rotating_share = 1.5 is outside [0, 1]"),
+        ({"link_coupling_ratio": float("nan")}, "link_coupling_ratio = nan is outside [0, inf]"),
+        ({"rotating_inertia_fraction": 1.5}, "rotating_inertia_fraction = 1.5 is outside [0, 1]"),
         ({"form": "published"}, "form = 'published' has no coupling of the joints: set coupling = 0"),
         ({"current_offset": (float("nan"), 0.0)}, "current offset is not finite at index 0"),
     ],
 )
 def test_an_arm_that_cannot_be_is_refused(changes, words):
     with pytest.raises(ftlm.FtlmError) as refused:
-        rig.record(duration=0.5, parameters=replace(rig.ArmParameters.of("effective"), **changes))
+        rig.record(duration=0.5, parameters=replace(rig.ArmParameters.load("effective"), **changes))
     assert words in str(refused.value)
 
 

@@ -64,7 +64,7 @@ class Stability:
         Whether a pole other than s = 0 lies on the imaginary axis, within numerical accuracy.
     method
         Method used: ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
-    base
+    commensurate_order
         Largest number, at most 1, of which all powers of s are multiples; None if it would be below 0.01, or the method
         is the argument principle.
     """
@@ -74,7 +74,7 @@ class Stability:
     origin_order: float
     on_axis: bool
     method: str
-    base: float | None
+    commensurate_order: float | None
 
     def __bool__(self) -> bool:
         return self.stable
@@ -90,8 +90,8 @@ class Stability:
             reasons.append(f"it integrates its input with order {self.origin_order:g}")
         verdict = "stable" if self.stable else f"not stable: {', '.join(reasons)}"
         method_text = self.method
-        if self.method == "poles" and self.base:
-            method_text = "poles in s" if self.base == 1.0 else f"poles in s^{self.base:g}"
+        if self.method == "poles" and self.commensurate_order:
+            method_text = "poles in s" if self.commensurate_order == 1.0 else f"poles in s^{self.commensurate_order:g}"
         return f"{verdict} ({method_text})"
 
 

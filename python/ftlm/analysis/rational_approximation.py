@@ -79,7 +79,7 @@ class Approximation:
     warnings: tuple[str, ...]
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states."""
         return int(self.a.shape[0])
 
@@ -87,14 +87,14 @@ class Approximation:
     def frequency_response(self, w: Sequence[float] | Floats) -> NDArray[np.complex128]:
         """Return the complex response at angular frequencies w [rad/s], shape (outputs, inputs, W)."""
         omega = check_vector("w", as_floats("w", w))
-        system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
+        system = 1j * omega[:, None, None] * np.eye(self.state_count) - self.a
         response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
         return np.asarray(np.moveaxis(response, 0, -1), dtype=np.complex128)
 
     def __str__(self) -> str:
         gain, phase = max(self.gain_error.values()), max(self.phase_error.values())
         lines = [
-            f"{self.states} states for {self.band[0]:g} to {self.band[1]:g} rad/s: within {gain:.2g} dB and "
+            f"{self.state_count} states for {self.band[0]:g} to {self.band[1]:g} rad/s: within {gain:.2g} dB and "
             f"{phase:.2g} degrees of the model"
         ]
         return "\n".join(lines + [f"warning: {w}" for w in self.warnings])

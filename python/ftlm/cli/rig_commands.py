@@ -114,7 +114,7 @@ class LiveOptions:
                 )
             structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
             if rig == "virtual":
-                arm = ArmParameters.of(parameters)
+                arm = ArmParameters.load(parameters)
                 default_orders = (arm.stage1 if stage == 1 else arm.stage2).orders(stage)
                 orders = {n: v for n, v in default_orders.items() if n in structure.order_names} | orders
         else:
@@ -122,7 +122,7 @@ class LiveOptions:
         return Streaming(
             structure.with_orders(orders),
             step=1.0 / rate,
-            longest=limit + 1.0,
+            max_duration=limit + 1.0,
             innovation_length=self.method.innovation_length,
             prior_covariance=self.method.prior_covariance,
         )

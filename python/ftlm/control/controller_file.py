@@ -211,7 +211,7 @@ def _pid(controller: DiscretePid) -> PidFile:
         limit=finite(controller.limit),
         band=controller.band,
         order=controller.order,
-        direct=controller.direct,
+        direct=controller.direct_gain,
         lags=[Lag(kind, *values) for kind, values in controller.lags()],
     )
 

@@ -184,12 +184,12 @@ class DiscretePid:
         self.reset()
 
     @property
-    def memory(self) -> int:
+    def state_count(self) -> int:
         """Number of states of the controller, including the last error."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
 
     @property
-    def direct(self) -> float:
+    def direct_gain(self) -> float:
         """Sum of the direct gains of the integral part and of the derivative part, without kp."""
         return self._integral.direct + self._derivative.direct
 
@@ -259,12 +259,12 @@ class DiscretePid:
             "band": list(self.band),
             "gain_error_db": self.gain_error,
             "phase_error_degrees": self.phase_error,
-            "memory": self.memory,
+            "state_count": self.state_count,
         }
 
     def __str__(self) -> str:
         return (
-            f"{self.pid} at {self.rate:g} Hz with {self.memory} numbers of memory: within {self.gain_error:.2g} dB and "
+            f"{self.pid} at {self.rate:g} Hz with {self.state_count} states: within {self.gain_error:.2g} dB and "
             f"{self.phase_error:.2g} degrees from {self.band[0]:.3g} to {self.band[1]:.3g} rad/s"
         )
 
@@ -350,7 +350,7 @@ class PidDesign(LoopDesign):
         Stability margins of the loop at the nominal parameters of the model.
     samples
         Stability margins at parameters drawn from their covariance; empty if the model has no covariance.
-    flat
+    phase_margin_at_gains
         Phase margins [degrees] at 0.7, 1 and 1.4 times the plant gain.
     plants
         Plants from the manipulated input to all outputs that depend on it, the controlled output first.
@@ -360,7 +360,7 @@ class PidDesign(LoopDesign):
     rate: float
     nominal: Margins
     samples: tuple[Margins, ...]
-    flat: tuple[float, float, float]
+    phase_margin_at_gains: tuple[float, float, float]
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
@@ -378,7 +378,7 @@ class PidDesign(LoopDesign):
             "design": "pid",
             "rate": self.rate,
             **self.pid.to_dict(),
-            "phase_margin_at_gains": list(self.flat),
+            "phase_margin_at_gains": list(self.phase_margin_at_gains),
             **self._margins(),
         }
 
@@ -386,7 +386,7 @@ class PidDesign(LoopDesign):
         lines = [f"fractional PID: {self.pid}", *self._margin_lines()]
         lines.append(
             "phase margin with {:g}, 1, {:g} of the plant's gain: ".format(*GAIN_VARIATIONS)
-            + ", ".join(f"{p:.3g}" for p in self.flat)
+            + ", ".join(f"{p:.3g}" for p in self.phase_margin_at_gains)
             + " degrees"
         )
         return "\n".join(lines)

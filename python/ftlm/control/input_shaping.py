@@ -45,7 +45,7 @@ class Shaper:
         Modes that the shaper does not excite.
     times, amplitudes
         Times [s] and amplitudes of the impulses in continuous time.
-    worst
+    max_residual_vibration
         Maximum residual vibration for frequencies and dampings within the 95 % intervals of the modes, relative to an
         unshaped step. None if the modes have no intervals.
     """
@@ -54,14 +54,14 @@ class Shaper:
     modes: tuple[Mode, ...]
     times: tuple[float, ...]
     amplitudes: tuple[float, ...]
-    worst: float | None
+    max_residual_vibration: float | None
 
     @property
     def delay(self) -> float:
         """Time of the last impulse [s], by which the shaper delays the end of a reference."""
         return self.times[-1]
 
-    def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
+    def residual_vibration(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
         """Return the amplitude of the vibration of a mode after a shaped step, relative to that after an unshaped step.
 
         The arguments are broadcast.
@@ -143,11 +143,18 @@ class Shaper:
     def to_dict(self) -> dict[str, Any]:
         """Return kind, impulses, modes and residual vibration as a dictionary for JSON."""
         modes = [[m.frequency, m.damping] for m in self.modes]
-        return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
+        return attributes(self, ("kind", "times", "amplitudes")) | {
+            "modes": modes,
+            "max_residual_vibration": self.max_residual_vibration,
+        }
 
     def __str__(self) -> str:
         impulses_text = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
-        worst_text = "" if self.worst is None else f"; within their intervals at most {100 * self.worst:.2g} % is left"
+        worst_text = (
+            ""
+            if self.max_residual_vibration is None
+            else f"; within their intervals at most {100 * self.max_residual_vibration:.2g} % is left"
+        )
         modes_text = ", ".join(map(str, self.modes))
         return f"{self.kind.upper()} shaper of {modes_text}: {impulses_text}{worst_text}"
 

@@ -71,7 +71,7 @@ class Trajectory:
     residual_vibration
         RMS deviation of the output from the path after the move, as the 97.5 % quantile over the parameter samples.
         None if the model has no covariance.
-    plain
+    uncompensated_vibration
         RMS deviation of the output from the path after the move if the path itself is the reference, at the nominal
         parameters.
     """
@@ -81,7 +81,7 @@ class Trajectory:
     command: Floats
     outputs: dict[str, Floats]
     residual_vibration: float | None
-    plain: float
+    uncompensated_vibration: float
 
     def to_dict(self) -> dict[str, Any]:
         """Return length, largest command and residual vibrations as a dictionary for JSON, without the samples."""
@@ -89,7 +89,7 @@ class Trajectory:
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
             "residual_vibration": self.residual_vibration,
-            "plain": self.plain,
+            "uncompensated_vibration": self.uncompensated_vibration,
         }
 
     def __str__(self) -> str:
@@ -102,7 +102,7 @@ class Trajectory:
         return (
             f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {command_text}{uncertainty_text}; the "
             "path itself as the "
-            f"reference would leave {self.plain:.2g}"
+            f"reference would leave {self.uncompensated_vibration:.2g}"
         )
 
 

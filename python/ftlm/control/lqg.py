@@ -56,7 +56,7 @@ class Observer:
     deviations: dict[str, float]
 
     @property
-    def rows(self) -> Floats:
+    def output_matrix(self) -> Floats:
         """Output matrix of the measured outputs, shape (measured outputs, states)."""
         return self.realization.c[[self.realization.outputs.index(o) for o in self.measured]]
 
@@ -67,9 +67,13 @@ class Observer:
         state_count = len(a)
         transformation = np.eye(state_count + 1)
         transformation[:state_count, :state_count], transformation[:state_count, state_count:] = a, b
-        return transformation, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
+        return (
+            transformation,
+            np.vstack([b, [[0.0]]]),
+            np.column_stack([self.output_matrix, np.zeros(len(self.output_matrix))]),
+        )
 
-    def over(self, run: Run) -> dict[str, Floats]:
+    def estimate_run(self, run: Run) -> dict[str, Floats]:
         """Return estimates of each output and of the input disturbance over a run, one array per name.
 
         The estimate at a sample uses this and earlier samples. The filter starts at rest or, if the model has an
@@ -92,7 +96,7 @@ class Observer:
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
         projection = np.eye(len(a)) - self.gain @ c
-        start = np.append(self.rest(y[:, 0]), 0.0)
+        start = np.append(self.equilibrium_state(y[:, 0]), 0.0)
         # Corrected state at the next sample: x' = projection (a x + b u) + gain y'.
         library = python_control()
         system = library.ss(
@@ -108,13 +112,13 @@ class Observer:
         estimates = self.realization.c @ states[:-1]
         return dict(zip(self.realization.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
-    def rest(self, measured: Floats) -> Floats:
+    def equilibrium_state(self, measured: Floats) -> Floats:
         """Return the equilibrium state, shape (states,), for the measured values of one sample.
 
         It is zero unless the model has an integrator that acts on a measured output.
         """
-        states = np.zeros(self.realization.states)
-        column = self.rows[:, 0]
+        states = np.zeros(self.realization.state_count)
+        column = self.output_matrix[:, 0]
         if self.realization.poles[0] == 0 and np.any(column):
             at = int(np.argmax(np.abs(column)))
             states[0] = _measured_values(self, measured)[at] / column[at]
@@ -256,7 +260,7 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
                 f"{setting('noise')} {{{short_repr(name)}: …}}: this is not a measured output{suggestion}; they are "
                 f"{', '.join(measured)}"
             )
-    free = None if model.estimate is None else model.estimate.free
+    free = None if model.estimate is None else model.estimate.free_parameters
     noise_of_fit = {} if free is None else dict(free.noise)
     out = []
     for name in measured:
@@ -311,9 +315,9 @@ class Lqg:
         realization = observer.realization
         self.rate = realization.rate
         gains = as_floats("feedback", feedback).reshape(1, -1).copy()
-        if gains.shape[1] != realization.states or not np.isfinite(gains).all():
+        if gains.shape[1] != realization.state_count or not np.isfinite(gains).all():
             raise ModelError(
-                f"feedback is not finite or has {gains.shape[1]} values; give {realization.states}, one per state"
+                f"feedback is not finite or has {gains.shape[1]} values; give {realization.state_count}, one per state"
             )
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
@@ -324,7 +328,7 @@ class Lqg:
         self.reset()
 
     @property
-    def memory(self) -> int:
+    def state_count(self) -> int:
         """Number of states of the controller, including the last command."""
         return len(self._a) + 1
 
@@ -348,7 +352,7 @@ class Lqg:
         y = _measured_values(self.observer, measured)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._states is None:
-                self._states = np.append(self.observer.rest(y), 0.0)
+                self._states = np.append(self.observer.equilibrium_state(y), 0.0)
             corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
             self._states = self._a @ corrected + self._b[:, 0] * self._applied
             command = self.ahead * reference - float(self._gains[0] @ self._states)
@@ -390,7 +394,7 @@ class Lqg:
             "input": realization.input,
             "tracked": self.tracked,
             "measured": list(self.observer.measured),
-            "memory": self.memory,
+            "state_count": self.state_count,
             "gain_error_db": max(realization.gain_error.values()),
             "phase_error_degrees": max(realization.phase_error.values()),
             "a": realization.a.tolist(),
@@ -402,7 +406,7 @@ class Lqg:
 
     def __str__(self) -> str:
         return (
-            f"LQG at {self.rate:g} Hz with {self.memory} numbers of memory, from "
+            f"LQG at {self.rate:g} Hz with {self.state_count} states, from "
             f"{', '.join(self.observer.measured)} to {self.observer.realization.input}, {self.tracked} as asked for"
         )
 
@@ -459,7 +463,7 @@ class LqgDesign(LoopDesign):
             "input": realization.input,
             "tracked": self.controller.tracked,
             "measured": list(self.controller.observer.measured),
-            "states": realization.states,
+            "state_count": realization.state_count,
             "band": list(realization.band),
             "gain_error_db": realization.gain_error,
             "phase_error_degrees": realization.phase_error,
@@ -627,7 +631,7 @@ def _equilibrium(realization: Realization, tracked: str) -> Floats:
         raise ModelError(
             f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realization.outputs)}"
         )
-    state_count = realization.states
+    state_count = realization.state_count
     matrix = np.zeros((state_count + 1, state_count + 1))
     matrix[:state_count, :state_count] = realization.a - np.eye(state_count)
     matrix[:state_count, state_count:] = realization.b

@@ -69,21 +69,21 @@ class Realization:
     phase_error: dict[str, float]
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states."""
         return len(self.a)
 
     def response(self, w: Floats) -> Complex:
         """Return the frequency response of the discrete-time system at w [rad/s], shape (outputs, W)."""
         z = np.exp(1j * check_vector("w", as_floats("w", w)) / self.rate)
-        system = z[:, None, None] * np.eye(self.states) - self.a
+        system = z[:, None, None] * np.eye(self.state_count) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
         return np.asarray((states @ self.c.T).T)
 
     def __str__(self) -> str:
         gain, phase = max(self.gain_error.values()), max(self.phase_error.values())
         return (
-            f"{self.states} states for {self.band[0]:.3g} to {self.band[1]:.3g} rad/s: within {gain:.2g} dB and "
+            f"{self.state_count} states for {self.band[0]:.3g} to {self.band[1]:.3g} rad/s: within {gain:.2g} dB and "
             f"{phase:.2g} degrees of the model"
         )
 
@@ -148,9 +148,8 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     gain, phase = max(best_realization.gain_error.values()), max(best_realization.phase_error.values())
     if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
         raise ModelError(
-            f"a realization with {best_realization.states} states has errors of up to {gain:.2g} dB and {phase:.2g} "
-            "degrees "
-            f"between {low:.3g} and {high:.3g} rad/s, too large for a design; use a narrower band"
+            f"a realization with {best_realization.state_count} states has errors of up to {gain:.2g} dB and "
+            f"{phase:.2g} degrees between {low:.3g} and {high:.3g} rad/s, too large for a design; use a narrower band"
             + ("" if poles is None else ", or more poles")
         )
     return best_realization

@@ -72,7 +72,7 @@ class LoopDesign:
     samples: tuple[Margins, ...]
 
     @property
-    def stable_share(self) -> float:
+    def stable_fraction(self) -> float:
         """Fraction of the parameter samples for which the loop is stable; 1 without samples."""
         return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
 
@@ -97,7 +97,7 @@ class LoopDesign:
         if self.samples:
             phase, gain, peak = (self.margin_interval(n) for n in ("phase", "gain", "sensitivity"))
             lines.append(
-                f"over the intervals ({len(self.samples)} samples, {100 * self.stable_share:.0f} % stable), 95 % "
+                f"over the intervals ({len(self.samples)} samples, {100 * self.stable_fraction:.0f} % stable), 95 % "
                 "between: "
                 f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
                 f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"

@@ -47,7 +47,7 @@ class ParameterDifference:
     ----------
     name
         The parameter.
-    parts
+    segments
         Indices of the two segments.
     difference_in_errors
         Absolute difference divided by its standard error; NaN if the parameter is not identifiable from one segment.
@@ -57,7 +57,7 @@ class ParameterDifference:
     """
 
     name: str
-    parts: tuple[int, int]
+    segments: tuple[int, int]
     difference_in_errors: float
     disjoint: bool
 
@@ -68,29 +68,29 @@ class Consistency(ReportMixin):
 
     Parameters
     ----------
-    names
+    segments
         Names of the segments.
     results
         Identification of each segment.
     differences
         Difference of each parameter between any two segments, those with disjoint intervals first, then by decreasing
         size.
-    distance, degrees
+    statistic, degrees_of_freedom
         Chi-squared statistic of all parameters about their common weighted mean, and its degrees of freedom under one
-        common model. `distance` is None, and `degrees` 0, for a method without covariance.
+        common model. `statistic` is None, and `degrees_of_freedom` 0, without a covariance.
     cross_validation
         ``cross_validation[k][j]`` is the fit in percent, by output, of the model of segment k on segment j.
-    delays
+    delay_findings
         Findings on runs that the model of another run explains once their inputs are shifted by some samples.
     """
 
-    names: tuple[str, ...]
+    segments: tuple[str, ...]
     results: tuple[Identification, ...]
     differences: tuple[ParameterDifference, ...]
-    distance: float | None
-    degrees: int
+    statistic: float | None
+    degrees_of_freedom: int
     cross_validation: tuple[tuple[dict[str, float], ...], ...] = field(repr=False)
-    delays: tuple[Finding, ...] = field(default=(), repr=False)
+    delay_findings: tuple[Finding, ...] = field(default=(), repr=False)
 
     @property
     def consistent(self) -> bool | None:
@@ -101,12 +101,12 @@ class Consistency(ReportMixin):
 
     @property
     def limit(self) -> float:
-        """99 % quantile of ``distance`` if all segments share one model; infinite without degrees of freedom."""
-        return chi_squared_99(self.degrees) if self.degrees else math.inf
+        """99 % quantile of ``statistic`` if all segments share one model; infinite without degrees of freedom."""
+        return chi_squared_99(self.degrees_of_freedom) if self.degrees_of_freedom else math.inf
 
     @property
     def _exceeds_limit(self) -> bool:
-        return self.distance is not None and self.distance > self.limit
+        return self.statistic is not None and self.statistic > self.limit
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
@@ -115,9 +115,9 @@ class Consistency(ReportMixin):
 
     @property
     def _joint_test_text(self) -> str:
-        if self.distance is None or not self.degrees:
+        if self.statistic is None or not self.degrees_of_freedom:
             return ""
-        return f"statistic {self.distance:.3g}, 99 % limit {self.limit:.3g}"
+        return f"statistic {self.statistic:.3g}, 99 % limit {self.limit:.3g}"
 
     def _values(self, part: int) -> dict[str, float]:
         return values_of(self.results[part])
@@ -125,10 +125,10 @@ class Consistency(ReportMixin):
     def describe_difference(self, difference: ParameterDifference) -> str:
         """Return text on one parameter in two segments: values, intervals and difference in standard errors."""
         text = []
-        for part in difference.parts:
+        for part in difference.segments:
             low, high = self.results[part].intervals[difference.name]
             value = f"{self._values(part)[difference.name]:.4g}"
-            text.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
+            text.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.segments[part]}")
         return (
             f"{difference.name} is {text[0]} and {text[1]}, {difference.difference_in_errors:.2g} standard errors apart"
         )
@@ -158,10 +158,10 @@ class Consistency(ReportMixin):
         out = []
         if self.not_identifiable and self.consistent is not None:
             out.append(make_finding("not_identifiable_from_segment", parameter=", ".join(self.not_identifiable)))
-        for name, result in zip(self.names, self.results, strict=True):
+        for name, result in zip(self.segments, self.results, strict=True):
             if result.joint is not None and not result.joint.converged:
                 out.append(make_finding("segment_not_converged", run=name))
-        out += self.delays
+        out += self.delay_findings
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
             out.append(make_finding("segment_residuals_not_white"))
         return tuple(out)
@@ -171,7 +171,7 @@ class Consistency(ReportMixin):
         """Findings as sentences."""
         return texts(self.findings)
 
-    def numbers_table(self) -> Table:
+    def parameters_table(self) -> Table:
         """Return a table of the parameters of each segment, with intervals and differences."""
         rows: list[list[Cell]] = []
         for name in dict.fromkeys(d.name for d in self.differences):
@@ -193,7 +193,7 @@ class Consistency(ReportMixin):
             )
         return Table(
             "Parameters of each segment, with 95 % intervals",
-            ("parameter", *self.names, "difference in standard errors", "95 % intervals"),
+            ("parameter", *self.segments, "difference in standard errors", "95 % intervals"),
             rows,
             wrap=True,
             note="The difference is that of the two segments that differ most, divided by its standard error.",
@@ -202,20 +202,22 @@ class Consistency(ReportMixin):
     def fits_table(self) -> Table:
         """Return a table of the fit of each segment's model on every segment."""
         rows: list[list[Cell]] = [
-            [f"{name}, {output}", *(self.cross_validation[k][j].get(output) for j in range(len(self.names)))]
-            for k, name in enumerate(self.names)
+            [f"{name}, {output}", *(self.cross_validation[k][j].get(output) for j in range(len(self.segments)))]
+            for k, name in enumerate(self.segments)
             for output in self.cross_validation[k][k]
         ]
-        return Table("Fit of each segment's model on each segment, in %", ("model of", *self.names), rows)
+        return Table("Fit of each segment's model on each segment, in %", ("model of", *self.segments), rows)
 
     def _page(self) -> Page:
         first = Section(
             "Test for one model",
             paragraphs=[f"{self.reason}."],
             warnings=list(self.warnings),
-            tables=[self.numbers_table(), self.fits_table()],
+            tables=[self.parameters_table(), self.fits_table()],
         )
-        sections = [Section(n, paragraphs=str(r).splitlines()) for n, r in zip(self.names, self.results, strict=True)]
+        sections = [
+            Section(n, paragraphs=str(r).splitlines()) for n, r in zip(self.segments, self.results, strict=True)
+        ]
         lead = {True: "the same model", False: "not the same model", None: "inconclusive"}[self.consistent]
         return Page("Parts of a run", [first, *sections], lead)
 
@@ -224,7 +226,7 @@ class Consistency(ReportMixin):
         rows = [
             {
                 "parameter": name,
-                "segment": self.names[part],
+                "segment": self.segments[part],
                 "value": self._values(part)[name],
                 "standard_error": error,
                 "low": result.intervals[name][0],
@@ -240,21 +242,21 @@ class Consistency(ReportMixin):
         return {
             "consistent": self.consistent,
             "reason": self.reason,
-            "segments": list(self.names),
+            "segments": list(self.segments),
             "differences": [
                 {
                     "parameter": d.name,
-                    "segments": [self.names[k] for k in d.parts],
+                    "segments": [self.segments[k] for k in d.segments],
                     "difference_in_errors": finite(d.difference_in_errors),
                     "disjoint": d.disjoint,
                 }
                 for d in self.differences
             ],
-            "distance": None if self.distance is None else finite(self.distance),
-            "degrees": self.degrees,
+            "statistic": None if self.statistic is None else finite(self.statistic),
+            "degrees_of_freedom": self.degrees_of_freedom,
             "cross_validation": {
-                name: dict(zip(self.names, row, strict=True))
-                for name, row in zip(self.names, self.cross_validation, strict=True)
+                name: dict(zip(self.segments, row, strict=True))
+                for name, row in zip(self.segments, self.cross_validation, strict=True)
             },
             "findings": [f.to_dict() for f in self.findings],
             "warnings": list(self.warnings),
@@ -263,7 +265,7 @@ class Consistency(ReportMixin):
 
     def __str__(self) -> str:
         lines = [f"{self.reason}."]
-        for table in (self.numbers_table(), self.fits_table()):
+        for table in (self.parameters_table(), self.fits_table()):
             rows = [list(table.columns), *([_cell(c) for c in row] for row in table.rows)]
             wide = [max(len(row[k]) for row in rows) for k in range(len(table.columns))]
             lines += ["", f"{table.title}:"]
@@ -357,11 +359,13 @@ def consistency(
     cross_validation = tuple(
         tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results
     )
-    distance, degrees = joint_distance(results)
-    result = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, cross_validation)
+    statistic, degrees_of_freedom = joint_statistic(results)
+    result = Consistency(
+        tuple(names), tuple(results), tuple(differences(results)), statistic, degrees_of_freedom, cross_validation
+    )
     if result.consistent is not False or len(all_runs) == 1:
         return result
-    return replace(result, delays=tuple(_delay_findings(names, pieces, results)))
+    return replace(result, delay_findings=tuple(_delay_findings(names, pieces, results)))
 
 
 def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequence[Identification]) -> list[Finding]:
@@ -480,7 +484,7 @@ def is_quadratic(result: Identification, name: str) -> bool:
     )
 
 
-def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int]:
+def joint_statistic(results: Sequence[Identification]) -> tuple[float | None, int]:
     """Return the chi-squared statistic of all parameters about their weighted mean, and its degrees of freedom.
 
     Parameters whose interval in some segment is not close to the Wald interval are omitted, because their covariance is
@@ -501,5 +505,5 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     weighted_mean = np.linalg.lstsq(np.sum(weights, axis=0), sum(w @ p for w, p in zip(weights, points, strict=True)))[
         0
     ]
-    distance = float(sum((p - weighted_mean) @ w @ (p - weighted_mean) for w, p in zip(weights, points, strict=True)))
-    return distance, count * (len(joints) - 1)
+    statistic = float(sum((p - weighted_mean) @ w @ (p - weighted_mean) for w, p in zip(weights, points, strict=True)))
+    return statistic, count * (len(joints) - 1)

@@ -219,7 +219,7 @@ def _fit_runs(
         return fit
 
     preliminary_method, initial_condition_fits = (
-        getattr(estimator, "hypothesis", None),
+        getattr(estimator, "preliminary_method", None),
         InitialConditionFits(estimate, may_add_offset),
     )
     if preliminary_method is not None:
@@ -385,7 +385,7 @@ def assess_fit(fit: Fit) -> Identification:
     limiting = tuple(f.to_file() for f in unique_findings(result_findings(result)))
     if not limiting:
         return result
-    return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=limiting)))
+    return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, verdict_findings=limiting)))
 
 
 def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str, float]], ...]:
@@ -514,7 +514,7 @@ def _estimate(
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
         findings=tuple(f.to_file() for f in findings),
         intervals=profiles,
-        free=None if joint is None else parameter_set(joint, fit.task.structure),
+        free_parameters=None if joint is None else parameter_set(joint, fit.task.structure),
     )
 
 

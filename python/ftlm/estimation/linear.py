@@ -373,7 +373,7 @@ class Streaming:
         the equation minus the order of a term must be in [0, 2] for every term.
     step
         Time between samples [s].
-    longest
+    max_duration
         Maximum duration of a run [s].
     inputs
         Names of the input signals, which are constant between samples (zero-order hold).
@@ -393,7 +393,7 @@ class Streaming:
         structure: Structure,
         *,
         step: float,
-        longest: float,
+        max_duration: float,
         inputs: Sequence[str] = ("I1", "I2"),
         innovation_length: int = 7,
         prior_covariance: float | None = None,
@@ -421,7 +421,7 @@ class Streaming:
         self.signals = tuple(structure.signals)
         self.structure = structure
         length = check_integer("innovation_length", innovation_length, 1, (1 << 31) - 1)
-        step, longest = check_step(step, "step"), check_step(longest, "longest")
+        step, max_duration = check_step(step, "step"), check_step(max_duration, "max_duration")
         self.step = step
         self._recursions: list[Recursion] = []
         for equation in structure.equations:
@@ -433,9 +433,9 @@ class Streaming:
                     output=output,
                     step=step,
                     hold=[name in inputs for name in self.signals],
-                    p=length,
+                    innovation_length=length,
                     prior_covariance=prior_covariance,
-                    longest=max(2, round(longest / step) + 1),
+                    max_pulses=max(2, round(max_duration / step) + 1),
                     fixed=[t.fixed for t in equation.terms],
                 )
             )
@@ -449,7 +449,7 @@ class Streaming:
         DataError
             If a sample is not finite.
         ModelError
-            If the samples exceed the duration `longest`.
+            If the samples exceed `max_duration`.
         ConvergenceError
             If rounding errors make the covariance indefinite.
         """

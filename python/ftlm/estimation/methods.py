@@ -322,8 +322,8 @@ class OutputError:
     ) -> Fit:
         """Fit a structure to checked runs; see :func:`ftlm.identify`.
 
-        `fitted` is a joint fit by the method that :attr:`hypothesis` returns. If given, it is completed with the
-        remaining confidence intervals, and no new fit is made. A preliminary fit has no findings.
+        `fitted` is a joint fit by the method that :attr:`preliminary_method` returns. If given, it is completed with
+        the remaining confidence intervals, and no new fit is made. A preliminary fit has no findings.
         """
         if self.reference is not None and structure.has_friction:
             raise ModelError(
@@ -399,7 +399,7 @@ class OutputError:
         return fit if self.reference is None else with_reference_findings(fit, self.reference, instrument_findings)
 
     @property
-    def hypothesis(self) -> OutputError | None:
+    def preliminary_method(self) -> OutputError | None:
         """Method without profile likelihood, for preliminary fits that :meth:`fit` can complete.
 
         None with bounds, a noise model or a reference, because :meth:`fit` cannot complete such fits.

@@ -431,7 +431,7 @@ def parameter_set_of(model: Model) -> FitParameters:
     ModelError
         If the model was not estimated by output error, or its file does not list the free parameters.
     """
-    free = None if model.estimate is None else model.estimate.free
+    free = None if model.estimate is None else model.estimate.free_parameters
     if free is None:
         reason = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(

@@ -335,7 +335,7 @@ class Identification:
     #: Same as `fit`, under a name that states the unit.
     fit_percent = fit
 
-    def physical(self, **values: float) -> dict[str, PhysicalParameter]:
+    def physical_parameters(self, **values: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
 
         Parameters

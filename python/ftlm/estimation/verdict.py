@@ -219,7 +219,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
     """Return the stored findings against a model, plus one on unidentifiable parameters if none reports them."""
-    findings = list(estimate.against)
+    findings = list(estimate.verdict_findings)
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
         findings.append(

@@ -276,7 +276,7 @@ def design_input(
         criterion=goal.kind,
         parameters=tuple(fit.names[i] for i in indices),
         values=dict(zip(fit.names, fit.values, strict=True)),
-        errors={k: dict(zip(fit.names, v.tolist(), strict=True)) for k, v in errors.items()},
+        standard_errors={k: dict(zip(fit.names, v.tolist(), strict=True)) for k, v in errors.items()},
         gain=float(np.exp(np.sum(ratios))),
         gains=tuple((d.name, math.exp(min(goal.count * (d.score - square_score), 700.0))) for d in designs),
         predicted_extremes=_predicted_extremes(run, bounds),

@@ -61,7 +61,7 @@ class DesignedInput:
         Names of the parameters of interest.
     values
         Values of the free parameters of the model by name.
-    errors
+    standard_errors
         Standard errors of the free parameters by case and name. ``"now"``: those of the model. ``"square"`` and
         ``"designed"``: predicted for a fit to the square wave alone, or to the designed run alone. ``"both"``:
         predicted for a fit to the designed run together with the estimation runs.
@@ -89,7 +89,7 @@ class DesignedInput:
     criterion: Kind
     parameters: tuple[str, ...]
     values: Mapping[str, float]
-    errors: Mapping[str, Mapping[str, float]]
+    standard_errors: Mapping[str, Mapping[str, float]]
     gain: float
     gains: tuple[tuple[str, float], ...]
     predicted_extremes: tuple[PredictedExtreme, ...]
@@ -118,7 +118,7 @@ class DesignedInput:
 
         They are centered at the values of the model.
         """
-        errors = self.errors["designed"]
+        errors = self.standard_errors["designed"]
         return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
 
     @property
@@ -146,7 +146,7 @@ class DesignedInput:
     def to_frame(self) -> Any:
         """Return a pandas DataFrame: one row per parameter, columns for its value and its standard error by case."""
         rows = [
-            {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.errors.items()}}
+            {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.standard_errors.items()}}
             for n, v in self.values.items()
         ]
         return to_frame(rows, ["parameter"])
@@ -158,7 +158,7 @@ class DesignedInput:
             **attributes(self, ("shape", "criterion", "parameters")),
             "duration": self.run.duration,
             **attributes(self, ("step", "values")),
-            "standard_errors": json_value(self.errors),
+            "standard_errors": json_value(self.standard_errors),
             "gain": finite(self.gain),
             "gains": dict(self.gains),
             "predicted_extremes": {
@@ -183,7 +183,9 @@ class DesignedInput:
             f"{'square/designed':>17}",
         ]
         for name, value in self.values.items():
-            now, square_error, new, both = (self.errors[k][name] for k in ("now", "square", "designed", "both"))
+            now, square_error, new, both = (
+                self.standard_errors[k][name] for k in ("now", "square", "designed", "both")
+            )
             mark = "*" if name in self.parameters else " "
             ratio = square_error / new if new > 0 else math.nan
             cells = "".join(f"{format_bound(v):>12}" for v in (now, square_error, new, both))

@@ -223,7 +223,7 @@ def parse_text(
     if dialect.names is None:
         assumed = tuple(_with_remark(a, remark, dialect.width) for a in assumed)
     return FileTable(
-        path, columns, True, header, layout=used_layout.under(dialect.layout), assumptions=assumed, kind=kind
+        path, columns, True, header, layout=used_layout.merge(dialect.layout), assumptions=assumed, kind=kind
     )
 
 

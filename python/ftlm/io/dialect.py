@@ -109,7 +109,7 @@ class Layout:
             raise DataError(f"{layout_fields('sheet')} is {type_name(self.sheet)}; give the name of a sheet")
 
     @classmethod
-    def of(cls, layout: object) -> Layout:
+    def from_argument(cls, layout: object) -> Layout:
         """Return a layout from None (no option set), a layout or a mapping of its fields; raise DataError otherwise."""
         if layout is None:
             return cls()
@@ -126,7 +126,7 @@ class Layout:
                 )
         return cls(**layout)
 
-    def under(self, other: Layout) -> Layout:
+    def merge(self, other: Layout) -> Layout:
         """Return the options of both layouts; where both set an option, that of `other` is used."""
         return replace(self, **other.to_dict())
 
@@ -319,11 +319,11 @@ def find_table(
         If there is no row of numbers, or the layout is ambiguous.
     """
     if is_ftlm_file:
-        layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(
+        layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).merge(
             layout_options
         )
     elif sheet:
-        layout_options = Layout(separator="tab", decimal="point", thousands="none").under(layout_options)
+        layout_options = Layout(separator="tab", decimal="point", thousands="none").merge(layout_options)
     rows = [(at, line) for at, line in lines if at > (layout_options.skip or 0)]
     if not rows:
         raise DataError(
@@ -345,7 +345,7 @@ def find_table(
         thousands=thousands_separator,
         skip=table_lines[top - header].at - 1 if 0 < top - header < len(table_lines) else 0,
         header=header,
-    ).under(layout_options)
+    ).merge(layout_options)
     assumed = _layout_assumptions(table_lines, layout_options, layout, top, units)
     if layout_options.skip is None:
         _check_above(table_lines[: top - header], width, source, (comma, thousands_separator))

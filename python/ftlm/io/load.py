@@ -478,7 +478,7 @@ def select_columns(
         names_to_columns("outputs", specification.get("outputs")) | names_to_columns("outputs", outputs),
         _words("units", specification.get("units")) | _words("units", units),
         _words("intersample", specification.get("intersample")) | _words("intersample", intersample),
-        Layout.of(specification.get("layout")).under(Layout.of(layout)),
+        Layout.from_argument(specification.get("layout")).merge(Layout.from_argument(layout)),
     )
 
 

@@ -149,7 +149,7 @@ def load_frequency(
         If the file cannot be read, columns are not recognized or have no numbers, a unit is unknown, or a frequency is
         not positive.
     """
-    (table,) = read_tables(path, Layout.of(layout))
+    (table,) = read_tables(path, Layout.from_argument(layout))
     pool = ColumnTable([table])
     if table.header is not None:
         raise DataError(f"{table.path.name} is a run over time that ftlm wrote; load it with ftlm.load")

@@ -398,10 +398,10 @@ class _FilePreview:
             if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):
                 options[key] = dict(getattr(selection, key))
         keys = {*selection.layout.to_dict(), *(a.option for a in self.table.assumptions)}
-        layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in keys})
+        layout = Layout.from_argument({key: value for key, value in self.table.layout.to_dict().items() if key in keys})
         for assumption in of_clock:
             if assumption.option == "dates":
-                layout = layout.under(Layout(dates=str(assumption.value)))
+                layout = layout.merge(Layout(dates=str(assumption.value)))
             else:
                 options[assumption.option] = assumption.value
         return options | ({"layout": layout} if layout != Layout() else {})

@@ -77,12 +77,12 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intervals
         95 % profile-likelihood intervals (low, high) by name, with None for an unbounded side. Parameters that are not
         listed have Wald intervals of ± 1.96 standard errors.
-    free
+    free_parameters
         Free parameters of the output-error fit, with their covariance. None for other methods.
     findings
         Findings about data, fit and model.
-    against
-        Findings against the model at its identification, which determine its verdict.
+    verdict_findings
+        Findings of the identification that determine the verdict.
     piece_duration
         Minimum duration [s] of the segments into which the runs of an unstable plant were split, each with its own
         initial values. Comparisons split other runs in the same way. None if whole runs were simulated.
@@ -96,9 +96,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fit: dict[str, float | None] = {}
     information: dict[str, float | None] = {}
     intervals: dict[str, tuple[float | None, float | None]] = {}
-    free: FitParameters | None = None
+    free_parameters: FitParameters | None = None
     findings: tuple[Finding, ...] = ()
-    against: tuple[Finding, ...] = ()
+    verdict_findings: tuple[Finding, ...] = ()
     piece_duration: float | None = None
 
 

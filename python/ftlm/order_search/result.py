@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ftlm.estimation.verdict import Verdict
 
 #: RMS simulation error over standard deviation of the output (NR) above which a simulation explains little of it.
-MAX_FREE_RUN_NR = 0.5
+MAX_SIMULATION_NR = 0.5
 #: Relative difference of scores and coefficients below which two rows of the table count as one model.
 SAME_MODEL_TOLERANCE = 1e-6
 #: Maximum number of candidates in the table of a report.
@@ -65,7 +65,7 @@ class OrderCertificate:
         the maximum number of boxes was reached.
     m
         Block pulses per run.
-    free_run_nr
+    simulation_nr
         RMS simulation error of the model with `orders` and its least-squares coefficients, divided by the standard
         deviation of the output; infinite if the simulation fails. The certificate does not bound this error.
     unstable_poles
@@ -84,7 +84,7 @@ class OrderCertificate:
     cells: int
     open_cells: int
     m: int
-    free_run_nr: float = math.nan
+    simulation_nr: float = math.nan
     unstable_poles: float = math.nan
     start_errors: tuple[float, ...] = ()
 
@@ -103,9 +103,9 @@ class OrderCertificate:
         The certificate covers only the equation error.
         """
         if self.unstable_poles > 0:
-            return (make_finding("best_orders_unstable", poles=int(self.unstable_poles), nr=self.free_run_nr),)
-        if self.free_run_nr > MAX_FREE_RUN_NR:
-            return (make_finding("best_orders_poor_fit", nr=self.free_run_nr),)
+            return (make_finding("best_orders_unstable", poles=int(self.unstable_poles), nr=self.simulation_nr),)
+        if self.simulation_nr > MAX_SIMULATION_NR:
+            return (make_finding("best_orders_poor_fit", nr=self.simulation_nr),)
         return ()
 
     @property
@@ -118,7 +118,7 @@ class OrderCertificate:
         bound_fields = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
         options = ("min_separation", "max_term_ratio", "cells", "open_cells", "m")
         attributes_shown = attributes(
-            self, (*bound_fields, *options, "free_run_nr", "start_errors", "beatable", "findings")
+            self, (*bound_fields, *options, "simulation_nr", "start_errors", "beatable", "findings")
         )
         return attributes_shown if self.orders else attributes_shown | {"best": None}
 
@@ -217,7 +217,7 @@ class SearchResult(BestIdentification):
         Values of those orders of the first row that are at a limit of their interval, by name.
     excluded_by_box
         Number of candidates, counted as "bound", that were excluded together with a whole box of orders.
-    free_runs
+    simulated_candidates
         Number of candidates that were simulated if the equations have nonlinear terms: the best by equation error. 0
         for linear equations, for which the search is exhaustive.
     verdict, model_findings
@@ -237,7 +237,7 @@ class SearchResult(BestIdentification):
     settings: dict[str, Any]
     at_grid_edge: dict[str, float]
     excluded_by_box: int = 0
-    free_runs: int = 0
+    simulated_candidates: int = 0
     verdict: Verdict | None = field(default=None, compare=False)
     model_findings: tuple[Finding, ...] = field(default=(), compare=False)
     best: Identification | None = field(default=None, compare=False, repr=False)
@@ -312,8 +312,10 @@ class SearchResult(BestIdentification):
     def search_findings(self) -> tuple[Finding, ...]:
         """Findings on the table: orders at a limit of their interval, candidates not simulated, equivalent rows."""
         edges = [make_finding("order_on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
-        if 0 < self.free_runs < self.candidates:
-            edges.append(make_finding("candidates_not_simulated", count=self.free_runs, candidates=self.candidates))
+        if 0 < self.simulated_candidates < self.candidates:
+            edges.append(
+                make_finding("candidates_not_simulated", count=self.simulated_candidates, candidates=self.candidates)
+            )
         distinct, rows = len(self.distinct_rows), len(self.table)
         if distinct == rows:
             return tuple(edges)

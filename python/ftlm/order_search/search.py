@@ -127,7 +127,7 @@ def free_run_score(
     return score if math.isfinite(score) else math.inf
 
 
-def rank_by_free_runs(
+def rank_by_simulation(
     table: Sequence[SearchRow], structure: Structure, records: Sequence[Record], norm: Norm, scales: Sequence[float]
 ) -> list[SearchRow]:
     """Return the rows of a search table whose simulations are finite, ranked by the score of the simulation.
@@ -307,13 +307,13 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
         count = max(settings.top, FREE_RUN_CANDIDATES)
         preliminary_job = replace(job, settings=replace(settings, criterion="equation-error", top=count))
         ranked = run_job(preliminary_job, store=store, number=number, executor=executor)
-        table = rank_by_free_runs(ranked.table, job.structure, job.records, settings.norm, job.scales())
+        table = rank_by_simulation(ranked.table, job.structure, job.records, settings.norm, job.scales())
         counts = {"candidates": ranked.candidates, "kept": min(settings.top, len(table)), **ranked.exclusion_counts}
         counts["diverged"] += len(ranked.table) - len(table)
         counts["beaten"] += len(table) - counts["kept"]
         totals = cast("_core._Counts", counts)
         result = _result(job, table[: settings.top], ranked.failures, totals, ranked.excluded_by_box)
-        return replace(result, free_runs=len(ranked.table))
+        return replace(result, simulated_candidates=len(ranked.table))
     execution = Execution(store, number, executor, job.progress)
     if job.structure.has_order_law:
         found_stage = search_coupled(job.coupled_problem(), execution)

@@ -22,7 +22,7 @@ ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 #: Amplitudes [A] of the paper's motor currents, by shape of the signal.
 CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
 #: Parameters of the demonstration's arm: the manufacturer's effective coefficients, fractional damping, no friction.
-DEMO_PARAMETERS = ArmParameters.of("linear")
+DEMO_PARAMETERS = ArmParameters.load("linear")
 #: Parameters of the manufacturer's arm, with fractional damping and friction.
 EFFECTIVE_PARAMETERS = PARAMETER_SETS["effective"]
 #: Default seed of the noise on the angles.

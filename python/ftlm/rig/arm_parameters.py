@@ -102,10 +102,10 @@ class ArmParameters:
         the kinetic energy of joint 2.
     inertia_ratio
         Inertia of hub 2 divided by the inertia of link 1 with everything that it carries, J_21/J_12.
-    reach
+    link_coupling_ratio
         Coupling ratio H/J_22. H is the length of link 1 times the first moment of mass of link 2, and J_22 the inertia
         of link 2. The ratio is 1 for equally long links with the mass at the tip.
-    rotating_share
+    rotating_inertia_fraction
         Fraction of the hub inertia J_21 that rotates with link 1. A rotor behind a gear contributes only its inertia
         divided by the gear ratio.
     current_offset
@@ -131,8 +131,8 @@ class ArmParameters:
     stage2: StageParameters
     coupling: float = 1.0
     inertia_ratio: float = INERTIA_RATIO
-    reach: float = LINK_COUPLING_RATIO
-    rotating_share: float = ROTATING_INERTIA_FRACTION
+    link_coupling_ratio: float = LINK_COUPLING_RATIO
+    rotating_inertia_fraction: float = ROTATING_INERTIA_FRACTION
     current_offset: tuple[float, float] = (0.0, 0.0)
     strain_noise: tuple[float, float] = (0.015, 0.0134)
     current_noise: tuple[float, float] = (0.0012, 0.0012)
@@ -145,7 +145,7 @@ class ArmParameters:
     name: str = "effective"
 
     @classmethod
-    def of(cls, source: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
+    def load(cls, source: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
         """Return the parameter set that a name or a TOML file denotes, or the argument itself.
 
         Raises
@@ -203,23 +203,27 @@ class ArmParameters:
         """
         for name, highest in (
             ("coupling", 1.0),
-            ("rotating_share", 1.0),
+            ("rotating_inertia_fraction", 1.0),
             ("inertia_ratio", math.inf),
-            ("reach", math.inf),
+            ("link_coupling_ratio", math.inf),
         ):
             value = getattr(self, name)
             if not (0.0 <= value <= highest and math.isfinite(value)):
                 raise ModelError(f"{name} = {value!r} is outside [0, {highest:g}]; correct the arm's parameters")
         if not self.stage2.r > 1.0:
             raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1; give (J_1 + J_2)/J_2")
-        hub = self.coupling * self.rotating_share * self.inertia_ratio
-        arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
-        base_coefficient, link_coefficient = -self.coupling * self.rotating_share, -self.coupling * (1.0 + self.reach)
+        hub = self.coupling * self.rotating_inertia_fraction * self.inertia_ratio
+        arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.link_coupling_ratio)
+        base_coefficient, link_coefficient = (
+            -self.coupling * self.rotating_inertia_fraction,
+            -self.coupling * (1.0 + self.link_coupling_ratio),
+        )
         # Determinant of the inertia matrix, relative to that of uncoupled joints.
         if not 1.0 + hub * base_coefficient + arm * link_coefficient > 0.0:
             raise ModelError(
-                f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give joint 2 more inertia than "
-                "link 1 carries, so that the kinetic energy of the arm is not positive definite; make them smaller"
+                f"inertia_ratio = {self.inertia_ratio:g} and link_coupling_ratio = {self.link_coupling_ratio:g} give "
+                "joint 2 more inertia than link 1 carries, so that the kinetic energy of the arm is not positive definite; "
+                "make them smaller"
             )
         return {
             "p2": -hub - arm,
@@ -347,7 +351,7 @@ _STAGE2 = StageParameters(
 #: of the stiffness term of link 1 is estimated as 0 within 0.01. benches/virtual_arm.py repeats these fits.
 _SOFT1 = StageParameters(a=439.9, b=-17.4, d=0.979, g=112.6, r=_STAGE1.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.179)
 _SOFT2 = StageParameters(a=891.0, b=-142.0, d=4.46, g=288.0, r=_STAGE2.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.228)
-_MEASURED_ARM = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, reach=1.36, name="measured")
+_MEASURED_ARM = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, link_coupling_ratio=1.36, name="measured")
 #: Named parameter sets. "effective" has the manufacturer's effective parameters with fractional damping, friction,
 #: coupling and noise. "linear" has the same joints without coupling, friction, noise and quantization of the gauges.
 #: "measured" and "measured-lqr" are two units of the real arm, under partial-state feedback and under LQR. Torque

@@ -219,7 +219,7 @@ class QuanserBoard:
             hil.watchdog_set_digital_expiration_state(*DIGITAL_OUT, states)
             self._digital_safe = True
 
-    def unsafe(self) -> str | None:
+    def watchdog_problem(self) -> str | None:
         """Return an error message if an output has no safe state for a watchdog expiration; None if all have one."""
         return missing_expiration_state(analog=self._analog_safe, digital=self._digital_safe)
 
@@ -228,7 +228,7 @@ class QuanserBoard:
 
         Raise RigFault if expiration states are not set, and ModelError if the timeout is shorter than two samples.
         """
-        missing_state = self.unsafe()
+        missing_state = self.watchdog_problem()
         if missing_state is not None:
             raise RigFault(f"Q8-USB: {missing_state}")
         check_watchdog(self._rate, seconds)
@@ -265,7 +265,7 @@ class QuanserBoard:
         with self.gate.lock, self._translate_errors("writing"):
             self._run_unless_expired(lambda: self._write(volts), is_end=volts == (0.0, 0.0))
 
-    def rest(self, guard: _core.Guard, samples: int) -> None:
+    def read_rest(self, guard: _core.Guard, samples: int) -> None:
         """Read a number of samples with outputs at 0 V, over which `guard` averages the bias of the strain gauges."""
         for _ in range(samples):
             if self._read(guard) is None:

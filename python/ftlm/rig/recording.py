@@ -396,7 +396,7 @@ class Experiment:
         if self.offset is not None and not virtual:
             raise ModelError("offset applies only to the virtual arm; leave it out for a board")
         if virtual:
-            arm = ArmParameters.of(self.parameters)
+            arm = ArmParameters.load(self.parameters)
             if self.offset is not None:
                 try:
                     first, second = (float(v) for v in self.offset)

@@ -415,7 +415,7 @@ class Board(Protocol):
     def set_expiration(self) -> None:
         """Set the outputs that the board applies when its watchdog expires: 0 V, and disabled amplifiers."""
 
-    def unsafe(self) -> str | None:
+    def watchdog_problem(self) -> str | None:
         """Return an error message if an expired watchdog would not stop the motors; None if it would."""
 
     def start_watchdog(self, seconds: float) -> None:
@@ -430,7 +430,7 @@ class Board(Protocol):
     def write(self, volts: tuple[float, float]) -> None:
         """Write the command voltages of both motors [V]."""
 
-    def rest(self, guard: _core.Guard, samples: int) -> None:
+    def read_rest(self, guard: _core.Guard, samples: int) -> None:
         """Read a number of samples with outputs at 0 V, over which `guard` averages the bias of the strain gauges."""
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
@@ -588,14 +588,14 @@ class Rig:
             board.open()
             board.configure(self.rate)
             board.set_expiration()
-            missing_state = board.unsafe()
+            missing_state = board.watchdog_problem()
             if missing_state is not None:
                 raise RigFault(
                     f"{board.name}: {missing_state}; the motors are not started without a watchdog that stops them"
                 )
             board.start_watchdog(self.watchdog)
             board.start(self.rate)
-            board.rest(self.guard, max(2, round(REST_DURATION_S * self.rate)))
+            board.read_rest(self.guard, max(2, round(REST_DURATION_S * self.rate)))
             self._check()
             board.enable(True)
             return self

@@ -60,7 +60,7 @@ class VirtualBoard:
         Whether to run in real time instead of as fast as possible.
     horizon
         Maximum duration of a run [s], which determines how much memory the simulation allocates.
-    page
+    register_file
         File of the output registers, which the watchdog process shares; by default a temporary file.
     inject
         Faults to inject for tests, each as (name in FAULT_INJECTIONS, channel from 0, time [s], number). The number has
@@ -76,7 +76,7 @@ class VirtualBoard:
     seed: int = 0
     real_time: bool = False
     horizon: float = 30.0
-    page: str | os.PathLike[str] | None = None
+    register_file: str | os.PathLike[str] | None = None
     inject: tuple[tuple[str, int, float, float], ...] = ()
     name: str = "virtual rig"
     hardware: bool = False
@@ -104,7 +104,7 @@ class VirtualBoard:
         """Open the board by creating the file of the output registers; raise RigFault if it is already open."""
         if self._page is not None:
             raise RigFault("virtual rig: the board is open already; close it first")
-        self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)
+        self._page = watchdog.RegisterPage(self.register_file or watchdog.create_page_file(), create=True)
 
     def configure(self, rate: float) -> None:
         """Create the simulated arm with a sampling rate [Hz], and set the outputs to 0 V."""
@@ -123,7 +123,7 @@ class VirtualBoard:
         page.set("state2", 0.0)
         page.set("tristate", 1)
 
-    def unsafe(self) -> str | None:
+    def watchdog_problem(self) -> str | None:
         """Return an error message if an output has no safe state for a watchdog expiration; None if all have one."""
         page = self._access()
         zero = all(page.get(f"state{k}") == 0.0 for k in (1, 2))
@@ -136,7 +136,7 @@ class VirtualBoard:
             check_watchdog(self._rate, seconds)
         try:
             # The process is stored before it is ready, so that it can be ended after an interruption.
-            self._process = spawn_watchdog(page, keep=self.page is not None)
+            self._process = spawn_watchdog(page, keep=self.register_file is not None)
             wait_for_watchdog(self._process, page)
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
@@ -168,7 +168,7 @@ class VirtualBoard:
             else:
                 self._output_volts(*volts)
 
-    def rest(self, guard: _core.Guard, samples: int) -> None:
+    def read_rest(self, guard: _core.Guard, samples: int) -> None:
         """Simulate a number of samples with outputs at 0 V, over which `guard` averages the bias of the gauges."""
         self._require_arm().rest(guard, self._random.standard_normal((samples, 4)), self._output_volts)
 
@@ -220,7 +220,7 @@ class VirtualBoard:
             page, self._page = self._page, None
         if page is not None:
             page.close()
-            if self.page is None:
+            if self.register_file is None:
                 with contextlib.suppress(OSError):
                     page.path.unlink()
 
@@ -264,7 +264,7 @@ def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Pop
 
     Parameters
     ----------
-    page
+    register_file
         Output registers, which the process shares through their file.
     keep
         Whether the process keeps this file when it ends, instead of removing it.
@@ -294,7 +294,7 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
     ----------
     process
         Process from `spawn_watchdog`.
-    page
+    register_file
         Output registers that the process shares.
 
     Raises

@@ -286,7 +286,7 @@ class Store:
 
         def decode(result: Answer) -> Trial:
             trial = self._check_result_type(result, StoredTrial, "a validation").trial
-            fit = None if trial.failed is not None else joint
+            fit = None if trial.failure is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
         request = ("judge", structure, joint.names, joint.values, joint.initial, is_final)

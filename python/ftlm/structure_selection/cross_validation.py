@@ -261,7 +261,7 @@ class Trial:
         Description of the candidate.
     structure
         Structure of the candidate.
-    parameters
+    parameter_count
         Number of estimated parameters: orders, coefficients, input parameters, and an offset of each run.
     estimation
         Fit in percent on estimation data, by output.
@@ -274,13 +274,13 @@ class Trial:
     effective_bic
         Schwarz's criterion with an effective number of samples for correlated residuals, which decides. None until the
         autocorrelation of the best candidate's residuals is known.
-    values, errors
+    values, standard_errors
         Estimates and standard errors from all runs, by name.
     insignificant
         Names of coefficients whose 95 % interval contains 0.
     unstable
         Whether the model has a pole with a positive real part. The simulation may still be bounded within a run.
-    failed
+    failure
         Reason why the fit failed; None for a valid trial.
     joint
         Fit on all runs.
@@ -290,17 +290,17 @@ class Trial:
 
     name: str
     structure: Structure
-    parameters: int
+    parameter_count: int
     estimation: Mapping[str, float] = field(default_factory=dict)
     validation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     scores: tuple[float, ...] = ()
     bic: float | None = None
     effective_bic: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
-    errors: Mapping[str, float] = field(default_factory=dict)
+    standard_errors: Mapping[str, float] = field(default_factory=dict)
     insignificant: tuple[str, ...] = ()
     unstable: bool = False
-    failed: str | None = None
+    failure: str | None = None
     joint: JointFit | None = field(default=None, repr=False)
     refined: bool = False
 
@@ -316,19 +316,19 @@ class Trial:
         return float(np.mean(fits)) if fits else math.nan
 
     @property
-    def parts(self) -> dict[str, float]:
+    def fits_by_part(self) -> dict[str, float]:
         """Fit [%] on each part of the validation data (output of a run or block), in the sequence of `scores`."""
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
     def worst_fold(self) -> float:
         """Lowest fit in percent over all parts of the validation data; NaN without validation."""
-        return min(self.parts.values(), default=math.nan)
+        return min(self.fits_by_part.values(), default=math.nan)
 
     @property
-    def mean_relative_error(self) -> float:
+    def mean_log_relative_error(self) -> float:
         """Logarithm of the geometric mean of the parameters' relative standard errors; lower is better."""
-        relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
+        relative = [self.standard_errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
         return float(np.mean([math.log(min(max(r, 1e-12), 1e12)) for r in relative])) if relative else 0.0
 
     @property
@@ -438,7 +438,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
         validation,
         scores,
         values=start,
-        errors=joint.standard_errors,
+        standard_errors=joint.standard_errors,
         insignificant=insignificant_coefficients(joint),
         unstable=is_unstable,
         joint=joint,
@@ -507,7 +507,7 @@ def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
         trial,
         joint=joint,
         estimation=dict(estimation),
-        errors=joint.standard_errors,
+        standard_errors=joint.standard_errors,
         insignificant=insignificant_coefficients(joint),
         refined=True,
         values=joint.values_by_name,

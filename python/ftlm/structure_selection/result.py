@@ -36,7 +36,7 @@ class Selection(BestIdentification):
     trials
         Candidates, best prediction first. Candidates that fail on a part of the validation data that others predict
         follow, then unstable candidates, and then candidates without a fit.
-    chosen
+    chosen_index
         Index of the chosen candidate in `trials`.
     best
         Identification of the chosen structure on all runs.
@@ -44,22 +44,22 @@ class Selection(BestIdentification):
         Description of the validation as text.
     reason
         Reason for the choice.
-    fitted
+    fitted_count
         Total number of fitted candidates, of which only the most promising ones of each step are validated.
     findings
         Findings on the choice, and on separate validation runs.
-    validated
+    validation_comparison
         Comparison of the chosen model with separate validation runs; None if runs or blocks were left out in turn.
     """
 
     trials: tuple[Trial, ...]
-    chosen: int
+    chosen_index: int
     best: Identification
     validation: str
     reason: str
-    fitted: int
+    fitted_count: int
     findings: tuple[Finding, ...] = field(default=())
-    validated: Validation | None = None
+    validation_comparison: Validation | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -89,12 +89,12 @@ class Selection(BestIdentification):
     @property
     def verdict(self) -> Verdict:
         """Verdict on the model, with separate validation runs if there were any; see also :meth:`validate`."""
-        return self.best.verdict if self.validated is None else self.validated.verdict
+        return self.best.verdict if self.validation_comparison is None else self.validation_comparison.verdict
 
     @property
     def winner(self) -> Trial:
         """Trial of the chosen candidate."""
-        return self.trials[self.chosen]
+        return self.trials[self.chosen_index]
 
     @property
     def structure(self) -> Structure:
@@ -107,7 +107,7 @@ class Selection(BestIdentification):
         rows: list[list[Cell]] = [
             [
                 ("chosen: " if trial is self.winner else "") + trial.name + (UNSTABLE_NOTE if trial.unstable else ""),
-                trial.parameters,
+                trial.parameter_count,
                 trial.estimation_fit,
                 trial.validation_fit,
                 trial.worst_fold,
@@ -116,7 +116,7 @@ class Selection(BestIdentification):
                 ", ".join(trial.insignificant),
             ]
             for trial in self.trials
-            if trial.failed is None
+            if trial.failure is None
         ]
         columns = ("structure", "param.", "estimation", "validation", "worst fold", "all", "effective", "insignificant")
         candidates = Table(
@@ -129,7 +129,7 @@ class Selection(BestIdentification):
             "samples is that of the residuals. The choice uses BIC of effective samples, from the autocorrelation of "
             "the best residuals; the table has its excess over the lowest.",
         )
-        failed: list[list[Cell]] = [[t.name, t.failed] for t in self.trials if t.failed is not None]
+        failed: list[list[Cell]] = [[t.name, t.failure] for t in self.trials if t.failure is not None]
         if not failed:
             return [candidates]
         return [candidates, Table("Candidates without a fit", ("structure", "reason"), failed, wrap=True, stacked=True)]
@@ -137,15 +137,16 @@ class Selection(BestIdentification):
     def figure(self) -> LineChart:
         """Return a chart of the best fit over the number of parameters."""
         best_by_count: dict[int, Trial] = {}
-        for trial in (t for t in self.trials if t.failed is None):
-            if trial.parameters not in best_by_count or trial.score < best_by_count[trial.parameters].score:
-                best_by_count[trial.parameters] = trial
+        for trial in (t for t in self.trials if t.failure is None):
+            if trial.parameter_count not in best_by_count or trial.score < best_by_count[trial.parameter_count].score:
+                best_by_count[trial.parameter_count] = trial
         counts = sorted(best_by_count)
         estimation, validation_data = (
             [best_by_count[n].estimation_fit for n in counts],
             [max(best_by_count[n].validation_fit, MIN_FIT_PERCENT) for n in counts],
         )
-        choice = [v if n == self.winner.parameters else math.nan for n, v in zip(counts, validation_data, strict=True)]
+        winner_count = self.winner.parameter_count
+        choice = [v if n == winner_count else math.nan for n, v in zip(counts, validation_data, strict=True)]
         return LineChart(
             [float(n) for n in counts],
             [("estimation", estimation), ("validation", validation_data), ("chosen", choice)],
@@ -153,12 +154,12 @@ class Selection(BestIdentification):
             x_label="estimated parameters",
             y_label="fit in %",
             dots=("chosen",),
-            caption=f"The best candidate with each number of parameters; the chosen one has {self.winner.parameters}.",
+            caption=f"The best candidate with each number of parameters; the chosen one has {winner_count}.",
         )
 
     def report(self, path: str | os.PathLike[str], *, validation: Any = None, force: bool = False) -> Path:
         """Write the choice and the model to an HTML file, as :meth:`ftlm.Identification.report` does."""
-        counts = f"Validation data: {self.validation}. {self.fitted} candidates fitted."
+        counts = f"Validation data: {self.validation}. {self.fitted_count} candidates fitted."
         choice = Section(
             "The choice",
             paragraphs=[self.reason, counts],
@@ -171,7 +172,7 @@ class Selection(BestIdentification):
             sections=[choice],
             choice_findings=self.findings,
             validation=validation,
-            validated=self.validated,
+            validated=self.validation_comparison,
             force=force,
         )
 
@@ -181,14 +182,14 @@ class Selection(BestIdentification):
             {
                 "rank": k + 1,
                 "structure": t.name,
-                "parameters": t.parameters,
+                "parameter_count": t.parameter_count,
                 "estimation_fit": t.estimation_fit,
                 "validation_fit": t.validation_fit,
                 "worst_fold": t.worst_fold,
                 "score": t.score,
                 "bic": math.nan if t.bic is None else t.bic,
-                "chosen": k == self.chosen,
-                "failed": t.failed or "",
+                "chosen": k == self.chosen_index,
+                "failure": t.failure or "",
             }
             for k, t in enumerate(self.trials)
         ]
@@ -202,12 +203,12 @@ class Selection(BestIdentification):
         """Return the candidates and the choice as a dictionary for JSON, without the identification."""
         return {
             "chosen": self.winner.name,
-            **attributes(self, ("reason", "validation", "fitted")),
+            **attributes(self, ("reason", "validation", "fitted_count")),
             "candidates": [
                 {
                     "structure": t.name,
-                    **attributes(t, ("parameters", "estimation", "validation", "score", "bic", "values")),
-                    "standard_errors": json_value(t.errors),
+                    **attributes(t, ("parameter_count", "estimation", "validation", "score", "bic", "values")),
+                    "standard_errors": json_value(t.standard_errors),
                     **attributes(t, ("insignificant", "unstable", "failed")),
                 }
                 for t in self.trials
@@ -216,16 +217,16 @@ class Selection(BestIdentification):
         }
 
     def __str__(self) -> str:
-        return f"{self.best.summary(self.validated)}\n\n{self.ranking_text()}"
+        return f"{self.best.summary(self.validation_comparison)}\n\n{self.ranking_text()}"
 
     def ranking_text(self) -> str:
         """Return the table of the candidates and the reason for the choice, as text."""
-        lines = [f"{len(self.trials)} of {self.fitted} fitted candidates validated: {self.validation}"]
+        lines = [f"{len(self.trials)} of {self.fitted_count} fitted candidates validated: {self.validation}"]
         lines.append(f"{'':2}{'valid. %':>9}{'worst %':>9}{'estim. %':>10}{'param.':>9}  structure")
         for index, trial in enumerate(self.trials[:MAX_PRINTED_ROWS]):
-            prefix = "> " if index == self.chosen else "  "
+            prefix = "> " if index == self.chosen_index else "  "
             lines += _row_lines(prefix, trial)
-        if self.chosen >= MAX_PRINTED_ROWS:
+        if self.chosen_index >= MAX_PRINTED_ROWS:
             lines += _row_lines("> ", self.winner)
         if len(self.trials) > MAX_PRINTED_ROWS:
             lines.append(f"  … and {len(self.trials) - MAX_PRINTED_ROWS} more")
@@ -235,10 +236,10 @@ class Selection(BestIdentification):
 def _row_lines(prefix: str, trial: Trial) -> list[str]:
     """Return the text lines of a candidate in the ranking: its fits, and its structure in as many lines as it takes."""
     fits = trial.validation_fit, trial.worst_fold, trial.estimation_fit
-    validation, worst_fold, estimation = ("-" if trial.failed is not None else format_fit(fit) for fit in fits)
-    row_start = f"{prefix}{validation:>9}{worst_fold:>9}{estimation:>10}{trial.parameters:>9}  "
+    validation, worst_fold, estimation = ("-" if trial.failure is not None else format_fit(fit) for fit in fits)
+    row_start = f"{prefix}{validation:>9}{worst_fold:>9}{estimation:>10}{trial.parameter_count:>9}  "
     lines = wrap_text(trial.name + (UNSTABLE_NOTE if trial.unstable else ""), row_start, " " * len(row_start))
-    return lines if trial.failed is None else lines + wrap_text(trial.failed, " " * len(row_start))
+    return lines if trial.failure is None else lines + wrap_text(trial.failure, " " * len(row_start))
 
 
 def format_fit(fit: float) -> str:

@@ -251,7 +251,7 @@ def _run_selection(
     """
     if problems_by_output:
         selection = _select_automatically(work, problems_by_output)
-        winner = selection.trials[selection.chosen]
+        winner = selection.trials[selection.chosen_index]
         poor = winner.unstable or winner.validation_fit < MIN_VALIDATION_FIT
         duration = _piece_duration(problems_by_output) if poor and not work.folds.unseen_runs else None
         if duration is None:
@@ -259,7 +259,7 @@ def _run_selection(
         folds = Folds.of_pieces(work.folds.runs, duration)
         problems = [replace(p, runs=folds.runs, initial="caputo") for p in problems_by_output]
         split = _select_automatically(replace(work, folds=folds, trials=[]), problems)
-        return split if split.trials[split.chosen].validation_fit > winner.validation_fit else selection
+        return split if split.trials[split.chosen_index].validation_fit > winner.validation_fit else selection
     for structure in searched:
         StepwiseSelection(NestedStructures(structure), work).run()
     if listed:
@@ -306,7 +306,7 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
     """
     fits = [t for t in work.trials if t.joint is not None]
     if not fits:
-        reason = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
+        reason = next((f"; {t.name}: {t.failure}" for t in work.trials), "")
         raise ConvergenceError(
             f"no candidate can be fitted to {work.folds.description}; give simpler candidates or longer runs{reason}"
         )
@@ -359,8 +359,8 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
             " The outputs do not have the same delay, and an input has one: the equations have no free delay. Select "
             "each output on its own for its delay."
         )
-    if trial.failed is not None:
-        raise ConvergenceError(f"{trial.name} cannot be fitted to {work.folds.description}; {trial.failed}")
+    if trial.failure is not None:
+        raise ConvergenceError(f"{trial.name} cannot be fitted to {work.folds.description}; {trial.failure}")
     return Choice((trial, *(t for c in choices for t in c.ranked)), trial, reason, tuple(choices))
 
 
@@ -371,7 +371,7 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
         concerned = [w for w in winners if signal in w.structure.signals]
         if any(name not in w.values for w in concerned):
             return False
-        values, errors = np.array([(w.values[name], w.errors[name]) for w in concerned]).T
+        values, errors = np.array([(w.values[name], w.standard_errors[name]) for w in concerned]).T
         if np.any(np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)):
             return False
     return True
@@ -379,7 +379,7 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
 
 def _without_free_delays(choice: Choice) -> Choice:
     """Return the choice among candidates without free delays, or the same choice if there are none."""
-    ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_input_parameters]
+    ranked = [t for t in choice.ranked if t.failure is None and not t.structure.free_input_parameters]
     if not choice.winner.structure.free_input_parameters or not ranked:
         return choice
     close = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], ranked[0])]
@@ -403,7 +403,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < MIN_VALIDATION_FIT:
         findings.append(make_finding("no_candidate_fits", fit=format_fit(winner.validation_fit)))
-    poor_parts = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
+    poor_parts = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.fits_by_part.items() if not fit > 0.0]
     if poor_parts:
         findings.append(make_finding("worse_than_mean", parts=", ".join(poor_parts)))
     for single_choice in choice.parts or (choice,):
@@ -448,11 +448,11 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
         return []
     orders_text = ", ".join(f"{n} = {result.orders[n]:.3g}" for n in orders)
-    integer_trial = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
-    if integer_trial is None or set(integer_trial.parts) != set(winner.parts):
+    integer_trial = next((t for t in ranked if t.failure is None and not has_memory(t.structure)), None)
+    if integer_trial is None or set(integer_trial.fits_by_part) != set(winner.fits_by_part):
         reason = "no candidate with integer orders was fitted"
         return [make_finding("fractional_orders_inconclusive", parameter=orders_text, reason=reason)]
-    gains = [fit - integer_trial.parts[name] for name, fit in winner.parts.items()]
+    gains = [fit - integer_trial.fits_by_part[name] for name, fit in winner.fits_by_part.items()]
     parts = f"{len(gains)} part{'s' if len(gains) > 1 else ''}"
     details = {"parameter": orders_text, "other": integer_trial.name, "parts": parts, "gain": median(gains)}
     if is_degenerate(result) or integer_trial.unstable or not integer_trial.validation_fit >= MIN_VALIDATION_FIT:
@@ -476,7 +476,7 @@ def _failed_parts(trials: Sequence[Trial]) -> list[list[str]]:
 
     A trial fails on a part if its prediction is poor while a stable trial predicts this part far better.
     """
-    scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in trials]
+    scores_by_part = [dict(zip(t.fits_by_part, t.scores, strict=False)) for t in trials]
     lowest_scores: dict[str, float] = {}
     for scores in (part for part, t in zip(scores_by_part, trials, strict=True) if not t.unstable):
         for name, score in scores.items():
@@ -494,7 +494,7 @@ def _rank_trials(trials: Sequence[Trial]) -> list[Trial]:
     """
     failures = dict(zip(map(id, trials), map(len, _failed_parts(trials)), strict=True))
     return sorted(
-        trials, key=lambda t: (t.failed is not None, t.unstable, failures[id(t)], t.score, t.parameters, t.name)
+        trials, key=lambda t: (t.failure is not None, t.unstable, failures[id(t)], t.score, t.parameter_count, t.name)
     )
 
 
@@ -504,7 +504,7 @@ def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
     return [
         k
         for k, t in enumerate(ranked)
-        if t.failed is None and t.unstable == best.unstable and failures[k] <= failures[0]
+        if t.failure is None and t.unstable == best.unstable and failures[k] <= failures[0]
     ]
 
 
@@ -572,7 +572,9 @@ def _winner(close: Sequence[Trial]) -> Trial:
     """
     lowest_bic = min(_bic(t) for t in close)
     equivalent = [t for t in close if _bic(t) <= lowest_bic + BIC_TOLERANCE]
-    return min(equivalent, key=lambda t: (t.parameters, _total_integer_order(t), t.score, t.mean_relative_error))
+    return min(
+        equivalent, key=lambda t: (t.parameter_count, _total_integer_order(t), t.score, t.mean_log_relative_error)
+    )
 
 
 def _total_integer_order(trial: Trial) -> int:
@@ -597,22 +599,21 @@ def _with_validated_initial_conditions(trial: Trial) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Return the reason for the choice of the winner as text."""
-    text = (
-        f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)."
-    )
+    validation_fit = format_fit(winner.validation_fit)
+    text = f"Chosen: {winner.name} ({winner.parameter_count} parameters, validation fit {validation_fit} %)."
     if winner is best:
         text += " It predicts best."
     else:
         text += " Of the candidates that predict as well as the best, it has the lowest Schwarz criterion."
     peers = [ranked[k] for k in _peer_indices(ranked)]
-    smaller_models = [t for t in peers if t.parameters < winner.parameters]
-    larger_models = [t for t in peers if t.parameters > winner.parameters]
+    smaller_models = [t for t in peers if t.parameter_count < winner.parameter_count]
+    larger_models = [t for t in peers if t.parameter_count > winner.parameter_count]
     for compared in filter(None, (smaller_models, larger_models)):
         closest = min(compared, key=lambda t: t.score)
         change = 100 * (math.exp(closest.score - winner.score) - 1)
         comparison = "larger" if change >= 0 else "smaller"
         text += (
-            f" With {closest.parameters} parameters, validation residuals are {float(f'{abs(change):.2g}'):g} % "
+            f" With {closest.parameter_count} parameters, validation residuals are {float(f'{abs(change):.2g}'):g} % "
             f"{comparison}."
         )
     return text + _failure_text(winner, ranked)
@@ -629,13 +630,15 @@ def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
         text += (
             f" {alternative.name} has {excess_percent:.2g} % smaller residuals on average and is not chosen: it "
             f"fails on {name}, with "
-            f"a fit of {format_fit(alternative.parts[name])} % where the chosen one has "
-            f"{format_fit(winner.parts[name])} %."
+            f"a fit of {format_fit(alternative.fits_by_part[name])} % where the chosen one has "
+            f"{format_fit(winner.fits_by_part[name])} %."
         )
     for name in failures[id(winner)]:
-        alternative = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
+        alternative = max(
+            (t for t in ranked if name in t.fits_by_part and not t.unstable), key=lambda t: t.fits_by_part[name]
+        )
         text += (
-            f" It fails on {name}, with a fit of {format_fit(winner.parts[name])} %; {alternative.name} has "
-            f"{format_fit(alternative.parts[name])} % there, but fails elsewhere."
+            f" It fails on {name}, with a fit of {format_fit(winner.fits_by_part[name])} %; {alternative.name} has "
+            f"{format_fit(alternative.fits_by_part[name])} % there, but fails elsewhere."
         )
     return text

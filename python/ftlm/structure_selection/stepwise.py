@@ -172,13 +172,13 @@ class CandidateEvaluator:
     ) -> Trial:
         """Return the trial of a fitted candidate on validation data; a failed fit gives a failed trial."""
         if isinstance(joint, FtlmError):
-            return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
+            return Trial(name, structure, len(FreeProblem.of(structure).names), failure=str(joint))
 
         def compute() -> Trial:
             try:
                 return validate_fit(name, structure, self.folds, joint, is_final=is_final)
             except FtlmError as error:
-                return Trial(name, structure, parameter_count(structure, joint, self.folds), failed=str(error))
+                return Trial(name, structure, parameter_count(structure, joint, self.folds), failure=str(error))
 
         return compute() if self.store is None else self.store.validation(name, structure, joint, is_final, compute)
 

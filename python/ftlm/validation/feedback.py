@@ -81,13 +81,13 @@ class FeedbackTest:
     ratio
         Largest test statistic over all sets of regressors, divided by its limit. In open loop, the probability that the
         ratio exceeds 1 is about 0.5 %.
-    share
+    explained_fraction
         Fraction of the variance of the input innovation that past outputs explain.
-    rows
+    samples
         Number of samples that were tested.
     bias
         Maximum bias that the feedback causes in a parameter, in standard errors of the parameter; None if unknown.
-    same_row
+    same_sample_correlation
         Correlation between the innovations of input and output in the same sample, divided by its 99.5 % limit, with
         its sign. Feedback without delay and direct feedthrough both cause it.
     response
@@ -98,10 +98,10 @@ class FeedbackTest:
     state: FeedbackState
     reason: str = ""
     ratio: float = 0.0
-    share: float = 0.0
-    rows: int = 0
+    explained_fraction: float = 0.0
+    samples: int = 0
     bias: float | None = None
-    same_row: float = 0.0
+    same_sample_correlation: float = 0.0
     response: tuple[Floats, ...] = field(default=(), repr=False, compare=False)
 
     @property
@@ -115,11 +115,11 @@ class FeedbackTest:
         The sign of the correlation is opposite to that of the static `gain` of the plant. A missing direct feedthrough
         gives the same sign.
         """
-        return self.state == "undecided" and self.same_row * math.copysign(1.0, gain) < -1.0
+        return self.state == "undecided" and self.same_sample_correlation * math.copysign(1.0, gain) < -1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary for JSON."""
-        return attributes(self, ("state", "reason", "has_feedback", "ratio", "share", "rows", "bias"))
+        return attributes(self, ("state", "reason", "has_feedback", "ratio", "explained_fraction", "samples", "bias"))
 
 
 def feedback_test(
@@ -154,20 +154,22 @@ def feedback_test(
     changes = [np.flatnonzero(np.diff(u)) + 1 for u in inputs]
     levels = np.unique(np.concatenate(inputs)).size
     if all(_is_periodic(u) for u in inputs):
-        return FeedbackTest("command", "it repeats itself exactly", rows=longest)
+        return FeedbackTest("command", "it repeats itself exactly", samples=longest)
     if levels <= max(MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_FRACTION * longest):
         if _has_common_change_interval(changes):
-            return FeedbackTest("command", f"{levels} levels on a clock", rows=longest)
-        return FeedbackTest("undecided", f"{levels} levels: a relay and a command are indistinguishable", rows=longest)
+            return FeedbackTest("command", f"{levels} levels on a clock", samples=longest)
+        return FeedbackTest(
+            "undecided", f"{levels} levels: a relay and a command are indistinguishable", samples=longest
+        )
     count = sum(c.size for c in changes)
     dense = 2 * count >= longest
     if not dense and count < MIN_CHANGES:
-        return FeedbackTest("undecided", f"{count} changes; {MIN_CHANGES} are needed", rows=longest)
+        return FeedbackTest("undecided", f"{count} changes; {MIN_CHANGES} are needed", samples=longest)
     if not dense:
         # Between its changes a held input has no innovation. The residual before a change is known at the change.
         rows_by_run = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
         if not rows_by_run:
-            return FeedbackTest("undecided", f"{count} changes over {len(runs)} short runs", rows=longest)
+            return FeedbackTest("undecided", f"{count} changes over {len(runs)} short runs", samples=longest)
         runs, inputs, changes = (
             [runs[k] for k in rows_by_run],
             [inputs[k] for k in rows_by_run],
@@ -453,7 +455,7 @@ class _Innovations:
         clipped = np.clip(self.innovation / max(self.scale, 1e-300), -INPUT_CLIP, INPUT_CLIP)
         clipped = clipped - clipped.mean()
         if robust_deviation(self.same_row_output) < QUIET_FRACTION:
-            return FeedbackTest("none", "the output has no noise that could come back", rows=count)
+            return FeedbackTest("none", "the output has no noise that could come back", samples=count)
         signed = self._same_sample_ratio(clipped)
         same_row_ratio = abs(signed)
         same_row_text = (
@@ -462,8 +464,8 @@ class _Innovations:
         )
         if self.scale < PREDICTED_FRACTION or self.noise < QUIET_FRACTION:
             if same_row_ratio > 1:
-                return FeedbackTest("undecided", same_row_text, rows=count, same_row=signed)
-            return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
+                return FeedbackTest("undecided", same_row_text, samples=count, same_sample_correlation=signed)
+            return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", samples=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
         fit = columns @ minimum_norm_solution(columns, target, 1e-12)
@@ -471,7 +473,9 @@ class _Innovations:
 
         def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
             response = self._response(columns, rows) if state == "found" else ()
-            return FeedbackTest(state, reason, ratio, power_fraction, count, same_row=signed, response=response)
+            return FeedbackTest(
+                state, reason, ratio, power_fraction, count, same_sample_correlation=signed, response=response
+            )
 
         # Without feedback, past outputs cannot explain most of the innovation of a rough input.
         if power_fraction >= CERTAIN_FRACTION and self.scale >= ROUGH_FRACTION and ratio >= CERTAIN_RATIO:

@@ -22,9 +22,9 @@ class InformationCriteria:
 
     Parameters
     ----------
-    parameters
+    parameter_count
         Number of estimated parameters: orders, coefficients, initial terms, and one noise level per output.
-    samples
+    sample_count
         Number of residuals over all outputs and runs.
     log_likelihood
         Log likelihood of the residuals as white normal noise.
@@ -33,8 +33,8 @@ class InformationCriteria:
         criterion.
     """
 
-    parameters: int
-    samples: int
+    parameter_count: int
+    sample_count: int
     log_likelihood: float
     aic: float
     aicc: float
@@ -42,24 +42,24 @@ class InformationCriteria:
 
     def to_dict(self) -> dict[str, float | int | None]:
         """Return the criteria as a dictionary for JSON."""
-        return attributes(self, ("parameters", "samples", "log_likelihood", "aic", "aicc", "bic"))
+        return attributes(self, ("parameter_count", "sample_count", "log_likelihood", "aic", "aicc", "bic"))
 
     def __str__(self) -> str:
         return (
             f"AIC {self.aic:.6g}, AICc {self.aicc:.6g}, BIC {self.bic:.6g} "
-            f"({self.parameters} parameters, noise levels included, estimated from {self.samples} samples)"
+            f"({self.parameter_count} parameters, noise levels included, estimated from {self.sample_count} samples)"
         )
 
 
 @check_arguments
-def information_criteria(tests: Residuals, parameters: int) -> InformationCriteria:
+def information_criteria(tests: Residuals, parameter_count: int) -> InformationCriteria:
     """Return AIC, AICc and BIC of a model from its residuals; free orders count like coefficients.
 
     Parameters
     ----------
     tests
         Result of :func:`ftlm.resid` on the runs that the model was identified from.
-    parameters
+    parameter_count
         Number of free orders and free coefficients. The function adds initial terms and noise levels.
 
     Returns
@@ -77,7 +77,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     -----
     AIC: doi:10.1109/TAC.1974.1100705. AICc: doi:10.1093/biomet/76.2.297. BIC: doi:10.1214/aos/1176344136.
     """
-    count = check_integer("parameters", parameters, 0)
+    count = check_integer("parameter_count", parameter_count, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = count + tests.initial_terms + len(tests.outputs)
@@ -114,7 +114,7 @@ def information_table(information: InformationCriteria) -> Table:
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Only differences matter, so all digits before the decimal point are shown.
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
-    rows += [["parameters", information.parameters], ["samples", information.samples]]
+    rows += [["parameters", information.parameter_count], ["samples", information.sample_count]]
     note = (
         "Lower is better, among models of the same outputs on the same runs. The parameters include orders, "
         "coefficients, initial terms and one noise standard deviation for each output."

@@ -74,7 +74,7 @@ class CorrelationTest:
     conclusive
         Whether the test can fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant.
         The test then neither passes nor fails.
-    first
+    first_lag
         Smallest tested lag of an independence test: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
     """
 
@@ -85,7 +85,7 @@ class CorrelationTest:
     limit: float
     passed: bool
     conclusive: bool = True
-    first: int = 0
+    first_lag: int = 0
 
     @property
     def failed(self) -> bool:
@@ -98,14 +98,14 @@ class CorrelationTest:
         return "undecided" if not self.conclusive else "passed" if self.passed else "failed"
 
     @property
-    def outside(self) -> int:
+    def outside_count(self) -> int:
         """Number of correlations outside the band, without lag 0 of an autocorrelation; 1 % are expected."""
         return int(np.sum((np.abs(self.values) > self.band) & (self.values != 1.0)))
 
     @property
-    def largest(self) -> tuple[int, float]:
+    def largest_correlation(self) -> tuple[int, float]:
         """Lag and value of the largest correlation among the tested lags."""
-        magnitudes = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
+        magnitudes = np.where((self.lags >= self.first_lag) & (self.values != 1.0), np.abs(self.values), -1.0)
         at = int(np.argmax(magnitudes))
         return int(self.lags[at]), float(self.values[at])
 
@@ -277,7 +277,7 @@ class Residuals:
             f"{'correlation of':<{width}}{'largest':>10}{'at lag':>8}{'band':>10}{'statistic':>12}{'limit':>10}",
         ]
         for label, test in tests:
-            lag, value = test.largest
+            lag, value = test.largest_correlation
             lines.append(
                 f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
                 f"   {test.verdict}"
@@ -492,7 +492,7 @@ def _test_beyond_parameters(
     def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
         noise = NoiseModel.fit(output.residuals, signal, lags)
         residuals = noise.subtract(output.residuals, sensitivities)
-        repeated_test = _independence(residuals, signal, noise, lags, first_lag=test.first)
+        repeated_test = _independence(residuals, signal, noise, lags, first_lag=test.first_lag)
         return repeated_test if repeated_test.passed else test
 
     inputs = {name: repeat(test, signals[name]) if test.failed else test for name, test in output.inputs.items()}
@@ -648,20 +648,20 @@ def failed_tests(tests: Residuals) -> list[Finding]:
                 code, details = "color_undecided" if output.is_undecided else "noise_coloured", {}
             findings.append(make_finding(code, output=name, **details))
         for signal, test in output.informative_tests.items():
-            lag, value = test.largest
+            lag, value = test.largest_correlation
             if not test.conclusive:
                 code = "residual_test_input_constant" if math.isnan(test.limit) else "residual_test_inconclusive"
                 findings.append(make_finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
                 details = {"value": value, "lag": lag, "limit": test.limit}
                 findings.append(make_finding("residuals_follow_input", output=name, input=signal, **details))
-            elif test.first:
+            elif test.first_lag:
                 value_at_lag_0 = test.values[test.lags == 0]
                 findings.append(
                     make_finding("moves_within_row", output=name, input=signal, value=float(value_at_lag_0[0]))
                 )
         if output.follows_direction and output.direction is not None:
-            details = {"value": output.direction.largest[1], "limit": output.direction.limit}
+            details = {"value": output.direction.largest_correlation[1], "limit": output.direction.limit}
             term = friction_term(name, "fc", output.sign_slope)
             findings.append(make_finding("residuals_follow_direction", output=name, term=term, **details))
         findings += [feedback_finding(name, signal, output) for signal in output.feedback]
@@ -671,7 +671,7 @@ def failed_tests(tests: Residuals) -> list[Finding]:
 def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
     """Return a finding on detected feedback, with its effect on the estimates."""
     test = output.feedback_tests[signal]
-    details = {"ratio": test.ratio, "share": 100 * test.share}
+    details = {"ratio": test.ratio, "share": 100 * test.explained_fraction}
     if test.bias is None:
         # Without a joint fit the bias is not known. Feedback of white noise hardly biases output-error estimates.
         code = "loop_harmless" if output.whiteness.passed else "loop_found"
