@@ -222,8 +222,8 @@ class ArmParameters:
         if not 1.0 + hub * base_coefficient + arm * link_coefficient > 0.0:
             raise ModelError(
                 f"inertia_ratio = {self.inertia_ratio:g} and link_coupling_ratio = {self.link_coupling_ratio:g} give "
-                "joint 2 more inertia than link 1 carries, so that the kinetic energy of the arm is not positive definite; "
-                "make them smaller"
+                "joint 2 more inertia than link 1 carries, so that the kinetic energy of the arm is not positive "
+                "definite; make them smaller"
             )
         return {
             "p2": -hub - arm,
