@@ -224,7 +224,7 @@ ONE_AND_BOTH = (("psf",), ("lqr",), ("psf", "lqr"))
 
 
 def measurements() -> Iterator[str]:
-    """Physics piece by piece, whole orders; the run that was not fitted to in bold."""
+    """Physics piece by piece, integer orders; the run that was not fitted to in bold."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     yield "| output | physics | fitted on | psf, lqr | numbers | time |"
     yield "| --- | --- | --- | --- | --- | --- |"
@@ -254,7 +254,7 @@ def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
 
 
 #: Equations whose gauges are compared: what the hubs' motion drives, in which the own gauge's gain stands, and what
-#: the other gauge read, in which the ratio of both stands. Signals, whole orders, coefficients; -1 where there is none.
+#: the other gauge read, in which the ratio of both stands. Signals, integer orders, coefficients; -1 if there is none.
 GAUGES = {
     "theta12": (
         [("theta11", 2, ""), ("theta21", 2, "p"), ("theta21", 0, "s"), ("theta11", 0, "r")],

@@ -90,7 +90,7 @@ class Late:
 
 
 class Lqr:
-    """State feedback on the maker's model of whole orders, rates by filtered differences; weights are ours."""
+    """State feedback on the maker's model of integer orders, rates by filtered differences; weights are ours."""
 
     def __init__(self):
         arm = rig.ArmParameters.load("effective").stage1

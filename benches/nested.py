@@ -39,7 +39,7 @@ LINK_TERMS = {
     "a spring-pot": ("D^2 {y} = d D {y} + a D^beta {y} + b D^gamma {u}", {}),
     "and a fractional damper": ("D^2 {y} = d D {y} + a D^beta {y} + e D^nu {y} + b D^gamma {u}", {}),
 }
-#: One input: whole orders, then the output's, then a term's, then a term more.
+#: One input: integer orders, then the output's, then a term's, then a term more.
 ORDERS = {
     "whole": ("D^2 {y} = d D {y} + a {y} + b {u}", {}),
     "alpha": ("D^alpha {y} = d D {y} + a {y} + b {u}", {}),

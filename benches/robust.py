@@ -1,7 +1,7 @@
 """What real records have, measured: coverage of 95 % intervals, or the warning that names the cause.
 
 ``python benches/robust.py [CASE …] [--seeds 30] [--plants whole,fractional] [--write]`` prints a table; ``--write``
-writes it to benches/results.json. Two plants, all orders free: a resonance of whole orders by SciPy's `lsim`, and
+writes it to benches/results.json. Two plants, all orders free: a resonance of integer orders by SciPy's `lsim`, and
 D^0.8 y = -1.5 y + 1.5 u by Grünwald and Letnikov's sum on a grid 64 times finer than the samples, extrapolated.
 """
 

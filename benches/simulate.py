@@ -1,5 +1,5 @@
-"""What a free run on a run's own samples costs, in transforms of 4096, beside SciPy's lsim for whole orders; and what a
-default identification of a long run spends outside its fit.
+"""What a free run on a run's own samples costs, in transforms of 4096, beside SciPy's lsim for integer orders; and what
+a default identification of a long run spends outside its fit.
 
     python benches/simulate.py runs [--write]
     python benches/simulate.py outside 50000 [--write]

@@ -47,7 +47,7 @@ CHECKPOINT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
 
 def structures():
-    """Three models of a stage: the arm's law with free orders and with whole ones, and whole orders without any law."""
+    """Three models of a stage: the arm's law with free orders, with integer orders, and integer orders without a law."""
     law = ftlm.flexible_link(stage=1, sensor_filter="stock", offset="constant", friction=True)
     free = ftlm.equation(
         "D^2 theta11 = k theta12 + e D theta12 + b D theta11 + g I1; "
@@ -137,7 +137,7 @@ def of_seed(seed):
 
 
 def contenders(seed):
-    """Designs on models of a seed's run, by name: on the fractional one, and on the best of whole orders."""
+    """Designs on models of a seed's run, by name: on the fractional one, and on the best of integer orders."""
     run = moves.own_run(seed)
     models = {kind: identified(run, structure) for kind, structure in structures().items() if kind != "integer"}
     fractional, whole = models["fractional"], models["integer, no law"]
@@ -148,7 +148,7 @@ def contenders(seed):
         "fractional PID, 12 rad/s": slow,
         "LQG": designed("lqg", fractional, SAMPLES)[0],
         "LQG, ten times the deviations": control.lqg(fractional, input="I1", samples=SAMPLES, **calm),
-        "LQG of whole orders": designed("lqg", whole, 0)[0],
+        "LQG of integer orders": designed("lqg", whole, 0)[0],
     }
 
 

@@ -30,7 +30,7 @@ ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "
 #: Deflections of psf are zeroed before.
 FIRST = {"psf": 1.1, "lqr": 0.0}
 THIN = 4
-#: Links of whole orders; their hub's own acceleration is known, stages push on each other as the energies say.
+#: Links of integer orders; their hub's own acceleration is known, stages push on each other as the energies say.
 LINKS = {
     1: "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 second",
     2: "D^2 theta22 = a theta22 + d D theta22 - D^2 theta21 + p D^2 tip",

@@ -186,14 +186,14 @@ def phases() -> Figure:
     design = control.fractional_pid(hub, crossover=40.0, phase_margin=60.0)
     w = np.geomspace(8.0, 200.0, 300)
     plant = design.plants[0].response(w)
-    # As many gains, and all that whole orders have left: the same crossover and margin, an integral of the same size.
+    # As many gains, and all that integer orders have left: the same crossover and margin, an integral of the same size.
     at = design.plants[0].response(np.array([40.0]))[0]
     wanted = np.exp(1j * np.radians(-120.0)) / at
     slow = design.pid.ki * 40.0 ** (1.0 - design.pid.lam)
     whole = control.FractionalPid(float(wanted.real), slow, float(wanted.imag + slow / 40.0) / 40.0, 1.0, 1.0)
     figure = Figure(figsize=(7, 3.2), layout="constrained")
     plot = figure.add_subplot(xlabel="frequency [rad/s]", ylabel="phase of the open loop [degrees]", xscale="log")
-    for name, pid, style in (("fractional PID", design.pid, "C0"), ("PID of whole orders", whole, "C1")):
+    for name, pid, style in (("fractional PID", design.pid, "C0"), ("PID of integer orders", whole, "C1")):
         loop = pid.response(w) * plant
         plot.plot(w, np.degrees(np.unwrap(np.angle(loop))), style, linewidth=1.2, label=name)
         for factor in (0.7, 1.0, 1.4):

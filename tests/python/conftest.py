@@ -182,5 +182,5 @@ def small_run(small_model):
 def reproduction():
     """The paper's section 5 on a coarse lattice, with few evaluations of the other optimizers and two arms."""
     return ftlm.reproduce(
-        increment=0.25, genetic=ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800), arms=["whole orders"], records=1
+        increment=0.25, genetic=ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800), arms=["integer orders"], records=1
     )

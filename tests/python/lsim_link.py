@@ -1,4 +1,4 @@
-"""A link's equation with whole orders by SciPy alone: free runs of its filtered deflection, linear numbers projected.
+"""A link's equation with integer orders by SciPy alone: free runs of its filtered deflection, linear numbers projected.
 
 D^2 y = a y + d D y + sum of c_k D^m_k s_k, compared behind the filter that y passed. Shares no code with ftlm.
 """

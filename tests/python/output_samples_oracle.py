@@ -239,7 +239,7 @@ def _samples_from_pulses(
         for term in item.terms:
             if abs(term.order.constant - item.order.constant) > ORDER_TOLERANCE:
                 continue
-            factor = float(term.fixed or 0.0)
+            factor = float(term.fixed_value or 0.0)
             if coupled and term.signal in names:
                 system[i, names.index(term.signal)] -= factor
             elif run is not None:
@@ -295,7 +295,7 @@ def _early_response(model: Model, run: Run, rec: TransientRecord, every: int) ->
     direct: tuple[Floats, dict[str, Floats]] = (np.eye(count), {})
     for i, item in enumerate(model.equations):
         for term in item.terms:
-            name, factor = term.signal, float(term.fixed or 0.0)
+            name, factor = term.signal, float(term.fixed_value or 0.0)
             eta = item.order.constant - term.order.constant
             own = name == item.output or (coupled and name in names)
             if not own and (name not in run or (rec.sensor is not None and not structure.is_filtered(name))):
@@ -355,7 +355,7 @@ def _kink_correction(model: Model, run: Run | None, at: SampleTimes, terms: Term
                     continue
                 correction = at.jump_correction(term.signal, order)
                 if correction is not None:
-                    out[i] += math.prod(float(t.fixed or 0.0) for t in path) * correction
+                    out[i] += math.prod(float(t.fixed_value or 0.0) for t in path) * correction
     return out
 
 

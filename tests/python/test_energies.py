@@ -69,7 +69,7 @@ def test_energies_and_forces_are_the_paper_s():
     assert alike(found.hub_force, LINK.torque_constant * run["I1"] - LINK.hub_friction * hub)
     assert alike(found.link_force, -LINK.link_friction * bend)
     assert np.array_equal(found.lagrangian, found.kinetic - found.potential)
-    # With whole orders what inertia takes is the kinetic energy, and the link gives back all that it took.
+    # With integer orders what inertia takes is the kinetic energy, and the link gives back all that it took.
     assert alike(integrated(found.inertia, run.step), found.kinetic)
     assert alike(found.elastic.stored, found.potential)
     assert not found.elastic.dissipated.any()

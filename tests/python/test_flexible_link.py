@@ -292,7 +292,7 @@ def test_models_of_other_parameters_orders_and_coefficients():
 
 
 def test_derived_manual_model_is_the_published_one():
-    # With whole orders the current is not differentiated.
+    # With integer orders the current is not differentiated.
     published, derived = (ftlm.link_model(stage=1, input_order=kind) for kind in ("published", "derived"))
     assert [e.terms for e in derived.equations] == [e.terms for e in published.equations]
 

@@ -82,7 +82,7 @@ def test_forms_that_mean_the_same(text, plain):
             known = known.with_coefficients({n: values.get(n, 0.5) for n in known.coefficient_names})
             terms: dict[tuple[str, float], float] = {}
             for t in known.equations[0].terms:
-                terms[t.signal, t.order.constant] = terms.get((t.signal, t.order.constant), 0.0) + t.fixed
+                terms[t.signal, t.order.constant] = terms.get((t.signal, t.order.constant), 0.0) + t.fixed_value
             models.append((known.equations[0].order.constant, known.equations[0].friction, terms))
         assert models[0][0] == models[1][0]
         assert (models[0][1] and models[0][1].law) == (models[1][1] and models[1][1].law)

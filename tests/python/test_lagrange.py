@@ -50,7 +50,7 @@ def test_both_equations_follow_from_the_energies_7_to_13(stage: int) -> None:
     sides = []
     for item in built.equations:
         right = sum(
-            (sp.nsimplify(t.fixed) if t.fixed is not None else t.factor * values[t.coefficient])
+            (sp.nsimplify(t.fixed_value) if t.fixed_value is not None else t.factor * values[t.coefficient])
             * deriv(operator(t.order, arm), signals[t.signal])
             for t in item.terms
         )
@@ -68,7 +68,7 @@ def test_both_equations_follow_from_the_energies_7_to_13(stage: int) -> None:
 def test_the_hub_is_carried_above_the_deflections_own_order(stage: int) -> None:
     built, h, d = ftlm.flexible_link(stage=stage), 2 * stage - 1, 2 * stage
     hub = built.equations[1].terms[1]
-    assert (hub.signal, hub.fixed, hub.name) == (f"theta{stage}1", -1.0, f"b{d}")
+    assert (hub.signal, hub.fixed_value, hub.name) == (f"theta{stage}1", -1.0, f"b{d}")
     assert hub.order == ftlm.Order.parse(f"2 - mu{d} + gamma{h}")
     assert ftlm.order_law(stage)[f"gamma{d}"] == ftlm.Order.parse(f"alpha{d} - mu{d} + gamma{h}")
     assert "input" not in ftlm.order_law(stage)
@@ -78,7 +78,7 @@ def test_the_hub_is_carried_above_the_deflections_own_order(stage: int) -> None:
     assert ftlm.flexible_link(stage=stage, laws=("orders",)).equations[1].terms[1].coefficient == f"b{d}"
     alone = built.equation(f"theta{stage}2")
     assert alone.order_names == (f"beta{d}", f"gamma{d}", f"mu{d}")
-    assert alone.equations[0].terms[1].fixed == -1.0
+    assert alone.equations[0].terms[1].fixed_value == -1.0
 
 
 @pytest.mark.parametrize("velocities", [False, True])
@@ -143,7 +143,7 @@ def test_inertial_coupling_follows_from_the_energies_of_the_planar_arm(velocitie
 
     for i, item in enumerate(built.equations):
         right = sum(
-            (sp.nsimplify(t.fixed) if t.fixed is not None else t.factor * values[t.coefficient])
+            (sp.nsimplify(t.fixed_value) if t.fixed_value is not None else t.factor * values[t.coefficient])
             * s ** power(t.order)
             * x[t.signal]
             for t in item.terms

@@ -14,7 +14,7 @@ from ftlm.control.lqg import UNKNOWN_INPUT
 from test_control import uncertain
 
 RATE = 500.0
-#: A hub that turns a link: two outputs of one current, whole orders and others.
+#: A hub that turns a link: two outputs of one current, integer orders and others.
 WHOLE = "D^2 hub = 160 bend - 30 D hub + 100 I; D^2 bend = -300 bend - 4 D bend - D^2 hub"
 BROKEN = "D^2 hub = 160 bend - 30 D^0.9 hub + 100 I; D^2 bend = -300 D^0.1 bend - 4 D^0.8 bend - D^2 hub"
 QUIET = {"hub": 3e-4, "bend": 2e-4}

@@ -300,8 +300,8 @@ def test_written_out_law_is_the_structure_of_flexible_link(plants, plant):
     built = plant("A")
     for ours, theirs in zip(written.equations, built.equations, strict=True):
         assert ours.order == theirs.order
-        assert [(t.signal, t.order.constant, t.fixed) for t in ours.terms] == [
-            (t.signal, t.order.constant, t.fixed) for t in theirs.terms
+        assert [(t.signal, t.order.constant, t.fixed_value) for t in ours.terms] == [
+            (t.signal, t.order.constant, t.fixed_value) for t in theirs.terms
         ]
 
 

@@ -439,7 +439,7 @@ def test_fixed_coefficients():
     structure = ftlm.equation("D^1.5 y = -2 a y + b u", fixed={"a": 3})
     assert structure.coefficient_names == ("b",)
     (own, _) = structure.equations[0].terms
-    assert (own.fixed, own.coefficient, own.factor, own.name) == (-6.0, 3.0, -2.0, "a")
+    assert (own.fixed_value, own.coefficient, own.factor, own.name) == (-6.0, 3.0, -2.0, "a")
     assert str(structure) == "D^1.5 y = -6.0 y + b u"
     model = ftlm.Model(structure.with_coefficients({"b": 4.0}))
     assert model.coefficients == {"a": 3.0, "b": 4.0}
@@ -591,7 +591,7 @@ def test_a_model_file_gives_back_every_bit(tmp_path):
         assert original == restored
         for a, b in zip(original.terms, restored.terms, strict=True):
             assert same_bits(a.coefficient, b.coefficient)
-            assert same_bits(a.fixed, b.fixed)
+            assert same_bits(a.fixed_value, b.fixed_value)
             assert same_bits(a.order.constant, b.order.constant)
     for name in ("orders", "units", "m", "about", "coefficients"):
         assert getattr(loaded, name) == getattr(model, name), name
@@ -613,7 +613,9 @@ def test_factor_and_sign_survive_estimation_and_file(small_run, tmp_path):
     assert [t.factor for t in identified.model.equations[0].terms] == [-2.0, 1.0, 0.5]
     loaded = ftlm.load_model(identified.model.save(tmp_path / "m.json"))
     assert loaded.coefficients == identified.coefficients
-    assert [t.fixed for t in loaded.equations[0].terms] == [t.fixed for t in identified.model.equations[0].terms]
+    assert [t.fixed_value for t in loaded.equations[0].terms] == [
+        t.fixed_value for t in identified.model.equations[0].terms
+    ]
     assert loaded.simulate(small_run)["y"].tolist() == identified.model.simulate(small_run)["y"].tolist()
 
 

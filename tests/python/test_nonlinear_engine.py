@@ -1,4 +1,4 @@
-"""Engine of non-linear terms: closed forms, whole orders against DOP853, Jacobians against differences, fits."""
+"""Engine of non-linear terms: closed forms, integer orders against DOP853, Jacobians against differences, fits."""
 
 from math import gamma
 

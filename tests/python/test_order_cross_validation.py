@@ -118,7 +118,7 @@ def test_fits_are_those_of_the_models_on_the_other_run(fractional):
             for other, run in runs.items():
                 wanted = fitted.result.model.compare(run.select(["theta11", "theta12"])).fit["theta12"]
                 assert fitted.fit(other) == pytest.approx(wanted, abs=1e-9), (name, other)
-    gain = link.fits["fractional damping"]["first"].fit("second") - link.fits["whole orders"]["first"].fit("second")
+    gain = link.fits["fractional damping"]["first"].fit("second") - link.fits["integer orders"]["first"].fit("second")
     assert link.gains("fractional damping")["first", "second"] == pytest.approx(gain)
     assert set(link.gains("fractional damping")) == {("first", "second"), ("second", "first")}
 
@@ -139,35 +139,35 @@ def test_the_lower_of_two_orders_is_the_elasticity_s_whatever_the_fit_called_it(
 def test_numbers_are_counted(fractional):
     link = fractional.deflections["theta12"]
     # a, d, e of the hub's angle; then an order or two.
-    assert [next(iter(each.values())).numbers for each in link.fits.values()] == [3, 4, 4, 5]
+    assert [next(iter(each.values())).parameter_count for each in link.fits.values()] == [3, 4, 4, 5]
 
 
 def test_a_fit_that_failed_cannot_be_told(fractional):
     link = fractional.deflections["theta12"]
     lacking = {kind: dict(each) for kind, each in link.fits.items()}
     del lacking["fractional damping"]["second"]
-    broken = replace(link, fits=lacking, failed={("fractional damping", "second"): "no start"})
+    broken = replace(link, fits=lacking, failures={("fractional damping", "second"): "no start"})
     verdict = broken.verdict("fractional damping")
     assert verdict.improves is None
-    assert "second → first" in verdict.words
-    assert "no fit" in verdict.words
+    assert "second → first" in verdict.reason
+    assert "no fit" in verdict.reason
     assert broken.verdict("both fractional").improves is True
     assert verdict_sentence("theta12", verdict).endswith("is inconclusive.")
 
 
 def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
     link = fractional.deflections["theta12"]
-    assert link.worse("both fractional") == []
+    assert link.worse_runs("both fractional") == []
     fitted = link.fits["fractional damping"]["first"]
     own = fitted.comparisons["first"]
     flown = replace(own, output_error={n: replace(f, fit=50.0) for n, f in own.output_error.items()})
     lost = replace(fitted, comparisons={**fitted.comparisons, "first": flown})
     fits = {**link.fits, "fractional damping": {**link.fits["fractional damping"], "first": lost}}
     broken = replace(link, fits=fits)
-    assert broken.worse("fractional damping") == ["first"]
+    assert broken.worse_runs("fractional damping") == ["first"]
     verdict = broken.verdict("fractional damping")
     assert verdict.improves is None
-    assert "On first it fits worse than the whole orders that it contains" in verdict.words
+    assert "On first it fits worse than the integer orders that it contains" in verdict.reason
 
 
 def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
@@ -178,7 +178,7 @@ def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
     for title in ("θ₁₂ on second, fitted to first", "θ₁₂ on first, fitted to second"):
         assert title in first
     link = fractional.deflections["theta12"]
-    for kind in ("whole orders", "both fractional"):
+    for kind in ("integer orders", "both fractional"):
         assert f"{kind[1:]} {link.fits[kind]['first'].fit('second'):.1f} %" in first
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert page.stat().st_size < 1_000_000
@@ -193,7 +193,7 @@ def test_a_page_without_a_fit_says_so(fractional, tmp_path):
     link = fractional.deflections["theta12"]
     lacking = {kind: dict(each) for kind, each in link.fits.items()}
     del lacking["both fractional"]["first"]
-    broken = replace(link, fits=lacking, failed={("both fractional", "first"): "no start was found"})
+    broken = replace(link, fits=lacking, failures={("both fractional", "first"): "no start was found"})
     found = replace(fractional, deflections={"theta12": broken})
     text = cross_validation_page(found, tmp_path / "orders.html").read_text()
     assert "both fractional: no fit" in text
@@ -226,7 +226,7 @@ def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
     link = fractional.deflections["theta12"]
     assert rate_effect_table(fractional) is None
     idle = {
-        run: replace(each, comparisons=link.fits["whole orders"][run].comparisons)
+        run: replace(each, comparisons=link.fits["integer orders"][run].comparisons)
         for run, each in link.fits["fractional damping"].items()
     }
     after = replace(link, fits={**link.fits, "fractional damping": idle}, without_rate=link)

@@ -18,7 +18,7 @@ FILTER = ftlm.SensorFilter.low_pass(["x"])
 MODELS = {
     "fractional": ("D^1.6 y = -2 y - 0.5 D^0.4 y + 3 u", {}),
     "low order": ("D^0.7 y = -2 y + 3 u", {}),
-    "whole orders": ("D^2 y = -4 y - 0.5 D y + 3 u", {}),
+    "integer orders": ("D^2 y = -4 y - 0.5 D y + 3 u", {}),
     "two outputs": ("D^1.5 y = -2 y - 0.5 D^0.5 y + 0.4 x + 3 u; D^0.8 x = -x + y", {"coupling": "simulated"}),
     "sensor filter": (
         "D^1.5 y = -2 y - 0.5 D^0.5 y + 3 u; D^0.8 x = -x + y",

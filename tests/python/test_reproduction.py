@@ -230,7 +230,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
         assert by_words(found, words).verdict == "not decidable by a simulation"
     freed = {(f.arm, f.stage): f for f in reproduction.cases.order_comparisons}
     for stage in (1, 2):
-        put_in, whole = freed["fractional", stage], freed["whole orders", stage]
+        put_in, whole = freed["fractional", stage], freed["integer orders", stage]
         assert whole.fractional_orders == []
         assert put_in.fractional_orders
         for o, nr in put_in.free_nr.items():
@@ -238,7 +238,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
             assert whole.free_nr[o] == pytest.approx(whole.integer_nr[o], rel=0.02)
     # On the maker's arm the manual is better than any p, on one of fractional orders a hub's p = 7 is.
     for t in reproduction.cases.trials:
-        if t.arm == "whole orders":
+        if t.arm == "integer orders":
             assert t.nr > t.manual
     # Of a measured run nobody chose the truth.
     own = replace(reproduction.cases, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
@@ -348,9 +348,9 @@ def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproducti
     uneven = dict(zip(printed.INNOVATION_LENGTHS, (1.0, 1.1, 1.2, 5.0), strict=True))
     weak = {
         o: {p: replace(t, coefficients={n: np.array([uneven[p]]) for n in t.coefficients}) for p, t in each.items()}
-        for o, each in stage.weak_traces.items()
+        for o, each in stage.weak_prior_traces.items()
     }
-    found = checks(replace(reproduction, stages={1: replace(stage, weak_traces=weak)}))
+    found = checks(replace(reproduction, stages={1: replace(stage, weak_prior_traces=weak)}))
     assert by_words(found, "p itself improves").verdict == "does not hold"
 
 
@@ -379,7 +379,7 @@ def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduct
 
 def test_the_simulated_arm_bends_against_its_current_and_the_published_form_with_it(reproduction):
     for number, stage in reproduction.stages.items():
-        bent = stage.derived.correlations
+        bent = stage.dropped_derivative_effect.correlations
         run = reproduction.square
         sign = np.corrcoef(run[f"theta{number}2"], run[f"I{number}"])[0, 1]
         assert bent["measured"] == pytest.approx(sign, abs=0.01)
@@ -591,14 +591,14 @@ def test_a_missing_optimizer_is_reported_first_and_its_tables_are_omitted(reprod
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
     monkeypatch.setitem(sys.modules, absent, None)
     lines = []
-    found = ftlm.reproduce(increment=0.25, arms=["whole orders"], records=1, log=lines.append)
+    found = ftlm.reproduce(increment=0.25, arms=["integer orders"], records=1, log=lines.append)
     assert lines[0].startswith("Tables 6 and 7 and Figure 11 are left out: ")
     assert "pip install 'ftlm[genetic]'" in lines[0]
     assert found.notes.count(lines[0]) == 1
     assert found.optimizer_comparisons == {}
     assert found.cases.optimizer_errors == ()
     # The joint fits of the other arm do not need the optimizers.
-    assert {c.arm for c in found.cases.order_comparisons} == {"fractional", "whole orders"}
+    assert {c.arm for c in found.cases.order_comparisons} == {"fractional", "integer orders"}
     page = found.page(tmp_path / "paper.html").read_text()
     assert "Tables 6 and 7 and Figure 11 are left out: " in page
     assert "Table 5." in page
@@ -641,7 +641,7 @@ def test_a_stage_that_fails_ends_the_other(reproduction):
 @pytest.mark.slow
 def test_threads_do_not_change_a_number(reproduction):
     settings = ftlm.GeneticAlgorithm(seeds=(0, 1), evaluations=800)
-    one = ftlm.reproduce(increment=0.25, genetic=settings, arms=["whole orders"], records=1, threads=1)
+    one = ftlm.reproduce(increment=0.25, genetic=settings, arms=["integer orders"], records=1, threads=1)
     assert one.to_dict() == reproduction.to_dict()
 
 

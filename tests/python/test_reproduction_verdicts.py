@@ -314,7 +314,7 @@ def test_optimizers_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeyp
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
     preset = Preset(ftlm.OrderGrid(increment=step), threads=1)
     with pytest.raises(ftlm.ModelError):
-        simulated_cases(1, "whole orders", [1], 0.0, preset, silent_progress())
+        simulated_cases(1, "integer orders", [1], 0.0, preset, silent_progress())
     work = StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress())
     assert work.compare_optimizers() == {}
     assert replace(preset, comparison_increment=0.01).comparison_order_grid.increment == step
@@ -419,11 +419,11 @@ def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
 
 
 def test_arms_differ_in_what_they_are_called_for():
-    whole = ARM_VARIANTS["whole orders"]
+    whole = ARM_VARIANTS["integer orders"]
     assert [whole.stage1.orders(1)[n] for n in ("gamma1", "beta2", "mu2")] == [1.0, 0.0, 1.0]
     assert whole.stage1.coulomb == ARM_VARIANTS[MAIN_ARM].stage1.coulomb == 0.0
-    assert ARM_VARIANTS["whole orders, friction"].stage2.coulomb > 0
-    assert ARM_VARIANTS["whole orders, friction"].coupling == ARM_VARIANTS["fractional, friction"].coupling == 1.0
+    assert ARM_VARIANTS["integer orders, friction"].stage2.coulomb > 0
+    assert ARM_VARIANTS["integer orders, friction"].coupling == ARM_VARIANTS["fractional, friction"].coupling == 1.0
     # The maker's model is the one arm: explicit Euler at 2 ms is what is left.
     run = demo_run("square", parameters=whole, noise=0.0).select(["I1", "theta11", "theta12"])
     exact = ftlm.link_model(stage=1).simulate(run)
@@ -434,7 +434,7 @@ def test_arms_differ_in_what_they_are_called_for():
     ("words", "message"),
     [
         ({"arms": ["whole"]}, "arm 'whole' is not known"),
-        ({"arms": "whole orders"}, "is a text; give a list of names"),
+        ({"arms": "integer orders"}, "is a text; give a list of names"),
         ({"records": 0}, "records = 0 is not a whole number from 1"),
         ({"records": 2.5}, "records = 2.5 is not a whole number from 1"),
         ({"increment": 0.0}, "increment"),

@@ -55,7 +55,7 @@ def test_coupled_equations_are_the_dense_solve(m):
         {
             "output": e.output,
             "alpha": e.order.constant,
-            "terms": [{"signal": t.signal, "coefficient": t.fixed, "order": t.order.constant} for t in e.terms],
+            "terms": [{"signal": t.signal, "coefficient": t.fixed_value, "order": t.order.constant} for t in e.terms],
         }
         for e in coupled.equations
     ]

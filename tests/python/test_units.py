@@ -38,7 +38,7 @@ def cart(seed):
 
 
 CARTS = {
-    "whole orders": ("D^2 y = -d D y - k y + g u - fc*sign(D y)", {}),
+    "integer orders": ("D^2 y = -d D y - k y + g u - fc*sign(D y)", {}),
     "damping of free order": ("D^2 y = -d D^mu y - k y + g u - fc*sign(D y)", {"mu": (0.5, 1.5, 0.1)}),
     "inertia of free order": ("D^alpha y = -d D y - k y + g u - fc*sign(D y)", {"alpha": (1.6, 2.0, 0.1)}),
     "more near rest": ("D^2 y = -d D y - k y + g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)", {}),

@@ -314,7 +314,7 @@ def test_a_saved_model_keeps_the_records(found, tmp_path):
     path = tmp_path / "m.json"
     document = json.loads(found.model.save(path).read_text("utf-8"))
     assert document["estimate"]["verdict_findings"] == []
-    for bad in ([{"level": "trust", "reason": "x"}], [{"numbers": {}}], ["x"], {}, [{"code": 3}], [{"code": "later"}]):
+    for bad in ([{"level": "trust", "reason": "x"}], [{"values": {}}], ["x"], {}, [{"code": 3}], [{"code": "later"}]):
         document["estimate"]["verdict_findings"] = bad
         path.write_text(json.dumps(document), encoding="utf-8")
         with pytest.raises(ftlm.DataError, match="is not an ftlm model"):
@@ -446,7 +446,7 @@ def test_every_entry_of_the_catalogue_renders():
         templates = "".join((kind.template, kind.reason, kind.remedy, kind.prefix, topic.remedy, topic.alternative))
         names = {n.partition("[")[0] for _, n, _, _ in string.Formatter().parse(templates) if n}
         numbers = dict.fromkeys(names - {*fields, "ask", "choose", "remedy", "signal"}, 1)
-        item = Finding(code, **fields, numbers=numbers)
+        item = Finding(code, **fields, values=numbers)
         for said in (item.text, item.reason, item.remedy):
             assert said != code
             assert not set("{}|") & set(said), (code, said)

@@ -40,7 +40,7 @@ def exact(name="effective", **changes):
 
 
 def whole(parameters):
-    """The same arm with whole orders."""
+    """The same arm with integer orders."""
     one, two = (replace(s, gamma=1.0, beta=0.0, mu=1.0) for s in (parameters.stage1, parameters.stage2))
     return replace(parameters, stage1=one, stage2=two)
 

@@ -63,7 +63,7 @@ def equation_polynomials(equation: Equation, names: Sequence[str]) -> tuple[list
     input_polynomials: dict[str, Polynomial] = {}
     polynomials[names.index(equation.output)][equation.order.constant] = 1.0
     for term in equation.terms:
-        value = {term.order.constant: float(term.fixed or 0.0)}
+        value = {term.order.constant: float(term.fixed_value or 0.0)}
         if term.signal in names:
             add_polynomial(polynomials[names.index(term.signal)], value, -1.0)
         else:
@@ -325,7 +325,7 @@ def parameter_vector(model: Model) -> Floats:
     for equation in model.equations:
         parameters += [
             equation.order.constant,
-            *(v for t in equation.terms for v in (t.order.constant, float(t.fixed or 0.0))),
+            *(v for t in equation.terms for v in (t.order.constant, float(t.fixed_value or 0.0))),
         ]
         parameters += [] if equation.friction is None else equation.friction.parameter_values
     return np.array([*parameters, *model.structure.fixed_input_parameters.values()])

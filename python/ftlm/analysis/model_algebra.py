@@ -308,7 +308,7 @@ def _linearized_equation(equation: Equation, values: Mapping[Channel, float]) ->
                 point_text = ", ".join(f"{channel(*c)} = {values[c]:g}" for c in expression.channels)
                 raise ModelError(f"{expression} has no derivative at {point_text}; choose another operating point")
             column = signal, Order(round(term.order.constant + order, 9))
-            slopes[column] = slopes.get(column, 0.0) + float(term.fixed or 0.0) * float(slope)
+            slopes[column] = slopes.get(column, 0.0) + float(term.fixed_value or 0.0) * float(slope)
     leading_coefficient = 1.0 - slopes.pop((equation.output, equation.order), 0.0)
     if abs(leading_coefficient) <= CANCELLATION_TOLERANCE:
         raise ModelError(
@@ -316,11 +316,11 @@ def _linearized_equation(equation: Equation, values: Mapping[Channel, float]) ->
         )
     for k, term in enumerate(terms):
         if (term.signal, term.order) in slopes:
-            value = float(term.fixed or 0.0) + slopes.pop((term.signal, term.order))
+            value = float(term.fixed_value or 0.0) + slopes.pop((term.signal, term.order))
             terms[k] = Term(term.signal, term.order, value)
     terms += [
         Term(signal, order, slope) for (signal, order), slope in slopes.items() if slope or signal != equation.output
     ]
     if leading_coefficient != 1.0:
-        terms = [Term(t.signal, t.order, float(t.fixed or 0.0) / leading_coefficient) for t in terms]
+        terms = [Term(t.signal, t.order, float(t.fixed_value or 0.0) / leading_coefficient) for t in terms]
     return replace(equation, terms=tuple(terms))

@@ -290,7 +290,7 @@ def state_space_matrices(
             if key not in filters:
                 source = sources[term.signal]
                 filters[key] = _filter_signal(states, source, key[1], extended_band, count) if key[1] > 0 else source
-            by_level.setdefault(integer_order, []).append((float(term.fixed or 0.0), filters[key]))
+            by_level.setdefault(integer_order, []).append((float(term.fixed_value or 0.0), filters[key]))
         previous_integrator: _Signal = {}
         for level in range(max(by_level), 0, -1):
             states.append(_sum([*by_level.get(level, []), (1.0, previous_integrator)]))

@@ -221,7 +221,7 @@ function mark() {
 }
 
 const WORDS = {
-  fit: "The numbers of this equation are estimated.",
+  fit: "The parameters of this equation are estimated.",
   inside: "Terms and free orders of this equation are added one by one, as long as what was not fitted to is predicted better. It takes several times as long.",
   offered: "Each structure below without dry friction is fitted to three quarters of the run and judged on the fourth, in turn.",
   auto: "Whole orders 1 to 4, every input, then free orders: what predicts best what it was not fitted to. It takes minutes.",

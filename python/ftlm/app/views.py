@@ -161,7 +161,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
         "verdict": overall_verdict.to_dict(),
         "box": str(verdict_box(overall_verdict)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],
-        "numbers": len(result.joint.names) if result.joint is not None else len(result.coefficients),
+        "parameter_count": len(result.joint.names) if result.joint is not None else len(result.coefficients),
         "fits": [
             {
                 "output": output,

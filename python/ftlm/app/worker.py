@@ -105,7 +105,7 @@ def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
         "options": description["options"],
         "step": opened.step,
         "problem": opened.problem,
-        "notes": list(opened.notes),
+        "notes": list(opened.warnings),
         "offers": [] if opened.problem else suggest_structures(*_signals(opened), (opened.step or 1.0) * opened.rows),
         **_run_preview(opened),
     }

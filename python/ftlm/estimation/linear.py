@@ -120,7 +120,7 @@ def _linear(
 ) -> tuple[list[Any], Any, list[bool], list[float | None], InitialTuple]:
     """Return one equation and its records as positional arguments of the core's linear estimators."""
     first = records[0]
-    fixed, structure = [t.fixed for t in equation.terms], structure_tuple(equation, first.signals)
+    fixed, structure = [t.fixed_value for t in equation.terms], structure_tuple(equation, first.signals)
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
@@ -149,7 +149,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             [r.core() for r in records],
             [structure_tuple(e, records[0].signals) for e in group],
             inputs,
-            [[t.fixed for t in e.terms] for e in group],
+            [[t.fixed_value for t in e.terms] for e in group],
             initial,
             MAX_IV_ITERATIONS,
             IV_RELATIVE_TOLERANCE,
@@ -164,7 +164,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             group, answer["estimates"], answer["covariances"], strict=True
         ):
             fit.values.update(named_coefficients(equation, estimate))
-            free = [t for t in equation.terms if t.fixed is None]
+            free = [t for t in equation.terms if t.fixed_value is None]
             errors = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
             pairs = zip(free, errors.tolist(), strict=True)
             fit.errors.update({str(t.coefficient): s / abs(t.factor) for t, s in pairs})
@@ -299,7 +299,7 @@ def multi_innovation_trace(
         [rec.core()],
         core_structure,
         inputs,
-        [t.fixed for t in single_equation.terms],
+        [t.fixed_value for t in single_equation.terms],
         (False, []),
         settings.innovation_length,
         settings.prior_covariance,
@@ -436,7 +436,7 @@ class Streaming:
                     innovation_length=length,
                     prior_covariance=prior_covariance,
                     max_pulses=max(2, round(max_duration / step) + 1),
-                    fixed=[t.fixed for t in equation.terms],
+                    fixed=[t.fixed_value for t in equation.terms],
                 )
             )
 

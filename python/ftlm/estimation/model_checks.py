@@ -515,7 +515,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
     findings = []
     for equation in model.equations:
         output_terms = [
-            (float(t.fixed or 0.0), equation.order.constant - t.order.constant)
+            (float(t.fixed_value or 0.0), equation.order.constant - t.order.constant)
             for t in equation.terms
             if t.column == equation.output
         ]

@@ -69,7 +69,7 @@ def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
     else:
         argument = np.asarray(shape.evaluate({c: _channel_values(values, c, step) for c in shape.channels}))
         argument = np.broadcast_to(argument, values[term.signal].shape)
-    return (term.fixed or 0.0) * _derive(argument, term.order.constant, step)
+    return (term.fixed_value or 0.0) * _derive(argument, term.order.constant, step)
 
 
 def _term_findings(equation: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:

@@ -371,7 +371,10 @@ def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
     for equation in structure.equations:
         for term in equation.terms:
             is_constant_term = (
-                term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
+                term.fixed_value is None
+                and not term.order.names
+                and term.order.constant == 0
+                and term.nonlinear is None
             )
             if is_constant_term and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
                 return term.signal

@@ -164,7 +164,7 @@ class ResponseProblem:
         if isinstance(term.coefficient, str):
             return term.factor * float(values[self._coefficient[term.coefficient]])
         power = self.order_at(equation.order, values) - self.order_at(term.order, values)
-        return float(term.fixed or 0.0) * math.pow(self.unit, -power)
+        return float(term.fixed_value or 0.0) * math.pow(self.unit, -power)
 
     def shift(self, signal: str, values: Floats) -> float:
         """Return the delay of an input, in the time unit of this problem."""
@@ -503,7 +503,7 @@ def _equation_coefficients(
                     output_columns.setdefault(term.coefficient, []).append(term.factor * power)
             else:
                 gap = alpha - _orders(problem, term.order.constant, term.order.weights, points)
-                fixed_coefficient = float(term.fixed or 0.0) * problem.unit ** -gap[:, None]
+                fixed_coefficient = float(term.fixed_value or 0.0) * problem.unit ** -gap[:, None]
                 target = target - fixed_coefficient * power * signal
                 if term.signal == equation.output:
                     powers_by_record[-1] = powers_by_record[-1] - fixed_coefficient * power

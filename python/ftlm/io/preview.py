@@ -100,7 +100,7 @@ class OpenedFile:
         Sampling interval [s]; None if `problem` is set.
     problem : str
         Reason why the file cannot be loaded as a run without further arguments, with a remedy; "" if it can.
-    notes : tuple of str
+    warnings : tuple of str
         Warnings of the run.
     """
 
@@ -113,7 +113,7 @@ class OpenedFile:
     options: dict[str, Any]
     step: float | None
     problem: str
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def load(self) -> Run:
         """Load the file with `options` as arguments, and return the run; raise DataError as :func:`ftlm.load` does."""
@@ -182,7 +182,7 @@ class OpenedFile:
         if self.step is not None:
             lines.append(f"step {self.step:.6g} s, {self.step * (self.rows - 1):.6g} s in all")
         lines += [f"assumed: {assumption}" for assumption in self.assumptions]
-        lines += [f"note: {note}" for note in self.notes]
+        lines += [f"note: {note}" for note in self.warnings]
         if self.problem:
             lines.append(f"to do: {self.problem}")
         # A command with unprintable characters could not be copied from a terminal.

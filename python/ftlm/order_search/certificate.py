@@ -197,11 +197,11 @@ def _check_certifiable(job: Job) -> None:
             "there is no certificate over all orders with initial terms; give the equation "
             f"{parameter('initial', 'rest')}"
         )
-    fixed_terms = [t for t in equation.terms if t.fixed is not None]
+    fixed_terms = [t for t in equation.terms if t.fixed_value is not None]
     if fixed_terms:
         raise ModelError(
             f"a certificate over all orders requires free coefficients, but the equation of {equation.output} has "
-            f"{plural(len(fixed_terms), 'fixed one')} (the first is {fixed_terms[0].fixed:g}); give each a name"
+            f"{plural(len(fixed_terms), 'fixed one')} (the first is {fixed_terms[0].fixed_value:g}); give each a name"
         )
 
 

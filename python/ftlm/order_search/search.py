@@ -224,7 +224,7 @@ class Job:
         """Return the search problem of the single equation, in the form that the Rust core takes."""
         equation = self.structure.equations[0]
         orders = order_grid_tuple(equation, self.records[0].signals, self.values)
-        return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed for t in equation.terms])
+        return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed_value for t in equation.terms])
 
     def coupled_problem(self) -> CoupledProblem:
         """Return the search problem of the coupled equations, in the form that the Rust core takes.
@@ -242,7 +242,7 @@ class Job:
             *self._common_arguments(),
             axes=[list(self.values[n]) for n in names],
             laws=laws,
-            fixed=[[t.fixed for t in e.terms] for e in structure.equations],
+            fixed=[[t.fixed_value for t in e.terms] for e in structure.equations],
             scales=self.scales(),
         )
 

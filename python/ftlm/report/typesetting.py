@@ -59,7 +59,7 @@ def equation_html(
     """
     parts = [_math(_derivative_math(equation.order, equation.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(equation.terms):
-        value = term.fixed or 0.0
+        value = term.fixed_value or 0.0
         sign = "−" if value < 0 else "" if k == 0 else "+"
         # The sign of the first term is a prefix operator; the other signs are infix operators between terms.
         sign_math = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")

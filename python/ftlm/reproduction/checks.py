@@ -304,7 +304,7 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
     """
     tables = reproduction.as_printed
     return _of_angles({o: t.rank == 1 for o, t in tables.items()}), {
-        "places": ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items()),
+        "places": ", ".join(f"{symbol(o)} {t.rank} of {t.grid_count}" for o, t in tables.items()),
         "best": by_angle({o: [t.best[n] for n in ("beta", "gamma", "mu")] for o, t in tables.items()}),
     }
 
@@ -355,7 +355,9 @@ def weak_prior(reproduction: Reproduction) -> Evidence:
     weak = [t for t in reproduction.cases.trials if t.prior == printed.WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
-    spread = [weak_prior_variation(each) for s in reproduction.stages.values() for each in s.weak.values()]
+    spread = [
+        weak_prior_variation(each) for s in reproduction.stages.values() for each in s.weak_prior_coefficients.values()
+    ]
     words = "no record that starts at rest"
     if ratios:
         words = f"{ruling.counts}; errors of p = {LAST_P} over p = {FIRST_P}: {min(ratios):.4g} to {max(ratios):.4g}"
@@ -504,7 +506,7 @@ def dropped_derivative(reproduction: Reproduction) -> Evidence:
     """
     orders = {n: printed.printed_numbers(n, LAST_P)[0] for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
-    parts = [stage.derived for stage in reproduction.stages.values()]
+    parts = [stage.dropped_derivative_effect for stage in reproduction.stages.values()]
     return combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]), {
         "printed_orders": format_list(dropped.values(), 2),
         "orders": format_list(p.order for p in parts),

@@ -39,7 +39,7 @@ from ftlm.validation.comparison import Comparison
 
 #: Free orders of each structure (beta: elasticity, mu: damping), by the structure's label ("kind"). Other orders are
 #: integer.
-INTEGER_KIND = "whole orders"
+INTEGER_KIND = "integer orders"
 FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
     INTEGER_KIND: (),
     "fractional elasticity": ("beta",),
@@ -99,14 +99,14 @@ class RunFit:
         return estimates
 
     @property
-    def numbers(self) -> int:
+    def parameter_count(self) -> int:
         """Number of free orders and coefficients."""
         return len(self.estimates)
 
     def to_dict(self) -> dict[str, Any]:
         """Return fits, estimates, intervals and warnings as a dictionary for JSON."""
         return {
-            "numbers": self.numbers,
+            "parameter_count": self.parameter_count,
             "fit": {run: finite(self.fit(run)) for run in self.comparisons},
             "estimates": {n: float(v) for n, (v, *_) in self.estimates.items()},
             "intervals": {n: json_value(ends) for n, (_, *ends) in self.estimates.items()},
@@ -124,13 +124,13 @@ class Verdict:
         Structure with fractional orders, a key of ``FREE_ORDERS_BY_KIND``.
     improves
         Whether fractional orders improve the prediction; None if the test is inconclusive.
-    words
+    reason
         Text with the fits and intervals from which the verdict follows.
     """
 
     kind: str
     improves: bool | None
-    words: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Deflection:
         Structure with free orders of elasticity and damping.
     fits
         Fits by kind, then by name of the estimation run.
-    failed
+    failures
         Error message of each failed fit, by (kind, estimation run).
     without_rate
         Cross-validation of structures without the term in the other deflection's rate. None if the other joint was not
@@ -157,7 +157,7 @@ class Deflection:
     output: str
     structure: Structure
     fits: dict[str, dict[str, RunFit]]
-    failed: dict[tuple[str, str], str] = field(default_factory=dict)
+    failures: dict[tuple[str, str], str] = field(default_factory=dict)
     without_rate: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
@@ -173,7 +173,7 @@ class Deflection:
                 gains[run, other] = 0.0 if before == after else after - before
         return gains
 
-    def worse(self, kind: str) -> list[str]:
+    def worse_runs(self, kind: str) -> list[str]:
         """Return the names of estimation runs to which a kind fits worse than integer orders.
 
         Integer orders are a special case of every kind, so such a fit has not found the optimum.
@@ -200,9 +200,9 @@ class Deflection:
         It is inconclusive if a fit failed, is unusable, or is worse than integer orders on its estimation run.
         """
         intervals, gains, whole, free = self.intervals(kind), self.gains(kind), self.fits[INTEGER_KIND], self.fits[kind]
-        worse, used = self.worse(kind), [*free.items(), *whole.items()]
+        worse, used = self.worse_runs(kind), [*free.items(), *whole.items()]
         degenerate = list(dict.fromkeys(run for run, fit in used if is_degenerate(fit.result)))
-        complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
+        complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failures)
         integer_orders = {name: integer_order(name) for name in intervals}
         improves = improves_prediction(list(gains.values()), intervals, integer_orders) if complete else None
 
@@ -218,7 +218,7 @@ class Deflection:
         if not all(have_common_value(each.values()) for each in intervals.values()):
             words += " The runs contradict each other."
         if worse:
-            words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
+            words += f" On {', '.join(worse)} it fits worse than the integer orders that it contains: no optimum found."
         if degenerate:
             words += f" On {', '.join(degenerate)} one of the two fits must not be used, so nothing follows from it."
         return Verdict(kind, improves, words)
@@ -228,9 +228,9 @@ class Deflection:
         without_rate = {} if self.without_rate is None else {"without_rate": self.without_rate.to_dict()}
         return {
             "equation": str(self.structure),
-            "verdicts": {v.kind: {"improves": v.improves, "words": v.words} for v in self.verdicts},
+            "verdicts": {v.kind: {"improves": v.improves, "reason": v.reason} for v in self.verdicts},
             "fits": json_value(self.fits),
-            "failed": {f"{kind}, {run}": words for (kind, run), words in self.failed.items()},
+            "failures": {f"{kind}, {run}": words for (kind, run), words in self.failures.items()},
             **without_rate,
         }
 
@@ -410,7 +410,7 @@ def verdict_sentence(output: str, verdict: Verdict) -> str:
 
 def _verdict(output: str, verdict: Verdict) -> Markup:
     template = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}</span></span>')
-    return template.format(verdict_sentence(output, verdict), verdict.words)
+    return template.format(verdict_sentence(output, verdict), verdict.reason)
 
 
 def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> list[LineChart]:
@@ -429,7 +429,7 @@ def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> l
                 words.append(f"{kind}: no fit")
                 continue
             lines.append((kind, fit.comparisons[other].simulated[output][0]))
-            words.append(f"{kind} {percent(fit.fit(other))} % with {fit.numbers} numbers")
+            words.append(f"{kind} {percent(fit.fit(other))} % with {fit.parameter_count} parameters")
         caption, title = "; ".join(words), f"{symbol(output)} on {other}, fitted to {run}"
         caption = f"{caption[0].upper()}{caption[1:]}."
         size = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
@@ -461,8 +461,8 @@ def fits_table(result: OrderCrossValidation) -> Table:
         for suffix, deflection in full.parts:
             cells = rows[f"{symbol(output)}{suffix}"] = []
             for kind, fits in deflection.fits.items():
-                numbers = next((Exact(f.numbers) for f in fits.values()), None)
-                cells.append([kind, numbers, *(_fit_cell(fits.get(run), run, other) for run, other in pairs)])
+                count = next((Exact(f.parameter_count) for f in fits.values()), None)
+                cells.append([kind, count, *(_fit_cell(fits.get(run), run, other) for run, other in pairs)])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
     return make_table("cross_fits", rows, {"@runs": heads})
 
@@ -491,7 +491,7 @@ def _deflection_section(full: Deflection) -> Section:
     failed: list[str] = []
     for suffix, d in full.parts:
         results |= {f"{kind}, {run}{suffix}": f.result for kind, fits in d.fits.items() for run, f in fits.items()}
-        failed += [f"{kind}, {run}{suffix}: {words}" for (kind, run), words in d.failed.items()]
+        failed += [f"{kind}, {run}{suffix}: {words}" for (kind, run), words in d.failures.items()]
     whole, free = full.fits[INTEGER_KIND], full.fits[CHARTED_KIND]
     run, fit = next(iter({**whole, **free}.items()))
     equations = [*next(iter(whole.values())).result.model.equations, *fit.result.model.equations]
@@ -553,7 +553,7 @@ def cross_validation_text(result: OrderCrossValidation) -> str:
     lines: list[str] = []
     for output, full in result.deflections.items():
         for verdict in full.verdicts:
-            lines += [verdict_sentence(output, verdict), f"    {verdict.words}"]
+            lines += [verdict_sentence(output, verdict), f"    {verdict.reason}"]
     for output, full in result.deflections.items():
         if full.without_rate is not None:
             lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]

@@ -213,7 +213,13 @@ def demo_details(demo: Demo) -> str:
         lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
         lines += [*table_text(paper_table(stage.candidates), 16, PAPER_TABLE_WIDTHS), ""]
         lines += ["Fit to pulse means in percent: on the square run, and on the sine run that no model has seen"]
-        lines += [*report.fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
+        lines += [
+            *report.fits_text(stage.candidates),
+            "",
+            derivative_chart(stage.dropped_derivative_effect).caption,
+            "",
+            "Output error",
+        ]
         estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
         lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
     lines += [page_text("demo_tables"), ""]
@@ -276,5 +282,5 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[*behavior_tables(best.model), estimates_table(best, demo.truth[stage])],
         fold="All models",
         folded_tables=[*tables, searches],
-        figures=[*charts, derivative_chart(demo.stages[stage].derived)],
+        figures=[*charts, derivative_chart(demo.stages[stage].dropped_derivative_effect)],
     )

@@ -245,7 +245,7 @@ class AsPrinted:
         normalized residual NR; at least 1. A wrong sign of a counts as a further factor of 10.
     ratio_at_unit_prior
         Smallest such mean among interpretations with prior covariance K0 = 1.
-    rank, among
+    rank, grid_count
         Rank of the printed orders by equation error among all points of an order grid around them, and number of these
         points, at p = 7.
     best
@@ -260,7 +260,7 @@ class AsPrinted:
     ratio: float
     ratio_at_unit_prior: float
     rank: int
-    among: int
+    grid_count: int
     best: dict[str, float]
     scale: float
 
@@ -299,7 +299,7 @@ class AsPrinted:
         """Return the comparison as a dictionary for JSON."""
         settings = {"closest settings": str(self.interpretation), "interpretation": json_value(self.interpretation)}
         numbers = attributes(self, ("ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows"))
-        return settings | numbers | attributes(self, ("rank", "among", "best"))
+        return settings | numbers | attributes(self, ("rank", "grid_count", "best"))
 
 
 class _AngleRegression:

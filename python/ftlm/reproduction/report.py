@@ -417,7 +417,7 @@ def saturation_table(reproduction: Reproduction) -> Table:
         x, c, _ = printed.printed_saturation(output)
         for p, model in of_p.items():
             alike = "yes" if letters_of(model, output)[0] == last else "no"
-            weak = stage.weak[output][p][name] if stage.weak else None
+            weak = stage.weak_prior_coefficients[output][p][name] if stage.weak_prior_coefficients else None
             printed_value = printed.FRACTIONAL_ROWS[output][p].a
             yield [f"p = {p}", model.coefficients[name], alike, weak, printed_value, x * p / (p + c)]
 
@@ -578,9 +578,9 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         title = page_text("printed_orders", angle=symbol(s.outputs[1]), table=3 + s.number)
         models = [("printed orders", s.printed_orders.estimation)]
         near.append(fit_chart(models, s.outputs[1], title, reference_label=reference))
-        for output, traces in s.weak_traces.items():
+        for output, traces in s.weak_prior_traces.items():
             weak.append(convergence_chart(traces, f"{symbol(output)}: error (45), weak prior"))
-        derived.append(derivative_chart(s.derived, reference))
+        derived.append(derivative_chart(s.dropped_derivative_effect, reference))
         if s.landscape is not None:
             landscapes.append(s.landscape)
             first, second = map(symbol, s.landscape.names)

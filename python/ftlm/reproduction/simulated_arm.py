@@ -37,7 +37,7 @@ def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
     )
     # In the manufacturer's parameters, link 1 has no damping.
     stage1 = replace(stage1, d=0.0)
-    return replace(DEMO_PARAMETERS, stage1=stage1, stage2=stage2, coupling=coupling, name="whole orders")
+    return replace(DEMO_PARAMETERS, stage1=stage1, stage2=stage2, coupling=coupling, name="integer orders")
 
 
 #: Key of the demonstration's arm in `ARM_VARIANTS`.
@@ -49,8 +49,8 @@ ARM_VARIANTS: dict[str, ArmParameters] = {
     "fractional, friction": replace(
         DEMO_PARAMETERS, stage1=EFFECTIVE_PARAMETERS.stage1, stage2=EFFECTIVE_PARAMETERS.stage2, coupling=1.0
     ),
-    "whole orders": _integer_order_arm(friction=False, coupling=0.0),
-    "whole orders, friction": _integer_order_arm(friction=True, coupling=1.0),
+    "integer orders": _integer_order_arm(friction=False, coupling=0.0),
+    "integer orders, friction": _integer_order_arm(friction=True, coupling=1.0),
 }
 #: Assumed parameters of the paper's arm: integer orders, friction, and uncoupled joints as in its equations.
 PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)

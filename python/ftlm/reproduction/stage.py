@@ -205,15 +205,15 @@ class Stage:
         Number of the joint, 1 or 2.
     candidates
         Models by label, in the sequence of the tables.
-    traces, weak_traces
+    traces, weak_prior_traces
         Convergence of the multi-innovation recursion by output and innovation length p. `traces` have K0 = 1 and the
-        best orders of each p. `weak_traces` have a weak prior and the orders of p = 7. Empty for a run that does not
-        start at rest.
+        best orders of each p. `weak_prior_traces` have a weak prior and the orders of p = 7. Empty for a run that does
+        not start at rest.
     optimizer_comparisons
         Optimizer comparisons by output; empty without PyGAD or SciPy, or for a run that does not start at rest.
     printed_orders
         Model with the orders printed in the paper and least-squares coefficients on the estimation run.
-    derived
+    dropped_derivative_effect
         Simulations of the deflection with and without the derivative of the current that the paper drops.
     landscape
         Output-error cost around the optimum, as a function of the two most correlated orders; None if there are no two
@@ -223,10 +223,10 @@ class Stage:
     number: StageNumber
     candidates: dict[str, Candidate]
     traces: Traces
-    weak_traces: Traces
+    weak_prior_traces: Traces
     optimizer_comparisons: dict[str, OptimizerComparison]
     printed_orders: Candidate
-    derived: DroppedDerivative
+    dropped_derivative_effect: DroppedDerivative
     landscape: Landscape | None
 
     @property
@@ -235,18 +235,18 @@ class Stage:
         return f"theta{self.number}1", f"theta{self.number}2"
 
     @property
-    def weak(self) -> dict[str, dict[int, dict[str, float]]]:
+    def weak_prior_coefficients(self) -> dict[str, dict[int, dict[str, float]]]:
         """Final coefficients with a weak prior at the orders of p = 7, by output, innovation length p and name."""
         return {
             o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
-            for o, each in self.weak_traces.items()
+            for o, each in self.weak_prior_traces.items()
         }
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results of the joint as a dictionary for JSON."""
-        derived = attributes(self.derived, ("output", "order", "correlations"))
-        parts = {"models": json_value(self.candidates), "derived input order": derived}
-        return parts | attributes(self, ("printed_orders", "weak", "optimizer_comparisons"))
+        derived = attributes(self.dropped_derivative_effect, ("output", "order", "correlations"))
+        parts = {"models": json_value(self.candidates), "dropped_derivative_effect": derived}
+        return parts | attributes(self, ("printed_orders", "weak_prior_coefficients", "optimizer_comparisons"))
 
 
 def compare_optimizers(
@@ -624,18 +624,18 @@ class StageWork:
         exact = self.manual()
         candidates = {"integer, Euler": self.euler_candidate(exact), "integer, exact": exact}
         whole = integer_orders(self.coupled)
-        candidates["integer, identified"] = self.best("integer, identified", whole, "whole orders", "whole orders")
+        candidates["integer, identified"] = self.best("integer, identified", whole, "integer orders", "integer orders")
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
         joint = candidates["output error"] = self.best("output error", self.coupled, "free orders")
         label = "published, output error"
         candidates[label] = self.best(label, self.published, "free orders, (22)–(25)", "published", joint.model)
         self.begin("convergence", "traces")
-        traces, weak_traces = Traces(), Traces()
+        traces, weak_prior_traces = Traces(), Traces()
         if self.measured.initial == "rest":
             models = {p: candidates[f"p = {p}"].model for p in INNOVATION_LENGTHS}
             traces = self.traces(models)
-            weak_traces = self.traces(dict.fromkeys(models, models[LAST_P]), printed.WEAK_PRIOR)
+            weak_prior_traces = self.traces(dict.fromkeys(models, models[LAST_P]), printed.WEAK_PRIOR)
         else:
             self.notes.append(page_text("moving_start", run=self.estimation_run.name))
         comparisons = self.compare_optimizers()
@@ -645,7 +645,7 @@ class StageWork:
         if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
         near = self.printed_orders()
-        return Stage(self.number, candidates, traces, weak_traces, comparisons, near, derived, landscape)
+        return Stage(self.number, candidates, traces, weak_prior_traces, comparisons, near, derived, landscape)
 
     def candidate(self, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with its errors on both runs; a coupled model is also simulated from the currents alone."""
@@ -764,7 +764,7 @@ class StageWork:
         """
         self.begin(words, step)
         run = self.estimation_run
-        if step == "whole orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
+        if step == "integer orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
             run = decimate_run(run, run.length // INTEGER_FIT_SAMPLES)
         elif run.length > MAX_FULL_SAMPLES:
             every = -(-run.length // DECIMATED_SAMPLES)

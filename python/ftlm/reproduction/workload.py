@@ -12,7 +12,7 @@ from ftlm.progress import CancellableProgress, FractionTracker
 #: for the default increment of the optimizer comparison ("optimizers"). They are three quarters of the measured times,
 #: because the machine had other load.
 STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
-    "whole orders": (1.5, 1, 0),
+    "integer orders": (1.5, 1, 0),
     "search": (1.4, 5, 0),
     "instrumental": (2.0, 1, 0),
     "output error": (5.8, 1, 0),

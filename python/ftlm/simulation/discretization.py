@@ -505,7 +505,9 @@ def order_grid_tuple(
     def axis(order: Order) -> list[float]:
         return list(values[order.names[0]]) if order.names else [order.constant]
 
-    terms = [(signals.index(t.column), axis(t.order), bool(t.order.names) and t.fixed is None) for t in equation.terms]
+    terms = [
+        (signals.index(t.column), axis(t.order), bool(t.order.names) and t.fixed_value is None) for t in equation.terms
+    ]
     return signals.index(equation.output), axis(equation.order), terms
 
 
@@ -521,7 +523,7 @@ def equation_tuple(
     """Return an identified linear equation in the form of :func:`structure_tuple`, and its coefficient values."""
     for term in equation.terms:
         _check_excess_order(term.signal, term.order.constant, equation.output, equation.order.constant)
-    return structure_tuple(equation, signals), [float(t.fixed or 0.0) for t in equation.terms]
+    return structure_tuple(equation, signals), [float(t.fixed_value or 0.0) for t in equation.terms]
 
 
 def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
@@ -577,7 +579,7 @@ def prepare(
     for equation in structure.equations:
         for term in equation.terms:
             if (
-                term.fixed is None
+                term.fixed_value is None
                 and term.column != equation.output
                 and not any(r.of(term.column).any() for r in prepared)
             ):
@@ -597,7 +599,7 @@ def prepare(
 
 def _is_offset(term: Term, equation: Equation, prepared: Sequence[Record]) -> bool:
     """Whether a free term of order 0 has a constant signal in every run, so that it is equivalent to an offset."""
-    if term.fixed is not None or term.column == equation.output or term.order.names or term.order.constant != 0:
+    if term.fixed_value is not None or term.column == equation.output or term.order.names or term.order.constant != 0:
         return False
     return all(float(np.ptp(r.of(term.column))) == 0.0 for r in prepared)
 

@@ -124,7 +124,7 @@ def output_simulation(
     start = resolve_initial_conditions(run, structure)
     run, run_without_level = without_level(run, structure)
     frictions = [(i, (model.equations[i].friction or Friction(0.0)).law) for i in structure.friction_equations]
-    equations = [(linear_tuple(e, signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
+    equations = [(linear_tuple(e, signals), [float(t.fixed_value or 0.0) for t in e.terms]) for e in model.equations]
     core = _core.OutputSimulation(
         recording(run, run_without_level, start), equations, frictions, times, derived_signals(structure)
     )

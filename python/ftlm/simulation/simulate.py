@@ -191,7 +191,7 @@ def _check_initial_values(equation: Equation, terms: Mapping[float, float]) -> N
         for term in equation.terms:
             order, power = term.order.constant, round(alpha - term.order.constant + i, 9)
             if term.column == equation.output and i < math.ceil(order - 1e-9):
-                contribution = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
+                contribution = float(term.fixed_value or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
                 required_values[power] = required_values.get(power, 0.0) - contribution * value
     missing_exponents = [
         e for e in required_values if e != round(e) and not any(abs(e - exponent) < 1e-6 for exponent in terms)

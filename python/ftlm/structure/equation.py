@@ -66,7 +66,7 @@ class Term:
         return tuple(dict.fromkeys(signal for signal, _ in self.nonlinear.channels))
 
     @property
-    def fixed(self) -> float | None:
+    def fixed_value(self) -> float | None:
         """Value of factor * coefficient; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
@@ -310,10 +310,10 @@ class Equation:
                     f"factor {term.factor:g} of {term.coefficient} {term.signal} in the equation of {self.output} "
                     "is 0 or not finite; give a finite number other than 0"
                 )
-            if term.fixed is not None and not math.isfinite(term.fixed):
+            if term.fixed_value is not None and not math.isfinite(term.fixed_value):
                 raise ModelError(
-                    f"coefficient of {term.signal} in the equation of {self.output} is {term.fixed:g}, which is not "
-                    "finite; give a number"
+                    f"coefficient of {term.signal} in the equation of {self.output} is {term.fixed_value:g}, which is "
+                    "not finite; give a number"
                 )
             if term.nonlinear is not None:
                 self._check_expression(term, term.nonlinear)
@@ -474,7 +474,7 @@ def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> 
     `inputs` maps the name of an input to its text, such as ``u(t - 0.035 s)``.
     """
     texts = inputs or {}
-    parts = [f"{t.fixed or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]
+    parts = [f"{t.fixed_value or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]
     right_side = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
         fc, fs, vs = item.friction.law

@@ -119,7 +119,7 @@ class BaseModel:
         equation = self.structure.equations[0]
         output_terms = [
             (
-                t.factor * values[t.coefficient] if isinstance(t.coefficient, str) else float(t.fixed or 0.0),
+                t.factor * values[t.coefficient] if isinstance(t.coefficient, str) else float(t.fixed_value or 0.0),
                 t.order.constant,
             )
             for t in equation.terms
@@ -166,7 +166,7 @@ def base_models(nested: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
     equation = structure.equations[0]
     output_terms = [t for t in equation.terms if t.signal == equation.output]
     tops = nested.integer_values(equation.order.names[0]) if equation.order.is_single else [equation.order.constant]
-    input_terms = [t for t in equation.terms if t.signal != equation.output and t.fixed is not None]
+    input_terms = [t for t in equation.terms if t.signal != equation.output and t.fixed_value is not None]
     droppable = [t for t in equation.terms if t.signal != equation.output and t.coefficient in nested.droppable]
 
     def base_model(variant: Variant, fixed_terms: Sequence[Term], highest_order: float, free: Free) -> BaseModel | None:

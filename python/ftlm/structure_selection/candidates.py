@@ -189,7 +189,9 @@ class NestedStructures:
             input_terms = [
                 t for t in equation.terms if t.coefficient in self.droppable and equation.output not in t.signals
             ]
-            has_fixed_terms = any(not self._is_optional_output_term(t) and t.fixed is not None for t in equation.terms)
+            has_fixed_terms = any(
+                not self._is_optional_output_term(t) and t.fixed_value is not None for t in equation.terms
+            )
             if not input_terms or has_fixed_terms:
                 yield Change(describe_structure(self.build(variant)), variant)
                 continue
@@ -356,7 +358,11 @@ def signature(structure: Structure) -> str:
     parts = []
     for equation in structure.equations:
         terms = sorted(
-            (t.column, "free" if t.order.is_single else str(t.order), "free" if t.fixed is None else repr(t.fixed))
+            (
+                t.column,
+                "free" if t.order.is_single else str(t.order),
+                "free" if t.fixed_value is None else repr(t.fixed_value),
+            )
             for t in equation.terms
         )
         parts.append(f"{equation.output} {'free' if equation.order.is_single else equation.order} {terms}")
