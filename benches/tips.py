@@ -47,7 +47,7 @@ CHECKPOINT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
 
 def structures():
-    """Three models of a stage: the arm's law with free orders, with integer orders, and integer orders without a law."""
+    """Three models of a stage: the arm's law with free and with integer orders, and integer orders without a law."""
     law = ftlm.flexible_link(stage=1, sensor_filter="stock", offset="constant", friction=True)
     free = ftlm.equation(
         "D^2 theta11 = k theta12 + e D theta12 + b D theta11 + g I1; "

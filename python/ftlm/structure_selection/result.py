@@ -209,7 +209,7 @@ class Selection(BestIdentification):
                     "structure": t.name,
                     **attributes(t, ("parameter_count", "estimation", "validation", "score", "bic", "values")),
                     "standard_errors": json_value(t.standard_errors),
-                    **attributes(t, ("insignificant", "unstable", "failed")),
+                    **attributes(t, ("insignificant", "unstable", "failure")),
                 }
                 for t in self.trials
             ],
