@@ -587,7 +587,7 @@ def test_names_with_scripts_in_them_are_text(used, loop):
                     "first": None,
                     "low": None,
                     "high": None,
-                    "words": HOSTILE,
+                    "description": HOSTILE,
                 }
             ],
             "options": {"inputs": {HOSTILE: HOSTILE}, "units": {HOSTILE: HOSTILE}, "outputs": {HOSTILE: HOSTILE}},

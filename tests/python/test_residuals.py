@@ -214,7 +214,7 @@ def test_identify_reports_both_tests_and_the_criteria(noisy):
     assert found.information.sample_count == noisy.length - 2
     assert "AIC " in found.details()
     assert "residuals white" in str(found)
-    assert json.loads(json.dumps(found.to_dict(), default=list, allow_nan=False))["information"]["parameters"] == 4
+    assert json.loads(json.dumps(found.to_dict(), default=list, allow_nan=False))["information"]["parameter_count"] == 4
     assert found.resid(noisy).outputs["y"].rms == found.residuals.outputs["y"].rms
 
 
