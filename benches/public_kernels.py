@@ -128,7 +128,7 @@ def main() -> None:
 
     def recursion() -> None:
         orders, hold = [1.9, 0.8, 0.5, 0.3, 0.0], [False, False, True]
-        kernels.Recursion(orders, [0, 1, 0, 2], step=STEP, hold=hold, max_pulses=SAMPLES).push(rows)
+        kernels.Recursion(orders, [0, 1, 0, 2], step=STEP, hold=hold, longest=SAMPLES).push(rows)
 
     say(f"Recursion, four terms, p = 7: {shortest(recursion) / SAMPLES * 1e6:.2f} us a sample (promised 1)")
     if arguments.write:

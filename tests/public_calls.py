@@ -296,7 +296,7 @@ def own_arguments(sound):
         "kernels.Candidates.__init__": {"signals": np.stack([U, T]), "terms": [0, 1]},
         "kernels.Candidates.coefficients": {"orders": [[1.0, 0.0, 0.0]]},
         "kernels.Candidates.score": {"orders": [[1.0, 0.0, 0.0]]},
-        "kernels.Candidates.simulate": {"orders": [[1.0, 0.0, 0.0]], "coefficients": [[-1.0, 2.0]]},
+        "kernels.Candidates.free_run": {"orders": [[1.0, 0.0, 0.0]], "coefficients": [[-1.0, 2.0]]},
         "kernels.errors": {"measured": T, "predicted": U},
         "kernels.pulse_means": {"samples": T},
         "plot.landscape": {"result": sound["search"]},

@@ -172,7 +172,7 @@ class _SentenceFormatter(string.Formatter):
 
 
 class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Finding about data, a fit or a model: a code, its subjects, and the values in its sentence.
+    """Finding about data, a fit or a model: a code, its subjects, and the numbers in its sentence.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         Names of the subjects of the finding; empty if not applicable. Several names are joined by commas.
     role
         ``"validation"`` if the run is a validation run, otherwise empty.
-    values
+    numbers
         Numbers and texts that are inserted into the sentence, by name.
 
     Raises
@@ -198,7 +198,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     parameter: str = ""
     method: str = ""
     role: str = ""
-    values: dict[str, float | int | str] = {}
+    numbers: dict[str, float | int | str] = {}
 
     def __post_init__(self) -> None:
         if self.code not in finding_catalogue().kinds:
@@ -258,9 +258,9 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     def _render(self, template: str) -> str:
         fields: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
         # An option in the words of the one who loaded the run means nothing to the reader of a page.
-        override = self.values.get("override", "") if current_interface() in TYPED_INTERFACES else ""
+        override = self.numbers.get("override", "") if current_interface() in TYPED_INTERFACES else ""
         override = f"; otherwise {override}" if override else ""
-        fields |= {**self.values, "override": override, "option": _ParameterText(), "choose": _InterfaceText()}
+        fields |= {**self.numbers, "override": override, "option": _ParameterText(), "choose": _InterfaceText()}
         try:
             if "{remedy}" in template:
                 fields["remedy"] = self.remedy
@@ -271,14 +271,14 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     def to_file(self) -> Finding:
         """Return a copy of the finding for a file, with nonfinite numbers as text."""
-        return msgspec.structs.replace(self, values={n: _storable(v) for n, v in self.values.items()})
+        return msgspec.structs.replace(self, numbers={n: _storable(v) for n, v in self.numbers.items()})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as a dictionary for JSON, with its level, text and remedy."""
         subject = {n: v for n in (*SUBJECT_FIELDS, "role") if (v := getattr(self, n))}
-        values = {n: _storable(v) for n, v in self.values.items()}
+        numbers = {n: _storable(v) for n, v in self.numbers.items()}
         head = {"code": self.code, "level": self.level}
-        return {**head, **subject, "values": values, "text": self.text, "remedy": self.remedy}
+        return {**head, **subject, "numbers": numbers, "text": self.text, "remedy": self.remedy}
 
     def __str__(self) -> str:
         return self.text
@@ -292,12 +292,12 @@ def _storable(value: float | str) -> float | int | str:
 
 
 def make_finding(code: str, **fields: Any) -> Finding:
-    """Return the finding with the given code; keyword arguments are its subjects and values by name.
+    """Return the finding with the given code; keyword arguments are its subjects and numbers by name.
 
     Raise ModelError if the code is not in the catalogue.
     """
     subject = {n: fields.pop(n) for n in SUBJECT_FIELDS if n in fields}
-    return Finding(code, **subject, values=fields)
+    return Finding(code, **subject, numbers=fields)
 
 
 def texts(findings: Iterable[Finding]) -> tuple[str, ...]:

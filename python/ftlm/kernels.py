@@ -221,7 +221,7 @@ def toeplitz_solve(kernel: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
 @check_arguments
 def multi_innovation(
-    Q: ArrayLike, m: ArrayLike, innovation_length: int = 7, *, prior_covariance: ArrayLike, trace: bool = False
+    Q: ArrayLike, m: ArrayLike, p: int = 7, *, prior_covariance: ArrayLike, trace: bool = False
 ) -> NDArray[np.float64]:
     """Return the multi-innovation estimate of X in m = Q X by equations (42)-(44) of the paper, starting from X = 0.
 
@@ -231,7 +231,7 @@ def multi_innovation(
         Regressors, shape (..., M, k), with rows in the sequence of the recursion.
     m
         Outputs, shape (..., M).
-    innovation_length
+    p
         Innovation length: number of most recent rows that each step of the recursion uses.
     prior_covariance
         Initial variance of the coefficients, one number or shape (k,), in the squared units of the coefficients.
@@ -255,7 +255,7 @@ def multi_innovation(
     Notes
     -----
     Without ``trace`` the estimate is computed in closed form by a QR factorization of cost O(M k^2), in which row i of
-    M has the weight min(p, M - i + 1) for innovation length p.
+    M has the weight min(p, M - i + 1).
     """
     regressors, outputs = finite_floats("Q", Q), finite_floats("m", m)
     if regressors.ndim < 2 or outputs.ndim < 1 or regressors.shape[-2] != outputs.shape[-1] or not outputs.shape[-1]:
@@ -263,7 +263,7 @@ def multi_innovation(
             f"Q has shape {regressors.shape}, m has shape {outputs.shape}; give shapes (..., M, k) and "
             "(..., M) with M of at least 1"
         )
-    length = check_integer("innovation_length", innovation_length, 1)
+    length = check_integer("p", p, 1)
     count, width = regressors.shape[-2:]
     prior = as_floats("prior_covariance", prior_covariance)
     if prior.ndim > 1 or (prior.ndim and prior.size != width):
@@ -376,9 +376,9 @@ class Candidates:
         self,
         orders: ArrayLike,
         *,
-        innovation_length: int = 0,
+        p: int = 0,
         prior_covariance: ArrayLike = math.inf,
-        row_basis: Literal["haar", "time"] = "haar",
+        rows: Literal["haar", "time"] = "haar",
     ) -> NDArray[np.float64]:
         """Estimate the coefficients for each tuple of orders, by least squares or multi-innovation.
 
@@ -386,11 +386,11 @@ class Candidates:
         ----------
         orders
             Shape (N, 1 + k): alpha, then the order of each term.
-        innovation_length
+        p
             Innovation length; 0 for least squares.
         prior_covariance
             Initial covariance of the coefficients, a number or shape (k,); infinite for no prior.
-        row_basis
+        rows
             Basis of the rows in equation (42) of the paper: ``"haar"``, which requires an M that is a power of two, or
             ``"time"``.
 
@@ -404,8 +404,8 @@ class Candidates:
         DataError
             Orders that are not finite, or of another shape; an M that is not a power of two, for Haar rows.
         ModelError
-            If an order of a term is above alpha or below 0, or alpha is above 10. Also if innovation length or prior
-            covariance is out of range.
+            If an order of a term is above alpha or below 0, or alpha is above 10. Also if p or the prior covariance is
+            out of range.
 
         Notes
         -----
@@ -413,8 +413,8 @@ class Candidates:
         where K is the number of distinct fractional integrals.
         """
         table = self._orders(orders)
-        length = check_integer("innovation_length", innovation_length, 0)
-        check_choice("row_basis", row_basis, ("haar", "time"))
+        length = check_integer("p", p, 0)
+        check_choice("rows", rows, ("haar", "time"))
         prior = as_floats("prior_covariance", prior_covariance)
         if prior.ndim > 1 or (prior.ndim and prior.size != len(self._terms)) or not np.all(prior > 0):
             raise ModelError(
@@ -422,7 +422,7 @@ class Candidates:
                 f"{len(self._terms)}, one per term"
             )
         columns = self._integral_rows(table)
-        gram = self._gram(length, row_basis)
+        gram = self._gram(length, rows)
         normal = gram[columns[:, :, None], columns[:, None, :]]
         normal[:, range(len(self._terms)), range(len(self._terms))] += 1.0 / np.broadcast_to(prior, len(self._terms))
         norms = np.sqrt(np.einsum("nii->ni", normal))
@@ -441,9 +441,9 @@ class Candidates:
         orders: ArrayLike,
         coefficients: ArrayLike | None = None,
         *,
-        innovation_length: int = 0,
+        p: int = 0,
         prior_covariance: ArrayLike = math.inf,
-        row_basis: Literal["haar", "time"] = "haar",
+        rows: Literal["haar", "time"] = "haar",
         norm: Literal["l1", "l2"] = "l1",
         limit: float = math.inf,
         threads: int = 1,
@@ -455,8 +455,8 @@ class Candidates:
         orders
             Shape (N, 1 + k): alpha, then the order of each term.
         coefficients
-            Shape (N, k); by default they are estimated by :meth:`coefficients` with the next arguments.
-        innovation_length, prior_covariance, row_basis
+            Shape (N, k); by default they are estimated by :meth:`coefficients` with p, prior covariance and rows.
+        p, prior_covariance, rows
             See :meth:`coefficients`.
         norm
             ``"l1"``: sum of absolute errors. ``"l2"``: root mean square error.
@@ -476,7 +476,7 @@ class Candidates:
         DataError
             Orders that are not finite, or orders or coefficients of another shape.
         ModelError
-            If an order, innovation length, prior covariance or limit is out of range; see :meth:`coefficients`.
+            If an order, p, the prior covariance or the limit is out of range; see :meth:`coefficients`.
 
         Notes
         -----
@@ -489,9 +489,7 @@ class Candidates:
         if math.isnan(max_error):
             raise ModelError(f"{parameter('limit', limit)} is not a number; give a maximum error, or inf for no limit")
         if coefficients is None:
-            coefficients_table = self.coefficients(
-                table, innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
-            )
+            coefficients_table = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
         else:
             coefficients_table = self._check_shape(as_floats("coefficients", coefficients, gaps=True), len(table))
         scores = np.full(len(table), np.inf)
@@ -502,7 +500,7 @@ class Candidates:
         return scores, coefficients_table
 
     @check_arguments
-    def simulate(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
+    def free_run(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
         """Simulate the output with zero initial conditions for each tuple of orders and coefficients.
 
         Parameters
@@ -598,17 +596,17 @@ class Candidates:
         rows_of_keys = np.array([self._columns[key] for key in keys], dtype=np.intp)
         return rows_of_keys[inverse.ravel()].reshape(order_differences.shape)
 
-    def _gram(self, innovation_length: int, row_basis: str) -> NDArray[np.float64]:
+    def _gram(self, p: int, rows: str) -> NDArray[np.float64]:
         """Return the matrix of inner products of the output and all cached integrals.
 
-        Pulse i of M has the weight min(p, M - i + 1) for innovation length p; for p = 0 all weights are 1.
+        Pulse i of M has the weight min(p, M - i + 1); for p = 0 all weights are 1.
         """
-        key = f"{row_basis} {innovation_length}" if innovation_length else "least squares"
+        key = f"{rows} {p}" if p else "least squares"
         if key not in self._cache:
             integrals = self._cache["time"]
-            if innovation_length:
-                weights = np.minimum(innovation_length, np.arange(integrals.shape[1], 0, -1.0))
-                integrals = np.sqrt(weights) * (haar(integrals) if row_basis == "haar" else integrals)
+            if p:
+                weights = np.minimum(p, np.arange(integrals.shape[1], 0, -1.0))
+                integrals = np.sqrt(weights) * (haar(integrals) if rows == "haar" else integrals)
             self._cache[key] = integrals @ integrals.T
         return self._cache[key]
 
@@ -631,7 +629,7 @@ class Recursion:
     hold
         For each of s signals, whether it is constant between samples (zero-order hold), as commands are. Otherwise it
         is interpolated linearly.
-    innovation_length
+    p
         Innovation length: number of most recent regression equations in each update.
     prior_covariance
         Initial variance of every coefficient. By default it is 1e10 divided by the sum of squares of the coefficient's
@@ -641,7 +639,7 @@ class Recursion:
     initial
         Exponents, above -1, of powers of time that are added as terms for nonzero initial conditions. ``"caputo"``
         selects the exponents of Caputo's initial values. By default initial conditions are zero.
-    max_pulses
+    longest
         Maximum number of samples, minus one.
     fixed
         Fixed value of each term's coefficient, or None for a free coefficient; by default all are free.
@@ -680,11 +678,11 @@ class Recursion:
         output: int = 0,
         step: float,
         hold: Sequence[bool],
-        innovation_length: int = 7,
+        p: int = 7,
         prior_covariance: float | None = None,
         forgetting: float = 1.0,
         initial: Sequence[float] | Literal["caputo"] = (),
-        max_pulses: int = 1_000_000,
+        longest: int = 1_000_000,
         fixed: Sequence[float | None] | None = None,
     ) -> None:
         rows = _signal_rows(terms, output, len(hold))
@@ -693,7 +691,7 @@ class Recursion:
             raise DataError(
                 f"orders has shape {numbers.shape}; give ({1 + len(rows)},): alpha, then one order per term"
             )
-        length = check_integer("innovation_length", innovation_length, 1, (1 << 31) - 1)
+        length = check_integer("p", p, 1, (1 << 31) - 1)
         if isinstance(initial, str):
             check_choice("initial", initial, ("caputo",))
         exponents = [] if isinstance(initial, str) else [real_number("initial", e) for e in initial]
@@ -701,7 +699,7 @@ class Recursion:
         self._count = len(hold)
         self._core = _core.Streaming(
             real_number("step", step),
-            max(2, check_pulses(max_pulses)),
+            max(2, check_pulses(longest)),
             [bool(h) for h in hold],
             [(equation, [None] * len(rows) if fixed is None else list(fixed))],
             length,
@@ -729,7 +727,7 @@ class Recursion:
         DataError
             Values that are not finite (with the first index and the count), or another number of signals.
         ModelError
-            If there are more samples than ``max_pulses`` allows.
+            If there are more samples than ``longest`` allows.
         ConvergenceError
             If rounding makes the covariance lose its positive definiteness.
         """

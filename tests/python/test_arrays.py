@@ -161,9 +161,9 @@ CALLS = {
         (TUPLES.score, ORDER_TUPLES),
         (lambda x: TUPLES.score(ORDER_TUPLES, x), np.array([[-1.0, 2.0], [-2.0, 1.0]])),
     ],
-    "kernels.Candidates.simulate": [
-        (lambda x: TUPLES.simulate(x, np.array([[-1.0, 2.0], [-2.0, 1.0]])), ORDER_TUPLES),
-        (lambda x: TUPLES.simulate(ORDER_TUPLES, x), np.array([[-1.0, 2.0], [-2.0, 1.0]])),
+    "kernels.Candidates.free_run": [
+        (lambda x: TUPLES.free_run(x, np.array([[-1.0, 2.0], [-2.0, 1.0]])), ORDER_TUPLES),
+        (lambda x: TUPLES.free_run(ORDER_TUPLES, x), np.array([[-1.0, 2.0], [-2.0, 1.0]])),
     ],
     "kernels.errors": [(lambda x: kernels.errors(x, U), T), (lambda x: kernels.errors(T, x), U)],
     "plot.bode": [(lambda x: plot.bode(MODEL, x), W)],

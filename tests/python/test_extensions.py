@@ -74,11 +74,11 @@ def test_the_estimated_delay_and_the_term_to_write():
     run = record(*plant, 1, [1.0])
     poor = ftlm.identify(run, ftlm.equation("D^alpha y = a y + b u"))
     (said,) = (f for f in poor.findings if f.code == "delay_fits")
-    assert abs(said.values["value"] / (5 * STEP) - 1) < 0.05
+    assert abs(said.numbers["value"] / (5 * STEP) - 1) < 0.05
     assert "u(t - 0:" in said.remedy
     assert poor.verdict.reason.startswith("y follows u with a delay of")
     # What the remedy says to write finds the plant.
-    limit = said.values["longest"]
+    limit = said.numbers["longest"]
     better = ftlm.identify(run, ftlm.equation(f"D^alpha y = a y + b u(t - 0:{limit:.2g})"))
     assert abs(better.orders["alpha"] - 1) < 3 * better.standard_errors["alpha"]
     *plant, _ = MISSING["feedthrough"]
@@ -94,10 +94,10 @@ def test_a_given_delay_that_is_wrong_is_named_beside_the_right_one(rows, given):
     delayed = f"u(t {'-' if given > 0 else '+'} {abs(given) * STEP})"
     found = ftlm.identify(run, ftlm.equation(f"D y = a y + b {delayed}"))
     (named,) = (f for f in found.findings if f.code == "delay_differs")
-    assert abs(named.values["value"] - rows * STEP) < 0.1 * STEP
-    assert named.values["before"] == pytest.approx(given * STEP)
+    assert abs(named.numbers["value"] - rows * STEP) < 0.1 * STEP
+    assert named.numbers["before"] == pytest.approx(given * STEP)
     # The interval of the remedy holds the delay.
-    bounds = named.values["low"], named.values["high"]
+    bounds = named.numbers["low"], named.numbers["high"]
     better = ftlm.identify(run, ftlm.equation("D y = a y + b u", delay={"u": bounds}))
     assert better.verdict.level != "do not use"
     assert abs(better.parameters["delay_u"].value - rows * STEP) < 0.1 * STEP
@@ -124,7 +124,7 @@ def test_how_an_input_acts_is_named(kind, seed):
     assert said.code == expected
     assert said.reason in found.verdict.reasons
     if limit is not None:
-        assert abs(said.values["value"] / limit - 1) < 0.03
+        assert abs(said.numbers["value"] / limit - 1) < 0.03
         # What the remedy says to write is read, and finds the limit.
         (term,) = re.findall(r"(?:sat|dead)\(.*?\)", said.remedy)
         better = ftlm.identify(run, ftlm.equation(f"D y = a y + b {term}"))
@@ -164,7 +164,7 @@ def test_dry_friction_is_named_and_its_term_finds_it(kind, seed, friction):
     (said,) = (f for f in found.findings if f.code in CODES)
     assert said.code == "friction_fits"
     assert said.reason in found.verdict.reasons
-    assert abs(said.values["value"] / true - 1) < 0.1
+    assert abs(said.numbers["value"] / true - 1) < 0.1
     assert term.split("(")[0] in said.remedy
     added = said.remedy.removeprefix("add the term ")
     better = ftlm.identify(run, ftlm.equation(f"{poor} {added}"))
@@ -228,8 +228,8 @@ def test_a_load_that_steps_in_the_record_is_named(seed):
     found = ftlm.identify(run, ftlm.equation("D y = a y + b u"))
     (said,) = (f for f in found.findings if f.code in CODES)
     assert said.code == "load_step_fits"
-    assert abs(said.values["time"] / STEP - 280) <= 3
-    assert abs(said.values["value"] / (0.6 * RATE) - 1) < 0.05
+    assert abs(said.numbers["time"] / STEP - 280) <= 3
+    assert abs(said.numbers["value"] / (0.6 * RATE) - 1) < 0.05
 
 
 def test_names_of_the_equation_are_no_obstacle():

@@ -197,7 +197,7 @@ def test_an_output_that_moves_before_its_input_is_named_with_the_rows(early, see
         for item in found.findings:
             if item.code == "moves_before_input":
                 said += 1
-                assert item.values["rows"] == pytest.approx(early, abs=0.3)
+                assert item.numbers["rows"] == pytest.approx(early, abs=0.3)
                 assert "y moves before its input" in item.text
     assert said == (seeds if early else 0)
 
@@ -437,9 +437,9 @@ def test_a_mode_with_few_samples_a_period_is_named():
         said = [f for f in found.findings if f.code == "mode_sampled_coarsely"]
         assert len(said) == named
         if named:
-            assert said[0].values["samples"] == pytest.approx(2 * np.pi / (4 * step), rel=0.02)
+            assert said[0].numbers["samples"] == pytest.approx(2 * np.pi / (4 * step), rel=0.02)
             # A hold is half a sample late and sinc(1/n) small.
-            assert said[0].values["phase"] == pytest.approx(180 / said[0].values["samples"])
+            assert said[0].numbers["phase"] == pytest.approx(180 / said[0].numbers["samples"])
 
 
 def test_a_level_that_drifts_is_named_with_its_remedy():
@@ -454,8 +454,8 @@ def test_a_level_that_drifts_is_named_with_its_remedy():
     # Without the line it is named with what it changes.
     plain = ftlm.identify(run_of(u, y), ftlm.equation(WORDS))
     (drift,) = [f for f in plain.findings if f.code == "drift_fits"]
-    assert drift.values["ratio"] < 0.01
-    assert drift.values["other_value"] == pytest.approx(found.parameters[drift.parameter].value, rel=1e-3)
+    assert drift.numbers["ratio"] < 0.01
+    assert drift.numbers["other_value"] == pytest.approx(found.parameters[drift.parameter].value, rel=1e-3)
     assert "offset_missing" not in codes(plain)
     assert any("the level of y drifts" in reason for reason in plain.verdict.reasons)
 
@@ -479,7 +479,7 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     if name == "fractional":
         assert not said
         return
-    numbers = said[0].values
+    numbers = said[0].numbers
     assert numbers["gain"] == pytest.approx(panel_gain(found), rel=1e-9)
     given = ftlm.identify(record, ftlm.equation(FRACTIONAL, initial="caputo", offset="level"))
     assert numbers["other_gain"] == pytest.approx(panel_gain(given), rel=5e-3)

@@ -160,7 +160,7 @@ def candidates(m=64, seed=4):
 def test_coefficients_of_candidates_are_those_of_dense_columns(p, prior, rows):
     model, signals, tuples = candidates()
     turn = kernels.haar if rows == "haar" else np.asarray
-    found = model.coefficients(tuples, innovation_length=p, prior_covariance=prior, row_basis=rows)
+    found = model.coefficients(tuples, p=p, prior_covariance=prior, rows=rows)
     for order, own in zip(tuples, found, strict=True):
         columns = [
             kernels.integrate(signals[row], order[0] - order[1 + j], step=STEP) for j, row in enumerate([1, 0, 2])
@@ -172,9 +172,9 @@ def test_coefficients_of_candidates_are_those_of_dense_columns(p, prior, rows):
             expected = np.linalg.lstsq(columns, output, rcond=None)[0]
         np.testing.assert_allclose(own, expected, rtol=1e-9)
     # What is kept between calls changes nothing.
-    again = model.coefficients(tuples[::-1], innovation_length=p, prior_covariance=prior, row_basis=rows)
+    again = model.coefficients(tuples[::-1], p=p, prior_covariance=prior, rows=rows)
     np.testing.assert_allclose(again[::-1], found, rtol=1e-12)
-    fresh = candidates()[0].coefficients(tuples[2:], innovation_length=p, prior_covariance=prior, row_basis=rows)
+    fresh = candidates()[0].coefficients(tuples[2:], p=p, prior_covariance=prior, rows=rows)
     np.testing.assert_allclose(fresh, found[2:], rtol=1e-9)
 
 
@@ -182,7 +182,7 @@ def test_coefficients_of_candidates_are_those_of_dense_columns(p, prior, rows):
 def test_scores_of_candidates_are_errors_of_their_simulations(norm):
     model, signals, tuples = candidates()
     scores, numbers = model.score(tuples, norm=norm)
-    simulated = model.simulate(tuples, numbers)
+    simulated = model.free_run(tuples, numbers)
     for order, own, outputs in zip(tuples, numbers, simulated, strict=True):
         gaps = order[0] - order[1:]
         divisor = np.eye(64) - own[0] * dense(kernels.block_pulse_kernel(gaps[0], 64, step=STEP))
@@ -207,7 +207,7 @@ def test_candidates_agree_with_identify(small_run, p, prior):
     y, u = (kernels.pulse_means(small_run[n], 256, hold=n == "u") for n in "yu")
     model = kernels.Candidates([y, u], [0, 0, 1], step=small_run.duration / 256)
     orders = [[alpha, beta, 0.0, 0.0] for alpha in (1.7, 1.8) for beta in (0.5, 0.6)]
-    scores, coefficients = model.score(orders, innovation_length=p, prior_covariance=prior)
+    scores, coefficients = model.score(orders, p=p, prior_covariance=prior)
     best = int(scores.argmin())
     assert orders[best][:2] == pytest.approx([found.orders["alpha"], found.orders["beta"]])
     np.testing.assert_allclose(coefficients[best], [found.coefficients[n] for n in ("a1", "a0", "b")], rtol=1e-9)
@@ -222,7 +222,7 @@ def test_candidates_without_an_estimate_are_marked():
     none = model.score(np.zeros((0, 3)))
     assert none[0].shape == (0,)
     assert none[1].shape == (0, 2)
-    assert model.simulate(np.zeros((0, 3)), np.zeros((0, 2))).shape == (0, 8)
+    assert model.free_run(np.zeros((0, 3)), np.zeros((0, 2))).shape == (0, 8)
 
 
 @pytest.mark.parametrize(
@@ -254,10 +254,7 @@ def test_candidates_without_an_estimate_are_marked():
             lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(5), prior_covariance=1.0),
             r"\(4, 2\), m has shape \(5,\)",
         ),
-        (
-            lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), 0, prior_covariance=1.0),
-            "innovation_length = 0",
-        ),
+        (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), 0, prior_covariance=1.0), "p = 0"),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=-1.0), "prior"),
         (lambda: kernels.multi_innovation(np.ones((4, 2)), np.ones(4), prior_covariance=[1.0] * 3), "prior_covariance"),
         (lambda: kernels.errors(np.ones(3), np.ones(4)), r"\(3,\), predicted \(4,\)"),
@@ -270,15 +267,12 @@ def test_candidates_without_an_estimate_are_marked():
         (lambda: kernels.Candidates(np.ones((2, 4)), [], step=STEP), "terms is empty|terms. is empty"),
         (lambda: PAIR.coefficients([0.5, 0.1]), r"orders has shape \(2,\); give \(N, 2\)"),
         (lambda: PAIR.coefficients([[0.5, 0.1], [0.5, 0.6]]), r"orders 1 of 2 are \[0.5, 0.6\] \(1 such"),
-        (
-            lambda: PAIR.coefficients([[0.5, 0.1]], innovation_length=-1),
-            "innovation_length = -1 is not a whole number of at least 0",
-        ),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], p=-1), "p = -1 is not a whole number of at least 0"),
         (lambda: PAIR.coefficients([[0.5, 0.1]], prior_covariance=0.0), "prior_covariance is not positive"),
-        (lambda: PAIR.coefficients([[0.5, 0.1]], row_basis="fourier"), "row_basis = 'fourier' is not known"),
-        (lambda: SHORT.coefficients([[0.5, 0.1]], innovation_length=7), "power of two"),
+        (lambda: PAIR.coefficients([[0.5, 0.1]], rows="fourier"), "rows = 'fourier' is not known"),
+        (lambda: SHORT.coefficients([[0.5, 0.1]], p=7), "power of two"),
         (lambda: PAIR.score([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\); give \(1, 1\)"),
-        (lambda: PAIR.simulate([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\)"),
+        (lambda: PAIR.free_run([[0.5, 0.1]], [[1.0, 2.0]]), r"coefficients has shape \(1, 2\)"),
     ],
 )
 def test_wrong_arguments_are_refused_in_words(call, words):
@@ -288,9 +282,7 @@ def test_wrong_arguments_are_refused_in_words(call, words):
 
 def test_a_recursion_ends_at_the_rows_so_far():
     y, u = np.cumsum(noise(2, 60), axis=1)
-    stream = kernels.Recursion(
-        [1.3, 0.4, 0.0], [0, 1], step=STEP, hold=[False, True], innovation_length=3, prior_covariance=1e4
-    )
+    stream = kernels.Recursion([1.3, 0.4, 0.0], [0, 1], step=STEP, hold=[False, True], p=3, prior_covariance=1e4)
     path = stream.push(np.stack([y, u], axis=1)[:50])
     assert path.shape == (50, 2)
     np.testing.assert_array_equal(path[-1], stream.coefficients)
@@ -307,7 +299,7 @@ def test_a_recursion_ends_at_the_rows_so_far():
 
 def test_a_recursion_forgets_by_powers_of_its_factor():
     y, u = np.cumsum(noise(2, 80), axis=1)
-    stream = kernels.Recursion([1.0, 0.0], [1], step=STEP, hold=[False, True], innovation_length=1, forgetting=0.9)
+    stream = kernels.Recursion([1.0, 0.0], [1], step=STEP, hold=[False, True], p=1, forgetting=0.9)
     (found,) = stream.push(np.stack([y, u], axis=1))[-1]
     target, means = kernels.pulse_means(y), kernels.pulse_means(u, hold=True)
     q = kernels.integrate(means, 1.0, step=STEP)
@@ -341,8 +333,8 @@ def test_a_start_in_motion_is_a_term_of_a_recursion():
         (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial=[-1.0]), r"exponent"),
         (lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], initial="rest"), "initial = 'rest'"),
         (
-            lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], innovation_length=0),
-            "innovation_length = 0 is not a whole number from 1",
+            lambda: kernels.Recursion([1, 0], [1], step=STEP, hold=[False, True], p=0),
+            "p = 0 is not a whole number from 1",
         ),
         (lambda: STREAM.push(np.ones(3)), r"samples has shape \(3,\); give \(n, 2\)"),
         (lambda: STREAM.push([[0.0, np.nan]]), r"samples is not finite at index \[0, 1\]"),

@@ -317,7 +317,7 @@ def test_a_report_names_no_option_as_it_is_typed(saved, tmp_path):
     # A note on an assumption has the option that replaces it only where it is typed.
     note = pickle.loads(pickle.dumps(Note("decimal commas", "--decimal point")))
     assert (note, note.fact) == ("decimal commas; otherwise --decimal point", "decimal commas")
-    finding = ftlm.Finding("data_note", values={"text": note.fact, "override": note.override})
+    finding = ftlm.Finding("data_note", numbers={"text": note.fact, "override": note.override})
     assert finding.text == note
     with use_interface("report"):
         assert finding.text == note.fact

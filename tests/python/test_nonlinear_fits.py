@@ -178,10 +178,10 @@ def test_the_linear_model_is_the_derivative_of_the_free_run():
 def test_findings_say_range_and_share_of_each_term(runs):
     result = ftlm.identify(runs["drag"], at_true_orders("drag"), method="least-squares")
     (found,) = (f for f in result.findings if f.code == "nonlinear_range")
-    assert (found.output, found.values["term"]) == ("y", "abs(D y)*D y")
+    assert (found.output, found.numbers["term"]) == ("y", "abs(D y)*D y")
     assert re.search(r"D y from -\d\.\d+ to \d\.\d+", str(found))
     velocity = np.gradient(runs["drag"]["y"], 0.01)
-    assert 20 < found.values["share"] < 100
+    assert 20 < found.numbers["share"] < 100
     assert f"{velocity.max():.1f}"[:1] in str(found)
 
 
@@ -197,7 +197,7 @@ def test_a_run_that_forgets_its_parameters_is_said():
 
     chaos = codes("D^2 y = -0.3 D^0.9 y + 1 y - 1 y^3 + 0.6 u")["simulation_chaotic"]
     assert chaos.level == "do not use"
-    assert 20 < chaos.values["seconds"] < 150
+    assert 20 < chaos.numbers["seconds"] < 150
     assert "simulation_chaotic" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
     # A linear unstable model grows with its output.
     assert "simulation_chaotic" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")

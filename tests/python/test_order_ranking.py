@@ -71,7 +71,7 @@ def test_rows_that_are_one_model_are_folded_and_counted():
     assert sum(count for _, count in distinct) == 20
     assert len(distinct) <= 4
     said = next(f for f in found.findings if f.code == "table_rows_equivalent")
-    assert said.values["models"] == len(distinct)
+    assert said.numbers["models"] == len(distinct)
     # Rows of one model differ by one number added to all orders.
     first = distinct[0][0]
     for row in found.table[1 : distinct[0][1]]:

@@ -181,7 +181,7 @@ def test_numbers_are_those_of_the_comparison(page, identified, square, sine):
 
 
 def test_warnings_come_before_details(tmp_path, identified):
-    notes = tuple(ftlm.Finding("data_note", values={"text": text}) for text in (HOSTILE, "second"))
+    notes = tuple(ftlm.Finding("data_note", numbers={"text": text}) for text in (HOSTILE, "second"))
     unstable = ftlm.Identification(
         identified.model, "least-squares", identified.comparison, {}, identified.settings, notes
     )

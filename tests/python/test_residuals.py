@@ -470,9 +470,9 @@ def test_a_wrong_behavior_between_samples_is_found(true, seeds):
         assert "other_intersample_fits" not in {f.code for f in right.findings}
         wrong = ftlm.identify(run.with_intersample({"u": other}), structure)
         (found,) = [f for f in wrong.findings if f.code == "other_intersample_fits"]
-        assert (found.input, found.parameter, found.values["kind"]) == ("u", "a", true)
+        assert (found.input, found.parameter, found.numbers["kind"]) == ("u", "a", true)
         assert abs(wrong.parameters["a"].value - a) > 8 * wrong.parameters["a"].standard_error
-        assert found.values["other_value"] == pytest.approx(right.parameters["a"].value, rel=1e-4)
+        assert found.numbers["other_value"] == pytest.approx(right.parameters["a"].value, rel=1e-4)
 
 
 def test_an_input_of_noise_and_a_missing_lag_keep_their_behavior_between_samples():
@@ -511,7 +511,7 @@ def test_friction_that_a_linear_model_lacks_is_named_with_the_term(seed):
     (said,) = [f for f in found.findings if f.code == "friction_fits"]
     assert not [f for f in found.findings if f.code == "noise_coloured"]
     assert found.validate(other).verdict.level == "with care"
-    term = said.values["term"]
+    term = said.numbers["term"]
     assert term.startswith("- fc*tanh(")
     whole = ftlm.identify(run, ftlm.equation(f"D w = a w + b u {term}"), threads=1)
     assert not [f for f in whole.findings if f.code == "friction_fits"]

@@ -48,8 +48,8 @@ def test_a_second_optimum_of_a_spectrum_is_named_with_both_values(seed):
     (said,) = (f for f in found.findings if f.code == "second_optimum")
     assert "alpha" in said.parameter.split(", ")
     assert said.level == "with care"
-    assert 0.0 <= said.values["difference"] <= 2.0
-    values = sorted([found.values["alpha"], float(said.values["shown"].split()[2])])
+    assert 0.0 <= said.numbers["difference"] <= 2.0
+    values = sorted([found.values["alpha"], float(said.numbers["shown"].split()[2])])
     assert values == pytest.approx([0.75, 1.24], abs=0.04)
 
 
@@ -96,7 +96,7 @@ def test_a_second_optimum_of_a_run_is_named(seed):
     found = ftlm.identify(run, structure)
     (said,) = (f for f in found.findings if f.code == "second_optimum")
     assert said.parameter.split(", ")[-1] == "delay_u"
-    shown = said.values["shown"].rpartition("delay_u = ")[2].split()
+    shown = said.numbers["shown"].rpartition("delay_u = ")[2].split()
     # Held inputs act half a sample later than straight lines; the optima lie half a period or a period apart.
     values = np.array([float(shown[0]), float(shown[2])])
     assert found.parameters["delay_u"].value == pytest.approx(values[1], rel=1e-3)

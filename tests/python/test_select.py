@@ -276,7 +276,7 @@ def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival
     if rival:
         free, lag = (next(t for t in found.trials if t.name == name) for name in ("free", "lag"))
         gains = [free.fits_by_part[p] - lag.fits_by_part[p] for p in lag.fits_by_part]
-        assert said.values["gain"] == pytest.approx(np.median(gains))
+        assert said.numbers["gain"] == pytest.approx(np.median(gains))
 
 
 def test_auto_is_of_outputs_that_something_drives(runs):
@@ -566,7 +566,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
             assert number(parameter.standard_error) in page, name
     part = page[page.index("The choice</h2>") : page.index("Residuals</h2>")]
     # The report has the findings of the terminal and of Python.
-    found = ftlm.Finding("worse_than_mean", values={"parts": "run 0 (-3 %)"})
+    found = ftlm.Finding("worse_than_mean", numbers={"parts": "run 0 (-3 %)"})
     doubted = replace(chosen, findings=(found,))
     warned = doubted.report(tmp_path / "warned.html").read_text("utf-8")
     warnings = warned[warned.index("Warnings</h2>") : warned.index("The choice</h2>")]

@@ -44,7 +44,7 @@ def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
     for name, truth in (("a", 4.0), ("b", 2.0)):
         assert abs(found.coefficients[name] - truth) < 4 * found.standard_errors[name] + 0.01 * truth
     (split,) = (f for f in found.findings if f.code == "runs_split")
-    assert split.values["pieces"] == len(run.split(split.values["seconds"]))
+    assert split.numbers["pieces"] == len(run.split(split.numbers["seconds"]))
     assert found.verdict.level == "with care"
     other = controlled_run(4.0, 2.0, 5.0, seed=seed + 10, noise=noise)
     validation = found.validate(other)
@@ -54,7 +54,7 @@ def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
     again = ftlm.load_model(found.model.save(tmp_path / "model.json"))
     assert again.compare(other).fit == validation.fit
     # The call that does the same by hand.
-    by_hand = ftlm.identify(run.split(split.values["seconds"]), ftlm.equation(EQUATION), initial="caputo")
+    by_hand = ftlm.identify(run.split(split.numbers["seconds"]), ftlm.equation(EQUATION), initial="caputo")
     assert by_hand.coefficients == found.coefficients
 
 
@@ -65,7 +65,7 @@ def test_a_start_that_is_given_is_kept_and_the_way_is_named(initial):
     assert default.verdict.level == "do not use"
     (said,) = (f for f in default.findings if f.code == "plant_needs_pieces")
     assert default.verdict.reason == said.reason
-    assert f"run.split({said.values['seconds']:.2g})" in said.remedy
+    assert f"run.split({said.numbers['seconds']:.2g})" in said.remedy
     assert "initial='caputo'" in said.remedy
     assert "method='least-squares'" in said.remedy
     assert "output-error" not in default.verdict.remedy

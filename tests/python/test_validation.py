@@ -336,7 +336,7 @@ def test_a_validation_on_fitted_rows_is_with_care():
     assert clean.verdict.trusted
     assert not partly.verdict.trusted
     (shared,) = (f for f in partly.findings if f.code == "estimation_rows_repeated")
-    assert (shared.values["count"], shared.values["rows"]) == (250, 500)
+    assert (shared.numbers["count"], shared.numbers["rows"]) == (250, 500)
     # The state at the start of a run in motion is estimated on it, and the summary says so.
     terms = sum(map(len, clean.initial[0].values()))
     assert terms

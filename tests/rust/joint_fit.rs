@@ -210,7 +210,7 @@ fn correction_ends_where_finer_grids_do(size: f64) {
 #[test]
 fn the_correction_of_nonlinear_terms_for_the_step_ends_where_finer_grids_do() {
     // y′ = u − y², of which tanh is the step response: exact from sample to sample.
-    let (step, rows, size) = (0.2, 500, 1e-3);
+    let (step, rows, size) = (0.1, 500, 2e-3);
     let mut random = Random::new(5);
     let u: Vec<f64> = random.steps(rows, 10).iter().map(|v| 1.25 + 0.75 * v.signum()).collect();
     let mut state = 0.0;

@@ -438,7 +438,7 @@ def _excess_gradient(model: Model, names: Sequence[str], highest: float) -> Floa
     for equation in model.equations:
         positions[equation.output] = at
         at += 1 + 2 * len(equation.terms)
-    gradient = np.zeros(at + len(model.structure.fixed_inputs))
+    gradient = np.zeros(at + len(model.structure.fixed_input_parameters))
     items = [e for e in model.equations if e.output in names]
 
     def highest_order(equation: Equation, name: str) -> tuple[float, int]:
@@ -446,7 +446,9 @@ def _excess_gradient(model: Model, names: Sequence[str], highest: float) -> Floa
         first = positions[equation.output]
         orders = [(equation.order.constant, first)] if equation.output == name else []
         orders += [
-            (t.order.constant, first + 1 + 2 * k) for k, t in enumerate(equation.terms) if t.signal == name and t.fixed
+            (t.order.constant, first + 1 + 2 * k)
+            for k, t in enumerate(equation.terms)
+            if t.signal == name and t.fixed_value
         ]
         return max(orders, default=(-math.inf, first))
 

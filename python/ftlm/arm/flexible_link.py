@@ -603,7 +603,7 @@ def link_model(
             link_values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
             values |= {n: v for n, v in link_values.items() if n in structure.coefficient_names}
         # Those of the named set belong to another arm.
-        structure = replace(structure, reference={})
+        structure = replace(structure, nominal_values={})
     values |= dict(coefficients or {})
     free = {name: integer_order(name) for name in structure.order_names} | dict(orders or {})
     return Model(

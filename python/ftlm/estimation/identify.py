@@ -177,7 +177,7 @@ def identify(
     )
     fit = _fit_runs(run_list, structure, estimator, offset is None, m=m, threads=threads, progress=progress)
     result = assess_fit(fit)
-    duration = next((f.values["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
+    duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
     without_reference = isinstance(estimator, OutputError) and estimator.reference is None
     if duration is not None and structure.initial == "auto" and without_reference:
         # If the pieces cannot be fitted, the result for whole runs is returned.
@@ -421,9 +421,9 @@ def _noise_finding(finding: Finding, tests: Residuals) -> Finding:
     """
     if finding.code == "explains_little" and tests.outputs[finding.output].nr <= MAX_NORMALIZED_RESIDUAL:
         remainder = 100.0 * (1.0 - tests.outputs[finding.output].nr)
-        return make_finding("end_row_far_off", output=finding.output, inner=remainder, **finding.values)
+        return make_finding("end_row_far_off", output=finding.output, inner=remainder, **finding.numbers)
     if finding.code == "explains_little" and is_buried(tests.outputs[finding.output]):
-        return make_finding("buried_in_noise", output=finding.output, **finding.values)
+        return make_finding("buried_in_noise", output=finding.output, **finding.numbers)
     if finding.code == "residuals_not_white" and tests.outputs[finding.output].is_undecided:
         return _undecided_color(finding)
     colored = finding.code == "residuals_not_white" and tests.outputs[finding.output].is_noise

@@ -433,9 +433,9 @@ class Streaming:
                     output=output,
                     step=step,
                     hold=[name in inputs for name in self.signals],
-                    innovation_length=length,
+                    p=length,
                     prior_covariance=prior_covariance,
-                    max_pulses=max(2, round(max_duration / step) + 1),
+                    longest=max(2, round(max_duration / step) + 1),
                     fixed=[t.fixed_value for t in equation.terms],
                 )
             )
