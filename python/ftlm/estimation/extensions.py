@@ -1,8 +1,8 @@
 """Tests whether an extended structure explains colored residuals, and whether other initial conditions fit as well.
 
-The extensions are a constant, a linear drift of an output, another intersample behavior of an input (``"zoh"`` or
-``"foh"``), a lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared
-input, and a load step.
+The extensions are an output level, nonzero initial conditions, a constant, a linear drift of an output, another
+intersample behavior of an input (``"zoh"`` or ``"foh"``), a lag, a delay or lead, a zero, a pole with a zero, dry
+friction, a saturation, a dead zone, a squared input, and a load step.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
 from ftlm.simulation.initial_conditions import rest_evidence
+from ftlm.simulation.output_samples import initial_exponents
 from ftlm.simulation.simulate import simulate
 from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.expression import apply, channel, constant, multiply, power
@@ -54,6 +55,9 @@ from ftlm.validation.residual_tests import (
 #: (Kass and Raftery, doi:10.1080/01621459.1995.10476572). The threshold is three times that, because the best of
 #: several extensions is chosen.
 MIN_CRITERION_DECREASE = 30.0
+#: The same for a drift, which is not chosen among many forms. A line through a random walk of the noise decreases the
+#: criterion by up to 16 in 128 records.
+MIN_DRIFT_DECREASE = 20.0
 #: Minimum further decrease of the criterion at which an extension replaces one that precedes it in the list. Some are
 #: nearly equivalent on sampled data: feedthrough of a first-order plant, and an input that was logged one sample late.
 MIN_CRITERION_GAP = 10.0
@@ -76,6 +80,25 @@ LIMIT_GUESS_FRACTIONS = (0.25, 0.6)
 LOCAL_FRICTION_FRACTION = 0.02
 #: Fraction of sampling intervals over which an input must change for its other intersample behavior to be tested.
 MIN_CHANGING_FRACTION = 0.5
+#: Codes of extensions by offsets and initial conditions, which are preferred to other causes.
+OFFSET_CODES = ("level_missing", "offset_missing", "motion_missing", "drift_fits")
+#: Words for the extensions by their codes, in the message on causes that the data do not distinguish.
+CAUSE_NAMES = {
+    "level_missing": "a level at rest",
+    "offset_missing": "a constant in the equation",
+    "motion_missing": "motion at the start",
+    "drift_fits": "a linear drift",
+    "other_intersample_fits": "another intersample behavior of an input",
+    "lag_fits": "a further lag",
+    "delay_fits": "a delay",
+    "zero_fits": "a derivative of an input",
+    "mode_fits": "a further pole and zero",
+    "saturation_fits": "a saturation",
+    "dead_zone_fits": "a dead zone",
+    "square_fits": "the square of an input",
+    "friction_fits": "dry friction",
+    "load_step_fits": "a load step",
+}
 #: Words for the intersample behavior of an input in messages.
 INTERSAMPLE_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
 #: Minimum reported difference between an estimated delay and the delay in the structure [standard errors].
@@ -194,17 +217,28 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         fitted_criterion = _prediction_criterion(joint, structure, runs, 0)
         is_poor = any(not o.nr <= MAX_NORMALIZED_RESIDUAL for o in inexact)
         fit_each = partial(_fit_extensions, runs=runs, fitted_criterion=fitted_criterion)
-        fits = fit_each(_offset_extensions(structure, joint, runs, is_poor=is_poor))
+        # If the fit explains little, the optimum with an offset may be far from it.
+        starts: list[Mapping[str, float] | None] = [joint.values_by_name, *([None] if is_poor else [])]
+        fits = fit_each(_offset_extensions(structure, joint, runs, starts))
         offset_fits = sorted((f.fit for f in fits), key=lambda fit: max(fit.noise.values()))
         fits += fit_each([e for e in _intersample_extensions(structure, joint, runs) if not fed_back & {*e.inputs}])
         if names:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
-            fits += fit_each(_friction_extensions(structure, joint, runs))
+            fits += fit_each(_friction_extensions(structure, joint.values_by_name, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
-        best = _best_extension([f for f in fits if f.is_physical], fitted_criterion) or _best_extension(
-            fits, fitted_criterion
-        )
+        best = _best_physical(fits, fitted_criterion)
+        if best is not None and best.extension.code != "offset_missing":
+            # The optimum with an offset or friction may be far from that without. Under an input of one sign or of two
+            # values, an offset, a dead zone and a saturation are the same model, and so is friction in one direction.
+            # Their fits are compared at the same optimum.
+            found = {n: best.fit.values_by_name[n] for n in joint.names}
+            fits = fit_each(_offset_extensions(structure, joint, runs, [found, None])) + fits
+            if names and best.extension.code != "friction_fits":
+                fits += fit_each(_friction_extensions(structure, found, runs, is_local=False))
+            best = _best_physical(fits, fitted_criterion)
         findings = _extension_findings(best, structure, joint, runs, names, location) if best else []
+        if best is not None and findings[0].code != "dynamics_missing":
+            findings += _alternative_findings(best, fits, runs, location)
     except FtlmError:
         # The fit to the first samples, with which extensions are compared, has failed.
         return ExtensionTests([])
@@ -233,8 +267,8 @@ def _extension_findings(
         test = f"with it {change['parameter']} is {change['other_value']:.4g}, not {change['value']:.4g}"
         share = 100.0 * (1.0 - min(change["ratio"], 1.0))
         return [make_finding("offset_missing", output=location["output"], share=share, test=test)]
-    if extension.code == "drift_fits":
-        return [make_finding("drift_fits", **location, **_largest_change(joint, refit))]
+    if extension.code in OFFSET_CODES:
+        return [make_finding(extension.code, **location, **_largest_change(joint, refit))]
     if extension.code == "other_intersample_fits":
         return _intersample_findings(extension, joint, refit, runs, location)
     if extension.code == "delay_fits":
@@ -281,25 +315,56 @@ def _inputs_fed_back_within_row(model: Model, tests: Residuals) -> set[str]:
     }
 
 
-def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return extensions by a constant and by a drift; only by a drift if the structure has a level.
+def _offset_extensions(
+    structure: Structure, joint: JointFit, runs: Runs, starts: Sequence[Mapping[str, float] | None]
+) -> list[Extension]:
+    """Return extensions by a constant and a drift; if the fit is from rest, also by a level and by initial conditions.
 
-    The result is [] for non-linear structures and for structures with a constant or a ramp. If the fit explains little
-    (`is_poor`), the optimum with a constant may be far from the fit. The extension by a constant is then also fitted
-    from automatic initial guesses.
+    A structure that has a level is extended only by a drift. The result is [] for non-linear structures and for
+    structures with a constant or a ramp. All but the drift are fitted from each of `starts`.
+
+    From rest, an offset of an input also acts through derivatives of the input, from the first sample on. The constant
+    is then an input of ones with terms of the same orders.
     """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
     count, extensions = len(structure.equations) * len(runs), []
-    if structure.offset == "none":
+
+    def add(code: str, added: int, **changes: Any) -> None:
         with contextlib.suppress(FtlmError):
-            constant_structure = replace(structure, offset="constant")
-            starts = [joint.values_by_name, *([None] if is_poor else [])]
-            extensions.append(Extension("offset_missing", constant_structure, count, [], starts=starts))
+            extensions.append(Extension(code, replace(structure, **changes), added, [], starts=starts))
+
+    if structure.offset == "none":
+        add("offset_missing", count, offset="constant")
+        if structure.initial == "rest":
+            values = joint.values_by_name
+            equations = [e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations]
+            terms = len(runs) * sum(len(initial_exponents(e, "caputo", "none")) for e in equations)
+            extensions += _input_offset_extensions(structure, joint, runs, starts)
+            add("level_missing", count, offset="level")
+            add("motion_missing", terms, initial="caputo")
         # A ramp has a constant and a slope; the constant is not new beside a level.
         count *= 2
     drift = replace(structure, offset="ramp")
     return [*extensions, Extension("drift_fits", drift, count, [], initial_fit=joint)]
+
+
+def _input_offset_extensions(
+    structure: Structure, joint: JointFit, runs: Runs, starts: Sequence[Mapping[str, float] | None]
+) -> list[Extension]:
+    """Return an extension by an input of ones with derivatives, if the only equation has derivatives of inputs."""
+    inputs = _inputs_of_single_equation(structure, runs)
+    orders = {t.order for e in structure.equations for t in e.terms if t.signal in inputs}
+    if not any(order.constant > 0.0 for order in orders):
+        return []
+    orders |= {Order(0.0)}
+    signal, *names = unused_names("one", 1 + len(orders), structure, runs[0].signals)
+    (equation,) = structure.equations
+    terms = [Term(signal, order, name) for order, name in zip(orders, names, strict=True)]
+    extended = replace(structure, equations=(_with_terms(equation, terms),))
+    with_ones = as_runs([run_with_inputs(run, {signal: np.ones(run.length)}) for run in runs])
+    guesses = [None if start is None else {**dict.fromkeys(names, 0.0), **start} for start in starts]
+    return [Extension("offset_missing", extended, len(names), [], starts=guesses, runs=with_ones)]
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -394,7 +459,7 @@ def _fit_extension(extension: Extension, runs: Runs, fitted_criterion: float) ->
 
 
 def _best_extension(fits: Sequence[FittedExtension], fitted_criterion: float) -> FittedExtension | None:
-    """Return the extension with the lowest criterion; None if the decrease is below `MIN_CRITERION_DECREASE`.
+    """Return the extension with the lowest criterion; None if the decrease is below the minimum for its code.
 
     Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
     Extensions with an unstable optimum are skipped.
@@ -405,7 +470,41 @@ def _best_extension(fits: Sequence[FittedExtension], fitted_criterion: float) ->
             continue
         if item.criterion < (fitted_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
             best = item
-    return best if best is not None and best.criterion <= fitted_criterion - MIN_CRITERION_DECREASE else None
+    if best is None:
+        return None
+    min_decrease = MIN_DRIFT_DECREASE if best.extension.code == "drift_fits" else MIN_CRITERION_DECREASE
+    return best if best.criterion <= fitted_criterion - min_decrease else None
+
+
+def _best_physical(fits: Sequence[FittedExtension], fitted_criterion: float) -> FittedExtension | None:
+    """Return the best extension with positive friction, or the best of all if there is none."""
+    physical = [f for f in fits if f.is_physical]
+    return _best_extension(physical, fitted_criterion) or _best_extension(fits, fitted_criterion)
+
+
+def _alternative_findings(
+    best: FittedExtension, fits: Sequence[FittedExtension], runs: Runs, location: Mapping[str, str]
+) -> list[Finding]:
+    """Return a finding if other causes with no more parameters than the best extension explain the residuals as well.
+
+    A structure with more parameters may contain the best one, and then always explains as much.
+    """
+    codes = list(
+        dict.fromkeys(
+            f.extension.code
+            for f in fits
+            if f.extension.code != best.extension.code
+            and f.extension.parameter_count <= best.extension.parameter_count
+            and f.criterion <= best.criterion + MIN_CRITERION_GAP
+            and f.fit.unstable_optimum is None
+            and f.is_physical
+            and _passes_residual_tests(f, runs)
+        )
+    )
+    if not codes:
+        return []
+    causes = {"cause": CAUSE_NAMES[best.extension.code], "others": enumerate_names([CAUSE_NAMES[c] for c in codes])}
+    return [make_finding("causes_alike", output=location["output"], **causes)]
 
 
 def _delay_findings(
@@ -509,17 +608,19 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     return extensions
 
 
-def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+def _friction_extensions(
+    structure: Structure, values: Mapping[str, float], runs: Runs, *, is_local: bool = True
+) -> list[Extension]:
     """Return extensions by Coulomb friction: -fc sign(D y) if the output y is a position, -fc tanh(s y) if a speed.
 
-    The second one is omitted if y never changes sign, because its friction is then nearly constant.
+    The second one is omitted if y never changes sign, because its friction is then nearly constant. `values` are the
+    parameters from which they are fitted. Unless `is_local`, they are the optimum of another extension.
     """
     (equation,) = structure.equations
     (name,) = unused_names("fc", 1, structure, runs[0].signals)
     # A simulation with friction starts from a level and a velocity.
     initial = "caputo" if isinstance(structure.initial, History) else structure.initial
     extensions = []
-    values = joint.values_by_name
     amplitudes = {
         n: max(float(np.nanmax(np.abs(run[n]))) for run in runs) for n in runs[0].inputs if n in equation.signals
     }
@@ -529,13 +630,14 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
         for t in equation.terms
         if t.signal in amplitudes
     ]
-    local_start = {**values, name: LOCAL_FRICTION_FRACTION * max(forces)}
+    guess = {**values, name: LOCAL_FRICTION_FRACTION * max(forces)}
+    start: dict[str, Any] = {"local_start": guess} if is_local else {"starts": [guess]}
 
     def add(text: str, **changes: Any) -> None:
         # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
         with contextlib.suppress(FtlmError):
             extended = replace(structure, equations=(replace(equation, **changes),), initial=initial)
-            extension = Extension("friction_fits", extended, 1, [], local_start=local_start, term_text=text)
+            extension = Extension("friction_fits", extended, 1, [], **start, term_text=text)
             extensions.append(replace(extension, positive_coefficient=name))
 
     add(friction_term(equation.output, name), friction=Friction(name))

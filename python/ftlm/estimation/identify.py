@@ -18,7 +18,7 @@ from ftlm.data.runs import Runs, as_runs
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError
 from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import feedback_bias
-from ftlm.estimation.extensions import run_extension_tests
+from ftlm.estimation.extensions import OFFSET_CODES, run_extension_tests
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.initial_condition_selection import InitialConditionFits, fit_with_offset_decision
@@ -76,7 +76,10 @@ from ftlm.validation.residual_tests import (
 #: Codes of residual findings that are omitted if a reported extension of the structure explains the residuals.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Codes of reported effects that have a nonzero mean. The test for an offset would report this mean as well.
-HAVE_MEAN_CODES = ("square_fits", "offset_missing", "drift_fits", "friction_fits")
+HAVE_MEAN_CODES = (
+    *OFFSET_CODES,
+    *("saturation_fits", "dead_zone_fits", "square_fits", "friction_fits", "load_step_fits"),
+)
 #: Fraction of the progress of an identification that is reached when its initial conditions are selected.
 INITIAL_CONDITIONS_PROGRESS = 0.7
 
