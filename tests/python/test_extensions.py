@@ -1,6 +1,7 @@
 """Missing dynamics are named, and told from colored noise: records by SciPy's exact discretization."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,6 +31,9 @@ ACTING = {
 CODES = {
     "dynamics_missing",
     "drift_fits",
+    "level_missing",
+    "offset_missing",
+    "motion_missing",
     "friction_fits",
     "load_step_fits",
     *(code for _, code, _ in ACTING.values()),
@@ -123,6 +127,8 @@ def test_how_an_input_acts_is_named(kind, seed):
     (said,) = (f for f in found.findings if f.code in CODES)
     assert said.code == expected
     assert said.reason in found.verdict.reasons
+    # Levels of both signs tell it from any other cause.
+    assert "causes_alike" not in {f.code for f in found.findings}
     if limit is not None:
         assert abs(said.numbers["value"] / limit - 1) < 0.03
         # What the remedy says to write is read, and finds the limit.
@@ -230,6 +236,85 @@ def test_a_load_that_steps_in_the_record_is_named(seed):
     assert said.code == "load_step_fits"
     assert abs(said.numbers["time"] / STEP - 280) <= 3
     assert abs(said.numbers["value"] / (0.6 * RATE) - 1) < 0.05
+
+
+#: Numerator, denominator and equation of plants that rest at an input of 0, and inputs of one sign or of two values.
+RESTING = {
+    "swing": ([50.0], [1.0, 2.0, 25.0], "D^2 y = -p D y - q y + b u"),
+    "two lags": ([2.0], [0.192, 1.04, 1.0], "D^2 y = -p D y - q y + b u"),
+    "zero": ([-0.64, 2.0], [0.256, 1.12, 1.0], "D^2 y = -p D y - q y + b u + c D u"),
+    "integrator": ([1.0], [1.0, 0.0], "D y = b u"),
+}
+ONE_SIDED = {
+    "staircase": lambda g: np.repeat(np.arange(6.0), 100),
+    "pulse": lambda g: np.where(np.arange(600) // 40 % 15 == 1, 1.0, 0.0),
+    "two values": lambda g: np.repeat(g.integers(0, 2, 30) * 1.0, 20),
+}
+
+
+def resting(plant, u, seed, color, read=0.0, raised=0.0):
+    """A run from rest whose input is read too high by `read` and whose output by `raised`; noise of 1 %."""
+    numerator, denominator, words = RESTING[plant]
+    b, a, _ = signal.cont2discrete((numerator, denominator), 0.02)
+    y = signal.lfilter(b.ravel(), a, u)
+    e = signal.lfilter([1.0], [1.0, -color], np.random.default_rng([seed, 3]).standard_normal(u.size))
+    y = y + (0.01 * e / e.std() + raised) * y.std()
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u + read}, outputs={"y": y})
+    return run, ftlm.equation(words, initial="rest")
+
+
+@slow_after(3, "color", [0.0, 0.8])
+@pytest.mark.parametrize("kind", ONE_SIDED)
+@pytest.mark.parametrize("plant", RESTING)
+def test_an_offset_of_an_input_is_no_dead_zone(plant, kind, color):
+    # Under an input of one sign or of two values a dead zone and a saturation are an offset, in numbers.
+    u = ONE_SIDED[kind](np.random.default_rng(4))
+    found = ftlm.identify(*resting(plant, u, 1, color, read=0.25 * u.max()))
+    assert {f.code for f in found.findings} & CODES == {"offset_missing"}
+
+
+@slow_after(1, "seed", range(3))
+def test_a_raised_output_and_motion_at_the_start_are_no_dynamics(seed):
+    u = np.repeat(np.random.default_rng([seed, 4]).uniform(-1, 1, 30), 20)
+    run, structure = resting("swing", u, seed, 0.0, raised=0.5)
+    assert {f.code for f in ftlm.identify(run, structure).findings} & CODES == {"level_missing"}
+    run, structure = resting("swing", u, seed, 0.0)
+    moving = run.window(150 * run.step, None)
+    assert {f.code for f in ftlm.identify(moving, structure).findings} & CODES == {"motion_missing"}
+
+
+@slow_after(1, "color", [0.0, 0.8])
+def test_causes_that_a_run_does_not_tell_apart_are_both_named(color):
+    # A motor that moves in one direction only: its friction takes as much from every input as a dead zone does.
+    u, fc, v, x = np.repeat(np.arange(6.0), 100), 0.75, 0.0, 0.0
+    y = np.zeros(u.size)
+    for k in range(u.size - 1):
+        for _ in range(40):
+            v = max(v + 0.0005 * (max(u[k] - fc, 0.0) - 0.5 * v) / 0.2, 0.0)
+            x += 0.0005 * v
+        y[k + 1] = x
+    e = signal.lfilter([1.0], [1.0, -color], np.random.default_rng(1).standard_normal(u.size))
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y + 0.01 * y.std() * e / e.std()})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = -p D y + b u", initial="rest"))
+    (said,) = (f for f in found.findings if f.code == "causes_alike")
+    causes = f"{said.numbers['cause']}, {said.numbers['others']}"
+    assert "a dead zone" in causes
+    assert "dry friction" in causes
+    assert said.reason in found.verdict.reasons
+
+
+@slow_after(1, "seeds", [4, 12])
+def test_a_drift_beside_colored_noise_is_named(seeds):
+    # Without the drift, an autoregression near a random walk explains most of it.
+    named = []
+    for seed in range(seeds):
+        u = ONE_SIDED["pulse"](np.random.default_rng(seed))
+        run, structure = resting("two lags", u, seed, 0.8)
+        y = run["y"] + 0.1 * run["y"].std() * np.linspace(0.0, 1.0, run.length)
+        drifting = ftlm.Run.from_arrays(step=run.step, inputs={"u": u}, outputs={"y": y})
+        found = ftlm.identify(drifting, replace(structure, initial="auto"))
+        named.append({f.code for f in found.findings} & CODES)
+    assert 4 * sum(codes == {"drift_fits"} for codes in named) >= 3 * seeds, named
 
 
 def test_names_of_the_equation_are_no_obstacle():

@@ -237,7 +237,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
                 fits += fit_each(_friction_extensions(structure, found, runs, is_local=False))
             best = _best_physical(fits, fitted_criterion)
         findings = _extension_findings(best, structure, joint, runs, names, location) if best else []
-        if best is not None and findings[0].code != "dynamics_missing":
+        if best is not None and any(f.code != "dynamics_missing" for f in findings):
             findings += _alternative_findings(best, fits, runs, location)
     except FtlmError:
         # The fit to the first samples, with which extensions are compared, has failed.
@@ -340,7 +340,8 @@ def _offset_extensions(
             values = joint.values_by_name
             equations = [e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations]
             terms = len(runs) * sum(len(initial_exponents(e, "caputo", "none")) for e in equations)
-            extensions += _input_offset_extensions(structure, joint, runs, starts)
+            with contextlib.suppress(FtlmError):
+                extensions += _input_offset_extensions(structure, runs, starts)
             add("level_missing", count, offset="level")
             add("motion_missing", terms, initial="caputo")
         # A ramp has a constant and a slope; the constant is not new beside a level.
@@ -350,17 +351,17 @@ def _offset_extensions(
 
 
 def _input_offset_extensions(
-    structure: Structure, joint: JointFit, runs: Runs, starts: Sequence[Mapping[str, float] | None]
+    structure: Structure, runs: Runs, starts: Sequence[Mapping[str, float] | None]
 ) -> list[Extension]:
-    """Return an extension by an input of ones with derivatives, if the only equation has derivatives of inputs."""
+    """Return an extension by an input of ones with its derivatives; [] without derivatives of fixed order of an input."""
     inputs = _inputs_of_single_equation(structure, runs)
-    orders = {t.order for e in structure.equations for t in e.terms if t.signal in inputs}
-    if not any(order.constant > 0.0 for order in orders):
+    orders = [t.order for e in structure.equations for t in e.terms if t.signal in inputs]
+    if any(order.weights for order in orders) or not any(order.constant > 0.0 for order in orders):
         return []
-    orders |= {Order(0.0)}
-    signal, *names = unused_names("one", 1 + len(orders), structure, runs[0].signals)
+    derivatives = sorted({0.0, *(order.constant for order in orders)})
+    signal, *names = unused_names("one", 1 + len(derivatives), structure, runs[0].signals)
     (equation,) = structure.equations
-    terms = [Term(signal, order, name) for order, name in zip(orders, names, strict=True)]
+    terms = [Term(signal, Order(order), name) for order, name in zip(derivatives, names, strict=True)]
     extended = replace(structure, equations=(_with_terms(equation, terms),))
     with_ones = as_runs([run_with_inputs(run, {signal: np.ones(run.length)}) for run in runs])
     guesses = [None if start is None else {**dict.fromkeys(names, 0.0), **start} for start in starts]
