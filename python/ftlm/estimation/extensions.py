@@ -353,7 +353,7 @@ def _offset_extensions(
 def _input_offset_extensions(
     structure: Structure, runs: Runs, starts: Sequence[Mapping[str, float] | None]
 ) -> list[Extension]:
-    """Return an extension by an input of ones with its derivatives; [] without derivatives of fixed order of an input."""
+    """Return an extension by an input of ones with its derivatives; [] if no input has derivatives of fixed orders."""
     inputs = _inputs_of_single_equation(structure, runs)
     orders = [t.order for e in structure.equations for t in e.terms if t.signal in inputs]
     if any(order.weights for order in orders) or not any(order.constant > 0.0 for order in orders):
