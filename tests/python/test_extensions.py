@@ -310,7 +310,7 @@ def test_a_drift_beside_colored_noise_is_named(seeds):
     for seed in range(seeds):
         u = np.where(np.arange(600) // 40 % 4 > 0, 1.0, 0.0) * (np.arange(600) < 160)
         run, structure = resting("two lags", u, seed, 0.8)
-        y = run["y"] + 0.3 * run["y"].std() * np.linspace(0.0, 1.0, run.length)
+        y = run["y"] + 0.1 * run["y"].std() * np.linspace(0.0, 1.0, run.length)
         drifting = ftlm.Run.from_arrays(step=run.step, inputs={"u": u}, outputs={"y": y})
         found = ftlm.identify(drifting, replace(structure, initial="auto"))
         named.append({f.code for f in found.findings} & CODES)
