@@ -254,7 +254,7 @@ pub fn status(status: output_error::Status) -> &'static str {
         output_error::Status::Converged => "converged",
         output_error::Status::Exhausted => "exhausted",
         output_error::Status::Stalled => "stalled",
-        output_error::Status::DomainLimit => "wall",
+        output_error::Status::DomainLimit => "domain limit",
     }
 }
 
