@@ -5,13 +5,16 @@ import json
 import os
 import re
 import subprocess
+import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
 # Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Otherwise each program that a test starts compiles the package anew, which takes it a second.
+# Otherwise each worker rewrites the assertions of all tests anew, half of the time of their collection, and each program
+# that a test starts compiles the package anew, which takes it a second.
+sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
