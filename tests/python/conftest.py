@@ -12,9 +12,7 @@ from types import SimpleNamespace
 
 # Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Otherwise each worker rewrites the assertions of all tests anew, half of the time of their collection, and each program
-# that a test starts compiles the package anew, which takes it a second.
-sys.dont_write_bytecode = False
+# Otherwise each program that a test starts compiles the package anew, which takes it a second.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
@@ -25,6 +23,9 @@ from xdist.scheduler import LoadScopeScheduling
 import ftlm
 from ftlm.estimation.extensions import ExtensionTests
 from ftlm.io import binary_reader, isolated_reader
+
+# Otherwise each worker rewrites the assertions of all tests anew, half of the time of their collection.
+sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
