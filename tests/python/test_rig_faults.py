@@ -341,7 +341,7 @@ def test_a_watchdog_that_does_not_start_is_said_in_words(script, tmp_path, monke
     fake = tmp_path / "watchdog.py"
     fake.write_text(script, encoding="utf-8")
     monkeypatch.setattr(watchdog, "__file__", str(fake))
-    monkeypatch.setattr(virtual_board.wait_for_watchdog, "__kwdefaults__", {"patience": 0.5})
+    monkeypatch.setattr(virtual_board, "_WATCHDOG_START_TIMEOUT_S", 0.5)
     with pytest.raises(SystemExit) as ended:
         app(["record", "--duration", "1", "-o", str(tmp_path / "run.csv")], standalone_mode=True)
     assert ended.value.code == 5
