@@ -52,10 +52,15 @@ def test_auto_finds_a_delay_zeros_feedthrough_and_an_integrator(
     assert found.best.model.compare(other).fit["y"] > truth - 0.5
 
 
-@pytest.mark.parametrize("bias", [0.0, 0.5])
-@pytest.mark.parametrize(
-    ("numerator", "denominator", "words"),
-    [([5.0], [1.0, 0.0], "D^1 y = b0 u"), ([60.0], [1.0, 6.0, 0.0], "D^2 y = a1 D^1 y + b0 u")],
+@slow_after(
+    2,
+    "numerator, denominator, words, bias",
+    [
+        ([5.0], [1.0, 0.0], "D^1 y = b0 u", 0.5),
+        ([60.0], [1.0, 6.0, 0.0], "D^2 y = a1 D^1 y + b0 u", 0.0),
+        ([5.0], [1.0, 0.0], "D^1 y = b0 u", 0.0),
+        ([60.0], [1.0, 6.0, 0.0], "D^2 y = a1 D^1 y + b0 u", 0.5),
+    ],
 )
 def test_auto_finds_an_integrator_despite_an_offset_of_its_input_sensor(numerator, denominator, words, bias):
     run, _ = record(numerator, denominator, seed=3, hold=20)
