@@ -305,33 +305,43 @@ fn joint_fit(m: usize) -> Option<f64> {
         },
         coefficients: terms.iter().map(|t| t.2).collect(),
     };
-    let driven = Record::new(h, PulseMeans::from_signals(vec![vec![0.0; m], u.clone()]), None).ok()?;
-    let mut y = simulate::respond(&[plant], &driven, &[]).ok()?.remove(0);
+    let input_record = Record::new(h, PulseMeans::from_signals(vec![vec![0.0; m], u.clone()]), None).ok()?;
+    let mut y = simulate::respond(&[plant], &input_record, &[]).ok()?.remove(0);
     y.iter_mut().zip(noise(m, 3)).for_each(|(y, e)| *y += 1e-3 * e);
-    let sizes = [OutputScale::from_runs(&[y.clone()])];
+    let scales = [OutputScale::from_runs(&[y.clone()])];
     let run = vec![Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold))];
     let runs = Recordings::new(vec![Recording::new("run", h, None, run, vec![0]).ok()?]).ok()?;
-    let free = |(signal, order, _): (usize, f64, f64), name: &str| ParametricTerm {
+    let free_term = |(signal, order, _): (usize, f64, f64), name: &str| ParametricTerm {
         signal,
         order: Order::number(order),
         coefficient: Coefficient::Free(name.into()),
         factor: 1.0,
     };
-    let terms = terms.into_iter().zip(["d", "a", "b"]).map(|(term, name)| free(term, name)).collect();
-    let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
-    let free = ParameterSet::from_structure(ParametricStructure::new(
+    let terms = terms.into_iter().zip(["d", "a", "b"]).map(|(term, name)| free_term(term, name)).collect();
+    let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+    let parameter_set = ParameterSet::from_structure(ParametricStructure::new(
         vec!["y".into(), "u".into()],
-        vec![sought],
+        vec![equation],
         Initial::Rest,
     ))
     .ok()?;
     let stop = Stop::default();
-    let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
-    let asked = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let guess_source = OrderGrids::new(&runs, 1, 1 << 28, &stop);
+    let fit_problem = FitProblem {
+        parameter_set: &parameter_set,
+        source: &runs,
+        guess_source: &guess_source,
+        scales: &scales,
+        stop: &stop,
+    };
     let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-    let found =
-        fit::fit(asked, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))
-            .ok()??;
+    let found = fit::fit(
+        fit_problem,
+        Initialization::Multistart { given_guesses: Vec::new(), candidates: None },
+        settings,
+        &|_, _| Ok(()),
+    )
+    .ok()??;
     black_box(found).optimum.estimate.first().copied()
 }
 

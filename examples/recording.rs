@@ -37,8 +37,8 @@ fn columns() -> (Vec<f64>, Vec<f64>) {
 
 fn main() -> Result<()> {
     let (y, u) = columns();
-    let known: Vec<f64> = y.iter().copied().filter(|v| !v.is_nan()).collect();
-    let sizes = [OutputScale::from_runs(&[known])];
+    let samples: Vec<f64> = y.iter().copied().filter(|v| !v.is_nan()).collect();
+    let scales = [OutputScale::from_runs(&[samples])];
     let input = Channel { delay: Some(DELAY), ..Channel::new("u", u, Role::Input(Intersample::Hold)) };
     let run = Recording::new("run", STEP, None, vec![Channel::new("y", y, Role::Output), input], vec![0])?;
     let runs = Recordings::new(vec![run.clone()])?;
@@ -49,19 +49,25 @@ fn main() -> Result<()> {
         ParametricTerm { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
     };
     let terms = vec![term(0, "a"), term(1, "b")];
-    let sought = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+    let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
     let signals = vec!["y".into(), "u".into()];
-    let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![sought], Initial::Rest))?;
+    let parameter_set = ParameterSet::from_structure(ParametricStructure::new(signals, vec![equation], Initial::Rest))?;
     let stop = Stop::default();
-    let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
-    let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let guess_source = OrderGrids::new(&runs, 1, 1 << 28, &stop);
+    let problem = FitProblem {
+        parameter_set: &parameter_set,
+        source: &runs,
+        guess_source: &guess_source,
+        scales: &scales,
+        stop: &stop,
+    };
     let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
     let initialization = Initialization::Multistart { known: Vec::new(), candidates: None };
-    let Some(found) = fit::fit(problem, initialization, settings, &|_, _| Ok(()))? else {
+    let Some(joint_fit) = fit::fit(problem, initialization, settings, &|_, _| Ok(()))? else {
         println!("no start has a finite simulation");
         return Ok(());
     };
-    let [alpha, a, b] = found.optimum.estimate[..] else { return Ok(()) };
+    let [alpha, a, b] = joint_fit.optimum.estimate[..] else { return Ok(()) };
     println!("D^{alpha:.4} y = {a:.3} y + {b:.3} u, with u {DELAY} s late");
 
     // Simulated output at the missing samples.

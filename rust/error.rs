@@ -66,10 +66,12 @@ pub enum Error {
         count: usize,
     },
     /// Order grid without candidates.
-    #[error("the order grid has no candidate: {why}; widen the intervals of the orders, or use a smaller increment")]
+    #[error(
+        "the order grid has no candidate: {reason}; widen the intervals of the orders, or use a smaller increment"
+    )]
     EmptyOrderGrid {
         /// Condition that no combination of orders satisfies.
-        why: String,
+        reason: String,
     },
     /// Order grid with too many candidates.
     #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; use a larger increment of the order grid, narrower intervals of the orders, or fixed orders", format_search_time(*count))]
@@ -118,18 +120,18 @@ pub enum Error {
         index: usize,
     },
     /// Pulse of a simulation whose non-linear equations have no solution.
-    #[error("the equations have no solution at {time:.4} s (pulse {index}) of the simulation: {why}; shorten the step, or check the coefficients of the non-linear terms")]
+    #[error("the equations have no solution at {time:.4} s (pulse {index}) of the simulation: {reason}; shorten the step, or check the coefficients of the non-linear terms")]
     NoSolution {
         /// Middle of the pulse \[s\].
         time: f64,
         /// Index of the pulse.
         index: usize,
         /// Cause.
-        why: String,
+        reason: String,
     },
     /// Fit in which the squares of the residuals of an output overflow.
     #[error("the simulation of {output} overflows from every initial guess; remove the term that makes the model unstable, or bound its coefficient")]
-    Beyond {
+    Overflow {
         /// Name of the output.
         output: String,
     },
@@ -145,12 +147,12 @@ pub enum Error {
     #[error("interrupted")]
     Interrupted,
     /// Threads that the operating system cannot start.
-    #[error("{threads} threads could not be started: {why}; use fewer threads")]
+    #[error("{threads} threads could not be started: {reason}; use fewer threads")]
     Threads {
         /// Number of requested threads.
         threads: usize,
         /// Message of the operating system.
-        why: String,
+        reason: String,
     },
     /// Internal error of ftlm.
     #[error("internal fault: {what}; please report it")]
@@ -187,7 +189,7 @@ impl Error {
     pub fn kind(&self) -> Kind {
         match self {
             Self::NotFinite { .. } | Self::Length { .. } | Self::Recording { .. } => Kind::Data,
-            Self::Diverged { .. } | Self::NoSolution { .. } | Self::Singular { .. } | Self::Beyond { .. } => {
+            Self::Diverged { .. } | Self::NoSolution { .. } | Self::Singular { .. } | Self::Overflow { .. } => {
                 Kind::Convergence
             }
             Self::Interrupted => Kind::Interrupted,

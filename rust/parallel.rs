@@ -64,7 +64,7 @@ pub fn pool(threads: usize) -> Result<rayon::ThreadPool> {
         .num_threads(threads)
         .thread_name(|i| format!("ftlm-search-{i}"))
         .build()
-        .map_err(|e| Error::Threads { threads, why: e.to_string() })
+        .map_err(|e| Error::Threads { threads, reason: e.to_string() })
 }
 
 /// Workspaces for the threads of a pool, one per thread.

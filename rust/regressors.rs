@@ -95,8 +95,8 @@ impl Record {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn from_samples(step: f64, signals: &[(&[f64], Intersample)]) -> Result<Self> {
-        let means = |(samples, between): &(&[f64], Intersample)| {
-            pulse_means(samples, samples.len().saturating_sub(1), *between)
+        let means = |(samples, intersample): &(&[f64], Intersample)| {
+            pulse_means(samples, samples.len().saturating_sub(1), *intersample)
         };
         Self::new(step, signals.iter().map(means).collect::<Result<_>>()?, None)
     }

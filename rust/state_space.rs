@@ -29,7 +29,7 @@ pub struct InputSignal {
     /// Samples, one per row of the record.
     pub samples: Vec<f64>,
     /// Inter-sample behavior. The samples of a linear signal are delayed first, and then interpolated linearly.
-    pub between: Intersample,
+    pub intersample: Intersample,
     /// Delay in sampling intervals, which need not be an integer.
     pub delay: f64,
     /// Value of a delayed input before the record.
@@ -260,12 +260,12 @@ impl Realization {
             let fraction = delay - delay.floor();
             #[allow(clippy::cast_possible_truncation)]
             let integer_delay = delay.floor().clamp(-1e18, 1e18) as isize;
-            let Some(InputGains { now, later }) =
-                InputGains::new(&interval, &self.system, input_vector, input.between, fraction)
+            let Some(InputGains { current_gains, next_gains }) =
+                InputGains::new(&interval, &self.system, input_vector, input.intersample, fraction)
             else {
                 return Ok(None);
             };
-            let (samples, lag) = match input.between {
+            let (samples, lag) = match input.intersample {
                 Intersample::Linear if delay != 0.0 => {
                     (Cow::Owned(delay_samples(&input.samples, delay, input.before)?), 0)
                 }
@@ -274,10 +274,11 @@ impl Realization {
                     (Cow::Borrowed(input.samples.as_slice()), integer_delay.saturating_add(isize::from(fraction > 0.0)))
                 }
             };
-            let channel = Channel { samples, lag, before: input.before, now, later, direct: direct.clone() };
+            let channel =
+                Channel { samples, lag, before: input.before, current_gains, next_gains, direct: direct.clone() };
             channels.push(channel);
         }
-        let gains = channels.iter().flat_map(|c| c.now.iter().chain(&c.later).chain(&c.direct));
+        let gains = channels.iter().flat_map(|c| c.current_gains.iter().chain(&c.next_gains).chain(&c.direct));
         if !gains.chain(&self.initial_state).chain(&self.output_matrix).all(|v| v.is_finite()) {
             return Ok(None);
         }
@@ -345,11 +346,11 @@ pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
     Some(transition)
 }
 
-/// Gains of an input on the states after one interval. `now` multiplies the value of the input at the start of the
-/// interval, and `later` its next value.
+/// Gains of an input on the states after one interval. `current_gains` multiplies the value of the input at the start
+/// of the interval, and `next_gains` its next value.
 pub(crate) struct InputGains {
-    pub(crate) now: Vec<f64>,
-    pub(crate) later: Vec<f64>,
+    pub(crate) current_gains: Vec<f64>,
+    pub(crate) next_gains: Vec<f64>,
 }
 
 impl InputGains {
@@ -361,14 +362,16 @@ impl InputGains {
         interval: &Transition,
         system: &[f64],
         input_vector: &[f64],
-        between: Intersample,
+        intersample: Intersample,
         fraction: f64,
     ) -> Option<Self> {
         let n = input_vector.len();
         let total = dense::multiply(&interval.first, input_vector, n, n, 1);
-        let later: Vec<f64> = match between {
+        let next_gains: Vec<f64> = match intersample {
             Intersample::Linear => dense::multiply(&interval.second, input_vector, n, n, 1),
-            Intersample::Hold if fraction == 0.0 => return Some(Self { now: total, later: vec![0.0; n] }),
+            Intersample::Hold if fraction == 0.0 => {
+                return Some(Self { current_gains: total, next_gains: vec![0.0; n] })
+            }
             Intersample::Hold => {
                 // The next value takes effect within the interval and acts over the rest of it.
                 let remaining_fraction = 1.0 - fraction;
@@ -379,8 +382,8 @@ impl InputGains {
                     .collect()
             }
         };
-        let now = total.iter().zip(&later).map(|(a, b)| a - b).collect();
-        Some(Self { now, later })
+        let current_gains = total.iter().zip(&next_gains).map(|(a, b)| a - b).collect();
+        Some(Self { current_gains, next_gains })
     }
 }
 
@@ -390,10 +393,10 @@ struct Channel<'a> {
     /// Number of rows by which the samples are delayed.
     lag: isize,
     before: f64,
-    /// Gains of the value in the current row on the states in the next row. `later` holds the gains of the value in the
-    /// next row.
-    now: Vec<f64>,
-    later: Vec<f64>,
+    /// Gains of the value in the current row on the states in the next row. `next_gains` holds the gains of the value
+    /// in the next row.
+    current_gains: Vec<f64>,
+    next_gains: Vec<f64>,
     /// Direct feedthrough gain on each output.
     direct: Vec<f64>,
 }
@@ -432,7 +435,7 @@ impl Recursion<'_> {
             history.fill(0.0);
             for channel in &self.channels {
                 channel.write_values(first_row, &mut values);
-                for (gains, shift) in [(&channel.now, 0), (&channel.later, 1)] {
+                for (gains, shift) in [(&channel.current_gains, 0), (&channel.next_gains, 1)] {
                     if gains.iter().any(|&gain| gain != 0.0) {
                         add_forcing(n, gains, &values[shift..], &mut history);
                     }
@@ -559,7 +562,7 @@ mod tests {
     fn a_stop_ends_the_recursion() {
         let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
         let samples = vec![1.0; 5];
-        let ramp = [InputSignal { signal: 1, samples, between: Intersample::Hold, delay: 0.0, before: 0.0 }];
+        let ramp = [InputSignal { signal: 1, samples, intersample: Intersample::Hold, delay: 0.0, before: 0.0 }];
         let equations = [Equation { structure, coefficients: vec![1.0] }];
         let stop = Stop::default();
         let of = || respond(&equations, &ramp, &[], 1.0, 5, &stop);

@@ -126,7 +126,7 @@ impl EarlyEnd {
         if self.is_overflow {
             Error::Diverged { what: format!("simulation (at {time:.4} s)"), index: self.index }
         } else {
-            Error::NoSolution { time, index: self.index, why: self.reason }
+            Error::NoSolution { time, index: self.index, reason: self.reason }
         }
     }
 }

@@ -124,7 +124,7 @@ impl OutputSimulation {
         let (channel, samples) = (&self.recording.channels()[signal], self.recording.acting_samples(signal));
         InputSignal {
             signal,
-            between: channel.intersample(),
+            intersample: channel.intersample(),
             delay: channel.lag() / self.recording.step(),
             before: self.recording.value_before(&samples),
             samples: samples.into_owned(),

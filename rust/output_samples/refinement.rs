@@ -190,7 +190,7 @@ impl<'a> SampleResponses<'a> {
                 }
                 let samples = interpolate_gaps(&recording.acting_samples(term.signal)).into_owned();
                 if inputs.iter().all(|(signal, ..)| *signal != term.signal) && samples.iter().any(|v| *v != 0.0) {
-                    inputs.push((term.signal, samples, !channel.is_held_input()));
+                    inputs.push((term.signal, samples, !channel.is_zero_order_hold()));
                 }
             }
         }

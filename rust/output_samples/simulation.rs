@@ -567,7 +567,7 @@ impl<'a> Grid<'a> {
             // The signal may have a slope discontinuity at the sample, which a mean over pulses would round off.
             return Ok(recording.acting_samples(signal).into_owned());
         }
-        if filtered || !channel.is_held_input() {
+        if filtered || !channel.is_zero_order_hold() {
             return Ok(point_samples(means).into_iter().step_by(self.every).collect());
         }
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
@@ -607,7 +607,7 @@ impl<'a> Grid<'a> {
                 }
                 if own.is_none() && halves[term.signal].is_none() {
                     let (means, sign) =
-                        (self.record.signal(term.signal), if channel.is_held_input() { 1.0 } else { -1.0 });
+                        (self.record.signal(term.signal), if channel.is_zero_order_hold() { 1.0 } else { -1.0 });
                     let values = self.values_at_samples(term.signal)?;
                     let half = (every..m).step_by(every).zip(&values[1..]);
                     let half = half.map(|(at, value)| sign * (value - 0.5 * (means[at - 1] + means[at]))).collect();

@@ -227,7 +227,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<output_error::Experi
                 record,
                 samples,
                 weights,
-                output_error::NonuniformSamples { readings: interpolation, jumps },
+                output_error::NonuniformSamples { interpolation, jumps },
             )?
         }
     };

@@ -98,14 +98,14 @@ impl Channel {
     #[must_use]
     pub fn intersample(&self) -> Intersample {
         match self.role {
-            Role::Input(between) => between,
+            Role::Input(intersample) => intersample,
             Role::Output => Intersample::Linear,
             Role::Derived => Intersample::Hold,
         }
     }
 
     /// True if the signal is an input with zero-order hold.
-    pub(crate) fn is_held_input(&self) -> bool {
+    pub(crate) fn is_zero_order_hold(&self) -> bool {
         self.role == Role::Input(Intersample::Hold)
     }
 

@@ -124,9 +124,10 @@ impl Recordings {
     /// ```
     #[must_use]
     pub fn inputs(&self) -> Vec<Option<Intersample>> {
-        let is_held_input = |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_held_input());
+        let is_zero_order_hold =
+            |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_zero_order_hold());
         let input_behavior = |(signal, channel): (usize, &Channel)| match channel.role {
-            Role::Input(_) if is_held_input(signal) => Some(Intersample::Hold),
+            Role::Input(_) if is_zero_order_hold(signal) => Some(Intersample::Hold),
             Role::Input(_) => Some(Intersample::Linear),
             _ => None,
         };

@@ -419,7 +419,7 @@ impl Recording {
     fn removed_transient(&self, signal: usize) -> Option<FilterStates> {
         let channel = &self.channels[signal];
         let is_simulated = self.is_coupled && self.outputs.contains(&signal);
-        let is_commanded = channel.is_held_input() || (channel.delay.is_some() && channel.role != Role::Output);
+        let is_commanded = channel.is_zero_order_hold() || (channel.delay.is_some() && channel.role != Role::Output);
         let enters_as_measured = channel.is_filtered && channel.enters_others && !is_simulated && !is_commanded;
         if !enters_as_measured || self.filter_states == 0 || channel.role == Role::Derived || !self.is_all_filtered() {
             return None;
@@ -781,7 +781,7 @@ impl Recording {
         if channel.role == Role::Derived || has_gaps || is_filtered_numerically {
             return Ok(PointValues::default());
         }
-        let is_zero_order_hold = channel.is_held_input();
+        let is_zero_order_hold = channel.is_zero_order_hold();
         if channel.lag() != 0.0 && is_zero_order_hold {
             // A delayed command switches between samples. Its value at a sample time is that of the pulse that follows.
             let mut values: Vec<f64> = pulses.means[signal].values().iter().copied().step_by(stride).collect();
@@ -829,7 +829,7 @@ impl Recording {
             point_values.push(PointValues { values, is_zero_order_hold: false });
         }
         let record = pulses.into_record_with_initial_state()?;
-        let nonuniform = NonuniformSamples { readings: interpolation, jumps };
+        let nonuniform = NonuniformSamples { interpolation, jumps };
         let experiment = Experiment::with_nonuniform_samples(record, samples, weights, nonuniform)?;
         Ok((experiment, sample_weights, point_values))
     }
@@ -848,7 +848,7 @@ impl Recording {
     /// ```
     #[must_use]
     pub fn jumps(&self, signal: usize) -> Option<(Vec<f64>, Vec<f64>)> {
-        if !self.channels[signal].is_held_input() {
+        if !self.channels[signal].is_zero_order_hold() {
             return None;
         }
         self.with_signal(signal, |interpolant| interpolant.jumps()).flatten()

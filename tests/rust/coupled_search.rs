@@ -162,7 +162,7 @@ fn empty_and_oversized_law_lattices_are_refused() {
     let mut none = axes();
     none[3].clear();
     match OrderLawGrid::new(&none, &two_link(), &INPUTS) {
-        Err(Error::EmptyOrderGrid { why }) => assert_eq!(why, "free order 3 has no value"),
+        Err(Error::EmptyOrderGrid { reason }) => assert_eq!(reason, "free order 3 has no value"),
         other => panic!("{other:?}"),
     }
     let fine: Vec<f64> = (0..100).map(|i| 0.01 * f64::from(i)).collect();

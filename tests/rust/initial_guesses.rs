@@ -134,9 +134,9 @@ fn delays_and_limits_are_tried() {
         (InputLaw::Delay, "delay_u", (0.0, 0.3), ", delay 0 ms"),
         (InputLaw::Saturation, "sat_u", (0.01, 10.0), ", sat_u 0."),
     ] {
-        let input = Input { name: name.into(), free: FreeInput { signal: 1, law, bounds } };
-        let mut free = structure(Order::number(1.7), 0.0);
-        free.inputs = vec![input.clone()];
+        let input = Input { name: name.into(), parameter: FreeInput { signal: 1, law, bounds } };
+        let mut structure_with_input = structure(Order::number(1.7), 0.0);
+        structure_with_input.inputs = vec![input.clone()];
         let run = plant();
         let mut channels = run.channels().to_vec();
         if law != InputLaw::Delay {
@@ -148,7 +148,7 @@ fn delays_and_limits_are_tried() {
         // What is free is left to the fit, but not where it starts.
         let at = |value: f64| source.records(100, &[value]).unwrap()[0].signal(1).to_vec();
         assert_ne!(bits(&at(bounds.0)), bits(&at(bounds.1)), "{name}");
-        let all = found(free, &source, 1).unwrap();
+        let all = found(structure_with_input, &source, 1).unwrap();
         let mut tried: Vec<f64> = all.iter().map(|r| r.result.iterate.point.inputs[0]).collect();
         tried.dedup();
         assert!(all[0].origin.contains(words), "{}", all[0].origin);
@@ -170,8 +170,8 @@ fn what_makes_no_start_is_refused() {
     assert!(empty.to_string().contains("no orders of signal 'y' fit below alpha = 1"), "{empty}");
     let stop = Stop::default();
     stop.set();
-    let free = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
-    assert_eq!(OrderGrids::new(&source, 1, BANK_LIMIT, &stop).candidates(&free), Err(Error::Interrupted));
+    let parameter_set = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
+    assert_eq!(OrderGrids::new(&source, 1, BANK_LIMIT, &stop).candidates(&parameter_set), Err(Error::Interrupted));
 }
 
 /// Samples of y″ + 2 y′ + 400 y = u, which swings with 20 rad/s, and an input that changes every 50 of 60 000 samples.
@@ -182,8 +182,13 @@ fn fast_swing() -> (Vec<f64>, Vec<f64>) {
     let term = |signal, order| equation::Term { signal, order };
     let plant = equation::Structure { output: 0, order: 2.0, terms: vec![term(0, 1.0), term(0, 0.0), term(1, 0.0)] };
     let plant = equation::Equation::new(plant, vec![-2.0, -400.0, 1.0]).unwrap();
-    let input =
-        state_space::InputSignal { signal: 1, samples: u.clone(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
+    let input = state_space::InputSignal {
+        signal: 1,
+        samples: u.clone(),
+        intersample: Intersample::Hold,
+        delay: 0.0,
+        before: 0.0,
+    };
     let y = state_space::respond(&[plant], &[input], &[], step, rows, &Stop::default()).unwrap().unwrap();
     (y, u)
 }
@@ -192,10 +197,10 @@ fn fast_swing() -> (Vec<f64>, Vec<f64>) {
 fn a_long_fast_record_is_not_thinned_beyond_its_motion() {
     // Thinned to 1200 samples, it would be read every 0.5 s, a turn and a half; six samples in half a turn show it.
     let (y, u) = fast_swing();
-    let free = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
+    let parameter_set = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
     let sampling = |y: &[f64]| {
         let runs = Recordings::new(vec![recording(0.01, y.to_vec(), u.clone())]).unwrap();
-        coarse_sampling(&free, &runs).unwrap()
+        coarse_sampling(&parameter_set, &runs).unwrap()
     };
     let (found, fastest) = (sampling(&y), power_frequency(&y, 0.01));
     let most = (PI / (6.0 * fastest * 0.01)).max(1.0);

@@ -123,14 +123,14 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         assert_eq!(found.pulses_per_sample as u64, case["refinement"].as_u64().unwrap());
         assert_eq!(found.step_converged, case["stands"].as_bool().unwrap());
         close(&format!("{name}: estimate"), &found.estimate, &numbers(&case["estimate"]), END_TOLERANCE);
-        close(&format!("{name}: on its grid"), &found.attempt.values(), &numbers(&case["on_grid"]), END_TOLERANCE);
+        close(&format!("{name}: on its grid"), &found.result.values(), &numbers(&case["on_grid"]), END_TOLERANCE);
         // Residuals in the unit of the Jacobian, whose weights have converged to the noise within a tolerance.
         let unit = found.noise[0] * found.weights.outputs[0];
         let weighted = |run: &Vec<Vec<f64>>| run[0].iter().map(|e| e * unit).collect::<Vec<f64>>();
         let series: Vec<Vec<f64>> = found.residuals.iter().map(weighted).collect();
         let (expected, tolerance) = if name == "white" {
             assert!(series.iter().all(|run| statistics::is_white(run, statistics::WHITENESS_LAGS)));
-            (classical_covariance(&found.attempt.jacobian, &series), 10.0 * END_TOLERANCE)
+            (classical_covariance(&found.result.jacobian, &series), 10.0 * END_TOLERANCE)
         } else {
             (table(&case["covariance"]).concat(), COLOR_TOLERANCE)
         };
@@ -169,14 +169,14 @@ fn correction_ends_where_finer_grids_do(size: f64) {
     let mut random = Random::new(3);
     let u = random.steps(rows, 15);
     // The input is linear between its samples.
-    let later = 1.0 - (1.0 - decay) / 0.1;
-    let now = 1.0 - decay - later;
+    let next_gain = 1.0 - (1.0 - decay) / 0.1;
+    let current_gain = 1.0 - decay - next_gain;
     let mut state = 0.0;
     let y: Vec<f64> = (0..rows)
         .zip(random.signal(rows))
         .map(|(k, noise)| {
             let here = state;
-            state = decay * state + now * u[k] + later * u[(k + 1).min(rows - 1)];
+            state = decay * state + current_gain * u[k] + next_gain * u[(k + 1).min(rows - 1)];
             here + size * noise
         })
         .collect();
@@ -192,7 +192,7 @@ fn correction_ends_where_finer_grids_do(size: f64) {
     let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
     let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
     assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
-    assert_eq!(corrected.attempt.values(), best.values());
+    assert_eq!(corrected.result.values(), best.values());
     let truths = [1.0, -2.0, 2.0];
     // On the grid itself a parameter is off by far more than its error.
     let off = |k: usize| (best.values()[k] - truths[k]).abs() / corrected.covariance[k * 4].sqrt();

@@ -50,7 +50,7 @@ fn every_error_has_its_family() {
         (Error::Interrupted, Kind::Interrupted),
         (Error::Internal { what: "x".into() }, Kind::Internal),
         (Error::LeadingZero { leading: 0.0 }, Kind::Model),
-        (Error::EmptyOrderGrid { why: "x".into() }, Kind::Model),
+        (Error::EmptyOrderGrid { reason: "x".into() }, Kind::Model),
         (Error::OrderGridTooLarge { count: 2, limit: 1 }, Kind::Model),
         (Error::NotPowerOfTwo { m: 3, below: 2, above: 4 }, Kind::Model),
         (Error::Structure { what: "x".into(), remedy: "y".into() }, Kind::Model),

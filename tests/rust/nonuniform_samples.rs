@@ -37,14 +37,14 @@ fn corners_are_those_of_the_definition() {
     let (m, step) = (60, 0.05);
     let (at, sizes) = ([0.0, 3.3, 9.0, 9.9], [1.0, -2.0, 0.5, 1.5]);
     let places: Vec<f64> = (0..150).map(|i| 0.1 * f64::from(i)).collect();
-    let readings = SampleInterpolation::new(places.clone(), m).unwrap();
+    let interpolation = SampleInterpolation::new(places.clone(), m).unwrap();
     let ramp = |x: f64, p: f64| (x - p).max(0.0);
     let held = |x: f64| at.iter().zip(&sizes).map(|(p, s)| s * ramp(x, *p)).sum::<f64>();
     let means: Vec<f64> = (0..m).map(|k| held((k + 1) as f64) - held(k as f64)).collect();
     for eta in [0.0, 0.3, 0.8, 1.0, 1.7] {
         let response = series::multiply(&block_pulse_kernel(eta, m, step), &means, m);
-        let lacking = readings.kink_corrections(&readings.jumps(&at, &sizes), eta, step);
-        let found: Vec<f64> = readings.interpolate(&response).iter().zip(&lacking).map(|(y, c)| y + c).collect();
+        let lacking = interpolation.kink_corrections(&interpolation.jumps(&at, &sizes), eta, step);
+        let found: Vec<f64> = interpolation.interpolate(&response).iter().zip(&lacking).map(|(y, c)| y + c).collect();
         let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
         // A held signal is read after it has jumped.
         let one = |x: f64, p: f64| if x < p { 0.0 } else { libm::pow(x - p, eta) };

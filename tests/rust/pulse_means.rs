@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use crate::common::{cases, check, check_between, distance, orders, Random};
 
 /// Means by adding, pulse by pulse, what every interval contributes. O(N m).
-fn naive(samples: &[f64], m: usize, between: Intersample) -> Vec<f64> {
+fn naive(samples: &[f64], m: usize, intersample: Intersample) -> Vec<f64> {
     let n = samples.len() - 1;
     // In units of the sampling step pulse k is [k n/m, (k+1) n/m).
     let width = n as f64 / m as f64;
@@ -18,7 +18,7 @@ fn naive(samples: &[f64], m: usize, between: Intersample) -> Vec<f64> {
             for j in 0..n {
                 let (a, b) = (lo.max(j as f64), hi.min((j + 1) as f64));
                 if b > a {
-                    let value = match between {
+                    let value = match intersample {
                         Intersample::Hold => samples[j],
                         // A straight line has its mean in the middle.
                         Intersample::Linear => {
@@ -43,10 +43,10 @@ fn means_match_naive_integration() {
     for n in [2, 3, 5, 10, 64, 101] {
         let samples = random.signal(n);
         for m in [1, 2, 3, 7, 10, 50, 63, 64, 100, 101, 200, 997] {
-            for between in BOTH {
-                let found = pulse_means(&samples, m, between).unwrap().into_vec();
+            for intersample in BOTH {
+                let found = pulse_means(&samples, m, intersample).unwrap().into_vec();
                 assert_eq!(found.len(), m);
-                worst = worst.max(distance(&found, &naive(&samples, m, between)));
+                worst = worst.max(distance(&found, &naive(&samples, m, intersample)));
             }
         }
     }
@@ -83,12 +83,12 @@ fn refining_keeps_the_signal() {
 
 #[test]
 fn too_little_is_refused() {
-    for between in BOTH {
+    for intersample in BOTH {
         for samples in [&[][..], &[1.0]] {
             let refused = Error::Length { name: "samples".into(), expected: 2, found: samples.len() };
-            assert_eq!(pulse_means(samples, 4, between), Err(refused));
+            assert_eq!(pulse_means(samples, 4, intersample), Err(refused));
         }
-        assert!(matches!(pulse_means(&[1.0, 2.0], 0, between), Err(Error::OutOfRange { .. })));
+        assert!(matches!(pulse_means(&[1.0, 2.0], 0, intersample), Err(Error::OutOfRange { .. })));
     }
 }
 
@@ -157,8 +157,8 @@ proptest! {
         let intervals = (n - 1) as f64;
         let hold: f64 = samples[..n - 1].iter().sum();
         let line: f64 = samples.windows(2).map(|p| 0.5 * (p[0] + p[1])).sum();
-        for (between, exact) in [(Intersample::Hold, hold), (Intersample::Linear, line)] {
-            let total = pulse_means(&samples, m, between).unwrap().values().iter().sum::<f64>() * intervals / m as f64;
+        for (intersample, exact) in [(Intersample::Hold, hold), (Intersample::Linear, line)] {
+            let total = pulse_means(&samples, m, intersample).unwrap().values().iter().sum::<f64>() * intervals / m as f64;
             prop_assert!((total - exact).abs() < 1e-12 * intervals);
         }
     }
@@ -166,9 +166,9 @@ proptest! {
     #[test]
     fn means_of_means_are_means(n in 2usize..60, m in 1usize..40, times in 2usize..6, seed in any::<u64>()) {
         let samples = Random::new(seed).signal(n);
-        for between in BOTH {
-            let coarse = pulse_means(&samples, m, between).unwrap().into_vec();
-            let fine = pulse_means(&samples, m * times, between).unwrap().into_vec();
+        for intersample in BOTH {
+            let coarse = pulse_means(&samples, m, intersample).unwrap().into_vec();
+            let fine = pulse_means(&samples, m * times, intersample).unwrap().into_vec();
             let joined: Vec<f64> = fine.chunks(times).map(|c| c.iter().sum::<f64>() / times as f64).collect();
             prop_assert!(distance(&joined, &coarse) < 1e-12);
         }
@@ -177,10 +177,10 @@ proptest! {
     #[test]
     fn constants_and_bounds_are_kept(value in -5.0..5.0_f64, n in 2usize..60, m in 1usize..200, seed in any::<u64>()) {
         let samples = Random::new(seed).signal(n);
-        for between in BOTH {
-            let constant = pulse_means(&vec![value; n], m, between).unwrap().into_vec();
+        for intersample in BOTH {
+            let constant = pulse_means(&vec![value; n], m, intersample).unwrap().into_vec();
             prop_assert!(constant.iter().all(|v| (v - value).abs() < 1e-12 * value.abs().max(1.0)));
-            prop_assert!(pulse_means(&samples, m, between).unwrap().values().iter().all(|v| v.abs() <= 1.0 + 1e-12));
+            prop_assert!(pulse_means(&samples, m, intersample).unwrap().values().iter().all(|v| v.abs() <= 1.0 + 1e-12));
         }
     }
 }

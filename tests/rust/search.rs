@@ -139,15 +139,15 @@ fn terms_with_different_axes_swap_only_where_both_may() {
 
 #[test]
 fn empty_and_oversized_lattices_say_why() {
-    let why = |alphas: &[f64], axes: &[TermAxis]| match OrderGrid::new(0, alphas, axes, |_| false) {
-        Err(Error::EmptyOrderGrid { why }) => why,
+    let reason = |alphas: &[f64], axes: &[TermAxis]| match OrderGrid::new(0, alphas, axes, |_| false) {
+        Err(Error::EmptyOrderGrid { reason }) => reason,
         other => panic!("{other:?}"),
     };
-    assert_eq!(why(&[], &[axis(0, &[0.0], false)]), "no value of alpha");
-    assert_eq!(why(&[0.5], &[axis(0, &[0.5, 0.7], false)]), "no orders of signal 0 fit below alpha = 0.5");
-    assert_eq!(why(&[0.5], &[axis(1, &[], false)]), "no orders of signal 1 fit below alpha = 0.5");
+    assert_eq!(reason(&[], &[axis(0, &[0.0], false)]), "no value of alpha");
+    assert_eq!(reason(&[0.5], &[axis(0, &[0.5, 0.7], false)]), "no orders of signal 0 fit below alpha = 0.5");
+    assert_eq!(reason(&[0.5], &[axis(1, &[], false)]), "no orders of signal 1 fit below alpha = 0.5");
     assert_eq!(
-        why(&[1.0], &[axis(0, &[0.5], true), axis(0, &[0.5], true)]),
+        reason(&[1.0], &[axis(0, &[0.5], true), axis(0, &[0.5], true)]),
         "no orders of signal 0 fit below alpha = 1"
     );
     for alpha in [0.0, -1.0, 10.05] {

@@ -35,15 +35,15 @@ fn is_long_enough_for_test(residuals: &[f64]) -> bool {
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals have another length than its
 /// rows. [`Error::Structure`] if its singular values are not found.
-pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<Vec<f64>> {
-    let series: Vec<Vec<f64>> = grid.residuals(attempt).into_iter().flatten().collect();
-    let priors = grid.problem.model.priors.len();
-    let robust_weights = grid.weights.robust_weights.is_some().then(|| {
-        let mut weights = grid.flat_sample_weights();
+pub fn covariance(result: &OptimizationResult, objective: &Objective<'_>) -> Result<Vec<f64>> {
+    let series: Vec<Vec<f64>> = objective.residuals(result).into_iter().flatten().collect();
+    let priors = objective.problem.model.priors.len();
+    let robust_weights = objective.weights.robust_weights.is_some().then(|| {
+        let mut weights = objective.flat_sample_weights();
         weights.resize(weights.len() + priors, 1.0);
         weights
     });
-    robust_covariance(&attempt.jacobian, series, robust_weights.as_deref(), priors)
+    robust_covariance(&result.jacobian, series, robust_weights.as_deref(), priors)
 }
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian and residuals.
@@ -53,8 +53,9 @@ pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<
 /// `robust_weights` contains the robust weight of each column; it is None for a squared loss.
 ///
 /// # Errors
-/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if `robust_weights` has
-/// another length than its rows, or the residuals another length than its rows without `priors`. [`Error::Structure`] if its singular values are not found.
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if `robust_weights` has another length than
+/// its rows, or the residuals another length than its rows without `priors`. [`Error::Structure`] if its singular
+/// values are not found.
 pub fn robust_covariance(
     jacobian: &[Vec<f64>],
     series: Vec<Vec<f64>>,
@@ -62,8 +63,9 @@ pub fn robust_covariance(
     priors: usize,
 ) -> Result<Vec<f64>> {
     let squares = |series: &[Vec<f64>]| {
-        let of = |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
-        series.iter().map(of).sum::<f64>()
+        let finite_squares =
+            |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
+        series.iter().map(finite_squares).sum::<f64>()
     };
     let Some(robust_weights) = robust_weights else {
         return covariance_of_residuals(jacobian, &series, squares(&series), priors);
@@ -72,12 +74,12 @@ pub fn robust_covariance(
     let (series, unclipped_fraction) = huber_pseudo_residuals(series, jacobian.len());
     let samples = robust_weights.len().saturating_sub(priors);
     // The curvature of the loss is that of least squares times the fraction of residuals that are not clipped.
-    let unweighted = |(k, (value, &robust_weight)): (usize, (&f64, &f64))| {
+    let unweight = |(k, (value, &robust_weight)): (usize, (&f64, &f64))| {
         let curvature = if k < samples { unclipped_fraction.sqrt() } else { 1.0 };
         curvature * value / if robust_weight > 0.0 { robust_weight } else { 1.0 }
     };
     let rows: Vec<Vec<f64>> =
-        jacobian.iter().map(|row| row.iter().zip(robust_weights).enumerate().map(unweighted).collect()).collect();
+        jacobian.iter().map(|row| row.iter().zip(robust_weights).enumerate().map(unweight).collect()).collect();
     covariance_of_residuals(&rows, &series, squares(&series), priors)
 }
 
@@ -106,9 +108,9 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<
 
 /// Return the row-major covariance matrix of the parameters from a Jacobian, residuals and their sum of squares.
 ///
-/// `jacobian` has one row per parameter. Its last `priors` columns are the derivatives of the residuals of priors, which
-/// are in standard deviations of the priors. `series` contains the residuals of samples by run and output, NaN for
-/// missing samples. `squares` is their sum of squares.
+/// `jacobian` has one row per parameter. Its last `priors` columns are the derivatives of the residuals of priors,
+/// which are in standard deviations of the priors. `series` contains the residuals of samples by run and output, NaN
+/// for missing samples. `squares` is their sum of squares.
 ///
 /// With priors, the result is the mean square error of the estimate, averaged over the noise and over parameters drawn
 /// from the priors. For white noise, this is the linearized covariance of the posterior distribution.
@@ -119,8 +121,9 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> (Vec<
 /// log m) for p parameters and m residuals.
 ///
 /// # Errors
-/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if
-/// the length of autocorrelated residuals is not that of its rows without `priors`. [`Error::Structure`] if its singular values are not found.
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if the length
+/// of autocorrelated residuals is not that of its rows without `priors`. [`Error::Structure`] if its singular values
+/// are not found.
 #[allow(clippy::cast_precision_loss)]
 pub fn covariance_of_residuals(
     jacobian: &[Vec<f64>],
@@ -133,56 +136,61 @@ pub fn covariance_of_residuals(
         return Ok(Vec::new());
     }
     let finite_count = series.iter().flatten().filter(|e| !e.is_nan()).count();
-    let lengths: Vec<f64> = jacobian
+    let norms: Vec<f64> = jacobian
         .iter()
         .map(|row| {
-            let length = sum(&row.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt();
-            if length > 0.0 {
-                length
+            let row_norm = sum(&row.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt();
+            if row_norm > 0.0 {
+                row_norm
             } else {
                 1.0
             }
         })
         .collect();
     let mut columns = Vec::with_capacity(p);
-    for (row, length) in jacobian.iter().zip(&lengths) {
+    for (row, row_norm) in jacobian.iter().zip(&norms) {
         check_length("a row of a Jacobian", count, row.len())?;
         check_finite("a column", row)?;
-        let mut column: Vec<f64> = row.iter().map(|v| v / length).collect();
+        let mut column: Vec<f64> = row.iter().map(|v| v / row_norm).collect();
         column.resize(count.max(p), 0.0);
         columns.push(column);
     }
-    let unfound = || Error::Structure {
+    let singular_value_error = || Error::Structure {
         what: "singular values of a Jacobian are not found".into(),
         remedy: "scale the parameters".into(),
     };
-    let dense::SingularValues { left: rows, values: sizes, right } =
-        dense::singular_values(&columns).ok_or_else(unfound)?;
-    let largest = sizes.iter().copied().fold(0.0, f64::max);
-    let rounding = f64::EPSILON * (count.max(1) as f64).sqrt() * largest;
-    let significant: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k] > rounding).collect();
+    let dense::SingularValues { left: rows, values: singular_values, right } =
+        dense::singular_values(&columns).ok_or_else(singular_value_error)?;
+    let largest = singular_values.iter().copied().fold(0.0, f64::max);
+    let rounding_level = f64::EPSILON * (count.max(1) as f64).sqrt() * largest;
+    let significant: Vec<usize> = (0..singular_values.len()).filter(|&k| singular_values[k] > rounding_level).collect();
     // Largest angle between an identifiable and a non-identifiable direction that rounding can cause.
-    let threshold = significant.iter().map(|&k| sizes[k]).reduce(f64::min).map_or(0.0, |least| rounding / least);
-    let is_beyond = |i: usize| {
-        let lost_share = (0..sizes.len()).filter(|k| sizes[*k] <= rounding).map(|k| right[k][i] * right[k][i]);
-        lost_share.sum::<f64>().sqrt() > threshold
+    let threshold =
+        significant.iter().map(|&k| singular_values[k]).reduce(f64::min).map_or(0.0, |least| rounding_level / least);
+    let has_unidentifiable_component = |i: usize| {
+        let unidentifiable_squares = (0..singular_values.len())
+            .filter(|k| singular_values[*k] <= rounding_level)
+            .map(|k| right[k][i] * right[k][i]);
+        unidentifiable_squares.sum::<f64>().sqrt() > threshold
     };
-    let mut is_unidentifiable: Vec<bool> = (0..p).map(|i| significant.len() < sizes.len() && is_beyond(i)).collect();
+    let mut is_unidentifiable: Vec<bool> =
+        (0..p).map(|i| significant.len() < singular_values.len() && has_unidentifiable_component(i)).collect();
     // Rows of the pseudoinverse in the singular basis: the outer factor of the sandwich covariance.
     let inverse: Vec<Vec<f64>> =
-        (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
+        (0..p).map(|i| significant.iter().map(|&k| right[k][i] / singular_values[k]).collect()).collect();
     let samples = count.saturating_sub(priors);
     let prior_basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][samples..count]).collect();
     let prior_rows: Vec<Vec<f64>> =
         inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, count - samples)).collect();
-    let from_priors = |at: usize| inner(&prior_rows[at / p], &prior_rows[at % p]);
+    let prior_contribution = |at: usize| inner(&prior_rows[at / p], &prior_rows[at % p]);
     // Number of parameters that the samples determine; the priors determine the others.
     let sample_degrees = p as f64 - prior_basis.iter().map(|row| inner(row, row)).sum::<f64>();
     let level = squares / (finite_count as f64 - sample_degrees).max(1.0);
-    let for_white_noise: Vec<f64> =
-        (0..p * p).map(|at| level * (inner(&inverse[at / p], &inverse[at % p]) - from_priors(at))).collect();
+    let for_white_noise: Vec<f64> = (0..p * p)
+        .map(|index| level * (inner(&inverse[index / p], &inverse[index % p]) - prior_contribution(index)))
+        .collect();
     let passes_test = series.iter().all(|e| is_white(e, WHITENESS_LAGS));
-    let mut middle: Vec<f64> = if passes_test && series.iter().all(|e| is_long_enough_for_test(e)) {
+    let mut scaled_covariance: Vec<f64> = if passes_test && series.iter().all(|e| is_long_enough_for_test(e)) {
         for_white_noise
     } else {
         check_length("residuals", samples, series.iter().map(Vec::len).sum())?;
@@ -195,12 +203,13 @@ pub fn covariance_of_residuals(
             widen_covariance(autoregressive, &long_run_covariance(&pseudoinverse_rows, series)?)
         }
     };
-    middle.iter_mut().enumerate().for_each(|(at, value)| *value += from_priors(at));
+    scaled_covariance.iter_mut().enumerate().for_each(|(index, value)| *value += prior_contribution(index));
     // The variance of a parameter with almost no effect can overflow.
-    let mut result: Vec<f64> = (0..p * p).map(|at| middle[at] / (lengths[at / p] * lengths[at % p])).collect();
+    let mut result: Vec<f64> =
+        (0..p * p).map(|index| scaled_covariance[index] / (norms[index / p] * norms[index % p])).collect();
     (0..p).for_each(|i| is_unidentifiable[i] |= !result[i * p + i].is_finite());
-    for (at, value) in result.iter_mut().enumerate() {
-        let (i, j) = (at / p, at % p);
+    for (index, value) in result.iter_mut().enumerate() {
+        let (i, j) = (index / p, index % p);
         if is_unidentifiable[i] || is_unidentifiable[j] {
             *value = if i == j { f64::INFINITY } else { f64::NAN };
         }
@@ -227,7 +236,7 @@ fn lag_count(samples: usize) -> usize {
 fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
     let (p, weighted) = (rows.len(), multiply_toeplitz(rows, covariances));
     let product = |i: usize, j: usize| inner(&weighted[i], rows[j]);
-    (0..p * p).map(|at| 0.5 * (product(at / p, at % p) + product(at % p, at / p))).collect()
+    (0..p * p).map(|index| 0.5 * (product(index / p, index % p) + product(index % p, index / p))).collect()
 }
 
 /// Return the covariance of least-squares estimates for noise that is modeled by an autoregression of the residuals.
@@ -242,35 +251,39 @@ fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss)]
 fn autoregressive_covariance(pseudoinverse_rows: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; pseudoinverse_rows.len() * pseudoinverse_rows.len()];
-    let mut at = 0;
+    let mut start = 0;
     for residuals in series {
-        let range = at..at + residuals.len();
-        at = range.end;
+        let range = start..start + residuals.len();
+        start = range.end;
         let count = residuals.iter().filter(|e| !e.is_nan()).count();
         if count == 0 {
             continue;
         }
-        let (through, power) = burg_filter(residuals, lag_count(count));
-        let covariances = filter_autocovariances(&through, power, residuals.len());
+        let (filter, power) = burg_filter(residuals, lag_count(count));
+        let covariances = filter_autocovariances(&filter, power, residuals.len());
         if covariances[0].is_nan() || covariances[0] <= 0.0 {
             continue;
         }
         let directions: Vec<&[f64]> = basis.iter().map(|row| &row[range.clone()]).collect();
-        let own = multiply_toeplitz(&directions, &covariances);
-        let explained = own.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
+        let filtered_directions = multiply_toeplitz(&directions, &covariances);
+        let explained =
+            filtered_directions.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
         let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_SHARE);
         let rows: Vec<&[f64]> = pseudoinverse_rows.iter().map(|row| &row[range.clone()]).collect();
-        total.iter_mut().zip(quadratic_form(&rows, &covariances)).for_each(|(sum, more)| *sum += more / remainder);
+        total
+            .iter_mut()
+            .zip(quadratic_form(&rows, &covariances))
+            .for_each(|(sum, contribution)| *sum += contribution / remainder);
     }
     total
 }
 
-/// Scale the covariance `one` so that no variance is below that of `other`; correlations are unchanged.
-fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
-    let p = one.len().isqrt();
-    let scale_of = |i: usize| (other[i * p + i] / one[i * p + i].max(f64::MIN_POSITIVE)).max(1.0).sqrt();
+/// Scale `covariance` so that no variance is below that of `minimum`; correlations are unchanged.
+fn widen_covariance(covariance: Vec<f64>, minimum: &[f64]) -> Vec<f64> {
+    let p = covariance.len().isqrt();
+    let scale_of = |i: usize| (minimum[i * p + i] / covariance[i * p + i].max(f64::MIN_POSITIVE)).max(1.0).sqrt();
     let scales: Vec<f64> = (0..p).map(scale_of).collect();
-    one.iter().enumerate().map(|(at, value)| value * scales[at / p] * scales[at % p]).collect()
+    covariance.iter().enumerate().map(|(at, value)| value * scales[at / p] * scales[at % p]).collect()
 }
 
 /// Return the long-run covariance of the summed scores, the middle factor of the sandwich covariance, row-major.
@@ -287,10 +300,10 @@ pub fn long_run_covariance(jacobian: &[Vec<f64>], series: &[Vec<f64>]) -> Result
     let count = series.iter().map(Vec::len).sum();
     jacobian.iter().try_for_each(|row| check_length("a row of a Jacobian", count, row.len()))?;
     let mut total = vec![0.0; jacobian.len() * jacobian.len()];
-    let mut at = 0;
+    let mut start = 0;
     for residuals in series {
-        let range = at..at + residuals.len();
-        at = range.end;
+        let range = start..start + residuals.len();
+        start = range.end;
         if residuals.is_empty() {
             continue;
         }
@@ -306,7 +319,7 @@ pub fn long_run_covariance(jacobian: &[Vec<f64>], series: &[Vec<f64>]) -> Result
             _ => 0.0,
         };
         let weights: Vec<f64> = (0..residuals.len()).map(weight).collect();
-        total.iter_mut().zip(quadratic_form(&rows, &weights)).for_each(|(sum, more)| *sum += more);
+        total.iter_mut().zip(quadratic_form(&rows, &weights)).for_each(|(sum, contribution)| *sum += contribution);
     }
     Ok(total)
 }

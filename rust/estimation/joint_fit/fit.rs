@@ -55,26 +55,26 @@ impl OutputScale {
     pub fn from_runs(runs: &[Vec<f64>]) -> Self {
         let variance = |samples: &Vec<f64>| {
             let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
-            let middle = mean(&finite);
-            mean(&finite.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>())
+            let center = mean(&finite);
+            mean(&finite.iter().map(|v| (v - center) * (v - center)).collect::<Vec<_>>())
         };
-        let size = mean(&runs.iter().map(variance).collect::<Vec<_>>()).sqrt();
-        Self::from_deviation(size, runs)
+        let scale = mean(&runs.iter().map(variance).collect::<Vec<_>>()).sqrt();
+        Self::from_deviation(scale, runs)
     }
 
     /// Return the scale of each output of the runs.
     ///
     /// # Errors
     /// [`Error::Structure`] for an output that does not exist.
-    pub fn of_recordings(source: &Recordings) -> Result<Vec<Self>> {
+    pub fn from_recordings(source: &Recordings) -> Result<Vec<Self>> {
         let compared: Vec<Vec<Vec<f64>>> = source.runs().iter().map(Recording::recorded_rows).collect();
         let outputs = source.runs().first().map_or(&[][..], Recording::outputs);
-        let of = |(k, &output): (usize, &usize)| {
+        let scale = |(k, &output): (usize, &usize)| {
             let uniform: Vec<Vec<f64>> = source.samples(output)?.into_iter().map(<[f64]>::to_vec).collect();
             let compared: Vec<Vec<f64>> = compared.iter().map(|rows| rows[k].clone()).collect();
             Ok(Self::from_deviation(Self::from_runs(&uniform).deviation, &compared))
         };
-        outputs.iter().enumerate().map(of).collect()
+        outputs.iter().enumerate().map(scale).collect()
     }
 
     /// Return the scale of an output with the given standard deviation from its samples, one list per run.
@@ -94,7 +94,7 @@ pub enum Initialization {
     /// replace the automatic ones.
     Multistart {
         /// The given initial guesses, each with the values of all free parameters.
-        known: Vec<Vec<f64>>,
+        given_guesses: Vec<Vec<f64>>,
         /// Candidates of an earlier multistart. None runs a new multistart.
         candidates: Option<Vec<Candidate>>,
     },
@@ -144,13 +144,13 @@ pub struct JointFit {
 #[derive(Clone, Copy)]
 pub struct FitProblem<'a> {
     /// Set of free parameters.
-    pub free: &'a ParameterSet,
+    pub parameter_set: &'a ParameterSet,
     /// Runs that are fitted together.
     pub source: &'a Recordings,
     /// Source of initial guesses.
-    pub starts: &'a dyn InitialGuessSource,
+    pub guess_source: &'a dyn InitialGuessSource,
     /// Scales of the outputs, one per output.
-    pub sizes: &'a [OutputScale],
+    pub scales: &'a [OutputScale],
     /// Cancellation flag.
     pub stop: &'a Stop,
 }
@@ -160,25 +160,25 @@ impl<'a> FitProblem<'a> {
     ///
     /// Unless `refine` is true, the objective has the looser convergence tolerance of fits that are only compared with
     /// other fits.
-    fn grid(&self, outputs: Vec<f64>, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
+    fn objective(&self, outputs: Vec<f64>, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = Weights { outputs, robust_weights: None };
         let source: &'a Recordings = self.source;
-        let grid = Objective::new((&self.free.problem, source, self.stop), weights, sampling, false)?;
-        Ok(if refine { grid } else { grid.for_comparison() })
+        let objective = Objective::new((&self.parameter_set.problem, source, self.stop), weights, sampling, false)?;
+        Ok(if refine { objective } else { objective.for_comparison() })
     }
 
     /// Return the objective with equal weights of all outputs relative to their standard deviations.
     ///
     /// The optimum depends on the noise levels, but a search far from the optimum does not need them.
-    fn equally_weighted_grid(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
-        let weights = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
-        self.grid(weights, sampling, refine)
+    fn equally_weighted_objective(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
+        let weights = self.scales.iter().map(|scale| 1.0 / (COARSE_RESIDUAL_RATIO * scale.deviation)).collect();
+        self.objective(weights, sampling, refine)
     }
 
     /// Mean square of the weighted residuals if they are white noise alone, with equal weights of the outputs.
     fn noise_floor(&self) -> f64 {
-        let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
-        mean(&self.sizes.iter().map(share).collect::<Vec<_>>())
+        let noise_ratio = |scale: &OutputScale| (scale.noise / (COARSE_RESIDUAL_RATIO * scale.deviation)).powi(2);
+        mean(&self.scales.iter().map(noise_ratio).collect::<Vec<_>>())
     }
 
     /// Run the multistart and return its candidates, best first.
@@ -187,25 +187,33 @@ impl<'a> FitProblem<'a> {
     /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress
     /// listener if it returns one. [`Error::Interrupted`] after a stop request.
     pub fn run_multistart(&self, threads: usize, progress: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
-        let floor = self.noise_floor();
-        let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
-        let shared = std::cell::RefCell::new(progress);
-        let listener =
-            |count, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, of);
-        let Self { source, starts, stop, .. } = *self;
-        let context =
-            MultistartContext { source, starts, stop, weights: &weights, floor, threads, listener: Some(&listener) };
-        let run = match &self.free.problem {
+        let noise_floor = self.noise_floor();
+        let weights: Vec<f64> = self.scales.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
+        let shared_progress = std::cell::RefCell::new(progress);
+        let listener = |count, total| {
+            shared_progress.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, total)
+        };
+        let Self { source, guess_source, stop, .. } = *self;
+        let context = MultistartContext {
+            source,
+            guess_source,
+            stop,
+            weights: &weights,
+            noise_floor,
+            threads,
+            listener: Some(&listener),
+        };
+        let multistart = match &self.parameter_set.problem {
             problem if !problem.derived.is_empty() => run_nonlinear_multistart,
             problem if !problem.frictions.is_empty() => run_friction_multistart,
             _ => run_multistart,
         };
-        run(self.free, context)
+        multistart(self.parameter_set, context)
     }
 
     fn start(&self, values: &[f64], origin: &str) -> Result<Candidate> {
-        let place = Iterate { point: self.free.problem.point(values)?, states: Vec::new() };
-        Ok(Candidate::at(place, origin))
+        let iterate = Iterate { point: self.parameter_set.problem.point(values)?, states: Vec::new() };
+        Ok(Candidate::at(iterate, origin))
     }
 }
 
@@ -225,34 +233,42 @@ pub struct EquationFit {
 ///
 /// # Errors
 /// [`Error::Diverged`] if no initial guess has a finite simulation. [`Error::Structure`] if the equations or runs are
-/// invalid. [`Error::Beyond`] if squares of residuals overflow.
+/// invalid. [`Error::Overflow`] if squares of residuals overflow.
 pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -> Result<EquationFit> {
     let runs = Recordings::new(runs)?;
     let signals = runs.runs()[0].channels().iter().map(|channel| channel.name.clone()).collect();
-    let sizes = equations
+    let scales = equations
         .iter()
         .map(|equation| {
             let samples: Vec<Vec<f64>> = runs.samples(equation.output)?.into_iter().map(<[f64]>::to_vec).collect();
             Ok(OutputScale::from_runs(&samples))
         })
         .collect::<Result<Vec<_>>>()?;
-    let free = ParameterSet::from_structure(ParametricStructure::new(signals, equations, Initial::Rest))?;
+    let parameter_set = ParameterSet::from_structure(ParametricStructure::new(signals, equations, Initial::Rest))?;
     let stop = Stop::default();
-    let starts = OrderGrids::new(&runs, 1, BANK_LIMIT, &stop);
-    let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let guess_source = OrderGrids::new(&runs, 1, BANK_LIMIT, &stop);
+    let problem = FitProblem {
+        parameter_set: &parameter_set,
+        source: &runs,
+        guess_source: &guess_source,
+        scales: &scales,
+        stop: &stop,
+    };
     let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
     let fit =
-        fit(problem, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))?
-            .ok_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })?;
-    Ok(EquationFit { values: free.names().cloned().zip(fit.optimum.estimate.iter().copied()).collect(), fit })
+        fit(problem, Initialization::Multistart { given_guesses: Vec::new(), candidates: None }, settings, &|_, _| {
+            Ok(())
+        })?
+        .ok_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })?;
+    Ok(EquationFit { values: parameter_set.names().cloned().zip(fit.optimum.estimate.iter().copied()).collect(), fit })
 }
 
 /// Fit a structure to runs by output error. Return None if no initial guess has a finite simulation.
 ///
 /// # Errors
 /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
-/// if it returns one. [`Error::Beyond`] if squares of residuals overflow. The error of the last survivor if no survivor
-/// of the multistart can be simulated. [`Error::Interrupted`] after a stop request.
+/// if it returns one. [`Error::Overflow`] if squares of residuals overflow. The error of the last survivor if no
+/// survivor of the multistart can be simulated. [`Error::Interrupted`] after a stop request.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -270,7 +286,7 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
 /// let fall = f64::exp(-2.0 * step);
 /// u.iter().for_each(|u| y.push(fall * y[y.len() - 1] + 1.5 * (1.0 - fall) * u));
 /// y.pop();
-/// let sizes = [OutputScale::from_runs(&[y.clone()])];
+/// let scales = [OutputScale::from_runs(&[y.clone()])];
 /// let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Hold)));
 /// let runs = Recordings::new(vec![Recording::new("run", step, None, vec![y, u], vec![0])?])?;
 /// let term = |signal, name: &str| {
@@ -280,15 +296,16 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
 /// let terms = vec![term(0, "a"), term(1, "b")];
 /// let equation = ParametricEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
 /// let signals = vec!["y".into(), "u".into()];
-/// let free = ParameterSet::from_structure(ParametricStructure::new(signals, vec![equation], Initial::Rest))?;
+/// let parameter_set = ParameterSet::from_structure(ParametricStructure::new(signals, vec![equation], Initial::Rest))?;
 /// let stop = Stop::default();
-/// let starts = OrderGrids::new(&runs, 1, 1 << 28, &stop);
-/// let problem = FitProblem { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+/// let guess_source = OrderGrids::new(&runs, 1, 1 << 28, &stop);
+/// let (parameter_set, guess_source, scales) = (&parameter_set, &guess_source, &scales[..]);
+/// let problem = FitProblem { parameter_set, source: &runs, guess_source, scales, stop: &stop };
 /// let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-/// let initialization = Initialization::Multistart { known: Vec::new(), candidates: None };
+/// let initialization = Initialization::Multistart { given_guesses: Vec::new(), candidates: None };
 /// // None if no initial guess has a finite simulation.
-/// let found = fit::fit(problem, initialization, settings, &|_, _| Ok(()))?;
-/// let estimate = found.map_or_else(Vec::new, |fit| fit.optimum.estimate);
+/// let joint_fit = fit::fit(problem, initialization, settings, &|_, _| Ok(()))?;
+/// let estimate = joint_fit.map_or_else(Vec::new, |fit| fit.optimum.estimate);
 /// assert_eq!(estimate.len(), 3);
 /// assert!(estimate.iter().zip([1.0, -2.0, 3.0]).all(|(value, truth)| (value - truth).abs() < 1e-2));
 /// # Ok(())
@@ -300,25 +317,25 @@ pub fn fit(
     settings: Settings,
     listener: &ProgressListener<'_>,
 ) -> Result<Option<JointFit>> {
-    let free = problem.free;
+    let parameter_set = problem.parameter_set;
     let mut progress = FitProgress::new(listener);
     let (candidates, survivors) = match initialization {
-        Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates } => {
+        Initialization::WarmStart { values, noise, pulses_per_sample, candidates } => {
             let start = problem.start(&values, GIVEN_START_ORIGIN)?;
-            let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
+            let sampling = Sampling { pulses_per_sample, ..Sampling::default() };
             let weights = noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect();
-            let grid = problem.grid(weights, sampling, settings.refine)?;
-            let (best, grid) = reweight_candidate(&start, grid, settings.loss)?;
-            return finish_fit(free, best, grid, candidates, settings).map(Some);
+            let objective = problem.objective(weights, sampling, settings.refine)?;
+            let (best_candidate, objective) = reweight_candidate(&start, objective, settings.loss)?;
+            return finish_fit(parameter_set, best_candidate, objective, candidates, settings).map(Some);
         }
         Initialization::InitialGuess(values) => (Vec::new(), vec![problem.start(&values, GIVEN_START_ORIGIN)?]),
-        Initialization::Multistart { known: guesses, candidates } => {
+        Initialization::Multistart { given_guesses, candidates } => {
             let candidates = match candidates {
                 Some(candidates) => candidates,
                 None => problem.run_multistart(settings.threads, &mut progress)?,
             };
             let mut survivors = select_survivors(&candidates);
-            for values in &guesses {
+            for values in &given_guesses {
                 survivors.push(problem.start(values, GIVEN_START_ORIGIN)?);
             }
             (candidates, survivors)
@@ -326,30 +343,30 @@ pub fn fit(
     };
     let Some(first) = survivors.first() else { return Ok(None) };
     progress.advance_to(MULTISTART_PROGRESS_SHARE)?;
-    let weights = problem.sizes.iter().map(|size| 1.0 / size.noise).collect();
-    let mut grid = problem.grid(weights, Sampling::default(), settings.refine)?;
+    let weights = problem.scales.iter().map(|size| 1.0 / size.noise).collect();
+    let mut objective = problem.objective(weights, Sampling::default(), settings.refine)?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
-    while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !grid.is_exact(&first.result.iterate) {
-        let finer = grid.finer()?;
-        if !grid.is_refinement_significant(&first.result.iterate, &finer)? {
+    while objective.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !objective.is_exact(&first.result.iterate) {
+        let finer = objective.finer()?;
+        if !objective.is_refinement_significant(&first.result.iterate, &finer)? {
             break;
         }
-        grid = finer;
+        objective = finer;
     }
-    let mut best = select_on_part(problem, &survivors, grid.sampling, settings.refine)?;
-    if problem.sizes.len() > 1 {
+    let mut best_candidate = select_on_part(problem, &survivors, objective.sampling, settings.refine)?;
+    if problem.scales.len() > 1 {
         // With a single output, the optimum does not depend on the noise level.
-        let place = &best.result.iterate;
-        best = best.with_result(grid.minimize_in(
-            &free.problem_at(place, false, &[]),
-            place,
+        let iterate = &best_candidate.result.iterate;
+        best_candidate = best_candidate.with_result(objective.minimize_in(
+            &parameter_set.problem_at(iterate, false, &[]),
+            iterate,
             EVALUATIONS_PER_REWEIGHTING,
         )?);
     }
     progress.advance_to(0.65)?;
-    let (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
+    let (best_candidate, objective) = reweight_candidate(&best_candidate, objective, settings.loss)?;
     progress.advance_to(0.75)?;
-    let final_fit = finish_fit(free, best, grid, candidates, settings)?;
+    let final_fit = finish_fit(parameter_set, best_candidate, objective, candidates, settings)?;
     progress.advance_to(1.0)?;
     Ok(Some(final_fit))
 }
@@ -361,24 +378,25 @@ const GIVEN_START_ORIGIN: &str = "given start";
 ///
 /// A stable optimum may replace an unstable one. Then the step is refined, and the statistics are computed.
 fn finish_fit(
-    free: &ParameterSet,
-    best: Candidate,
-    grid: Objective<'_>,
+    parameter_set: &ParameterSet,
+    best_candidate: Candidate,
+    objective: Objective<'_>,
     candidates: Vec<Candidate>,
     settings: Settings,
 ) -> Result<JointFit> {
-    let (mut best, mut grid, stability) = prefer_stable(free, best, grid, &candidates)?;
+    let (mut best_candidate, mut objective, stability) =
+        prefer_stable(parameter_set, best_candidate, objective, &candidates)?;
     if stability.is_some_and(|stability| !stability.keeps_unstable) {
-        (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
+        (best_candidate, objective) = reweight_candidate(&best_candidate, objective, settings.loss)?;
     }
-    let optimum = if !settings.refine || grid.is_exact(&best.result.iterate) {
-        Optimum::without_refinement(best.result, grid)?
-    } else if let Some(corrected) = correct_step(&best.result, &grid, settings.loss)? {
+    let optimum = if !settings.refine || objective.is_exact(&best_candidate.result.iterate) {
+        Optimum::without_refinement(best_candidate.result, objective)?
+    } else if let Some(corrected) = correct_step(&best_candidate.result, &objective, settings.loss)? {
         corrected
     } else {
-        let others: Vec<Iterate> =
+        let alternatives: Vec<Iterate> =
             select_survivors(&candidates).into_iter().map(|candidate| candidate.result.iterate).collect();
-        refine_step(best.result, grid, settings.loss, &others)?
+        refine_step(best_candidate.result, objective, settings.loss, &alternatives)?
     };
     Ok(JointFit { optimum: optimum.into_statistics(), candidates, stability })
 }
@@ -388,11 +406,11 @@ fn finish_fit(
 /// Return the fitted candidate and the objective with the final weights.
 fn reweight_candidate<'a>(
     candidate: &Candidate,
-    grid: Objective<'a>,
+    objective: Objective<'a>,
     loss: Loss,
 ) -> Result<(Candidate, Objective<'a>)> {
-    let (attempt, grid) = fit_reweighted(&candidate.result.iterate, grid, loss)?;
-    Ok((candidate.with_result(attempt), grid))
+    let (result, objective) = fit_reweighted(&candidate.result.iterate, objective, loss)?;
+    Ok((candidate.with_result(result), objective))
 }
 
 /// Return the best survivor of the multistart, fitted to all samples.
@@ -406,75 +424,91 @@ fn select_on_part(
     sampling: Sampling,
     refine: bool,
 ) -> Result<Candidate> {
-    let whole = problem.equally_weighted_grid(sampling, refine)?;
-    if let Some(intervals) = leading_part(problem.free, problem.source, SELECTION_INTERVALS)? {
-        let part =
-            problem.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
-        let winner = select_best_candidate(problem, survivors, &part).and_then(|best| {
-            let place = &best.result.iterate;
-            let problem = problem.free.problem_at(place, true, &[]);
-            let end = whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?;
-            Ok((best.cost_per_residual(), best.with_result(end)))
+    let full_objective = problem.equally_weighted_objective(sampling, refine)?;
+    if let Some(intervals) = leading_part(problem.parameter_set, problem.source, SELECTION_INTERVALS)? {
+        let part_objective =
+            problem.equally_weighted_objective(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
+        let selection = select_best_candidate(problem, survivors, &part_objective).and_then(|best_candidate| {
+            let iterate = &best_candidate.result.iterate;
+            let problem = problem.parameter_set.problem_at(iterate, true, &[]);
+            let result = full_objective.minimize_in(&problem, iterate, MAX_FINAL_EVALUATIONS)?;
+            Ok((best_candidate.cost_per_residual(), best_candidate.with_result(result)))
         });
         // On all samples, the simulation of the winner may overflow, or be much worse than that of another survivor.
-        match winner {
+        match selection {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            Ok((partial, best)) => {
-                let rises = best.cost_per_residual() > MAX_COST_RATIO * partial;
-                if !rises || !has_better_candidate(&best, survivors, &whole)? {
-                    return Ok(best);
+            Ok((part_cost, best_candidate)) => {
+                let has_increased = best_candidate.cost_per_residual() > MAX_COST_RATIO * part_cost;
+                if !has_increased || !has_better_candidate(&best_candidate, survivors, &full_objective)? {
+                    return Ok(best_candidate);
                 }
             }
             Err(_) => {}
         }
     }
-    select_best_candidate(problem, survivors, &whole)
+    select_best_candidate(problem, survivors, &full_objective)
 }
 
-/// Return true if a candidate, without further optimization, has a lower cost on the objective `grid` than `best`.
-fn has_better_candidate(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -> Result<bool> {
+/// Return true if a candidate, without further optimization, has a lower cost on `objective` than `best_candidate`.
+fn has_better_candidate(
+    best_candidate: &Candidate,
+    candidates: &[Candidate],
+    objective: &Objective<'_>,
+) -> Result<bool> {
     for candidate in candidates {
-        if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {
+        if objective
+            .evaluate(&candidate.result.iterate)?
+            .is_some_and(|evaluation| evaluation.cost < best_candidate.result.cost)
+        {
             return Ok(true);
         }
     }
     Ok(false)
 }
 
-/// Fit each survivor with the objective `near` and return the best one.
-fn select_best_candidate(problem: FitProblem<'_>, survivors: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
-    let free = problem.free;
+/// Fit each survivor on `objective` and return the best one.
+fn select_best_candidate(
+    problem: FitProblem<'_>,
+    survivors: &[Candidate],
+    objective: &Objective<'_>,
+) -> Result<Candidate> {
+    let parameter_set = problem.parameter_set;
     let fit = |candidate: &Candidate, evaluations| {
-        let place = &candidate.result.iterate;
-        near.minimize_in(&free.problem_at(place, false, &[]), place, evaluations)
+        let iterate = &candidate.result.iterate;
+        objective.minimize_in(&parameter_set.problem_at(iterate, false, &[]), iterate, evaluations)
     };
-    let mut short = Vec::new();
-    let mut last = None;
+    let mut short_fits = Vec::new();
+    let mut last_error = None;
     for candidate in survivors {
         match fit(candidate, FIRST_BUDGET_EVALUATIONS) {
-            Ok(attempt) => short.push(candidate.with_result(attempt.without_residuals())),
+            Ok(result) => short_fits.push(candidate.with_result(result.without_residuals())),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // This survivor has no finite simulation on this grid. Other survivors may have one.
-            Err(error) => last = Some(error),
+            Err(error) => last_error = Some(error),
         }
     }
-    let (unfinished, mut ends) = split_unfinished(short, problem.noise_floor());
+    let (unfinished, mut finished) = split_unfinished(short_fits, problem.noise_floor());
     for candidate in unfinished {
         match fit(&candidate, MAX_FINAL_EVALUATIONS) {
-            Ok(attempt) => ends.push(candidate.with_result(attempt.without_residuals())),
+            Ok(result) => finished.push(candidate.with_result(result.without_residuals())),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            Err(_) => ends.push(candidate),
+            Err(_) => finished.push(candidate),
         }
     }
-    let attempts: Vec<&OptimizationResult> = ends.iter().map(|candidate| &candidate.result).collect();
-    let first = match (attempts.len(), last) {
+    let results: Vec<&OptimizationResult> = finished.iter().map(|candidate| &candidate.result).collect();
+    let first_index = match (results.len(), last_error) {
         (0, Some(error)) => return Err(error),
         (0 | 1, _) => 0,
-        _ => near.finer()?.rank_results(&attempts)?[0],
+        _ => objective.finer()?.rank_results(&results)?[0],
     };
-    let best = &ends[first];
+    let best_candidate = &finished[first_index];
     // The previous fits use logarithmic coordinates. The best one is continued in plain coordinates.
-    let place = &best.result.iterate;
-    let plain = near.minimize_in(&free.problem_at(place, true, &[]), place, MAX_FINAL_EVALUATIONS)?;
-    Ok(if plain.cost <= best.result.cost { best.with_result(plain) } else { best.clone() })
+    let iterate = &best_candidate.result.iterate;
+    let plain_result =
+        objective.minimize_in(&parameter_set.problem_at(iterate, true, &[]), iterate, MAX_FINAL_EVALUATIONS)?;
+    Ok(if plain_result.cost <= best_candidate.result.cost {
+        best_candidate.with_result(plain_result)
+    } else {
+        best_candidate.clone()
+    })
 }

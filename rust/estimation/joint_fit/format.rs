@@ -11,15 +11,15 @@ pub(crate) fn format_general(value: f64, digits: usize) -> String {
             "-inf".into()
         };
     }
-    let most = digits.max(1) - 1;
+    let decimals = digits.max(1) - 1;
     // The exponent is that of the rounded value: 9.99 in two digits is 10.
-    let rounded = format!("{value:.most$e}");
+    let rounded = format!("{value:.decimals$e}");
     let Some((mantissa, exponent)) = rounded.split_once('e') else { return rounded };
     let power: i64 = exponent.parse().unwrap_or(0);
     match usize::try_from(power) {
-        Ok(whole) if whole <= most => trim_zeros(&format!("{value:.*}", most - whole)).into(),
+        Ok(whole) if whole <= decimals => trim_zeros(&format!("{value:.*}", decimals - whole)).into(),
         Err(_) if power >= -4 => {
-            let places = usize::try_from(-power).unwrap_or(0) + most;
+            let places = usize::try_from(-power).unwrap_or(0) + decimals;
             trim_zeros(&format!("{value:.places$}")).into()
         }
         _ => {

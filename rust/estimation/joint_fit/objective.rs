@@ -72,20 +72,20 @@ impl<'a> Objective<'a> {
         sampling.check()?;
         let experiments = source.experiments(sampling)?;
         stop.check()?;
-        let read = Arc::new(experiments.iter().map(|e| e.sample_weights.clone()).collect());
-        let blank = Weights { outputs: Vec::new(), robust_weights: None };
-        let grid = Self {
+        let sample_mask = Arc::new(experiments.iter().map(|e| e.sample_weights.clone()).collect());
+        let no_weights = Weights { outputs: Vec::new(), robust_weights: None };
+        let objective = Self {
             problem,
             source,
             stop,
-            weights: blank,
+            weights: no_weights,
             sampling,
             requires_stability,
             tolerance: RELATIVE_COST_TOLERANCE,
-            sample_mask: read,
+            sample_mask,
             experiments: Arc::new(experiments),
         };
-        grid.with_weights(weights)
+        objective.with_weights(weights)
     }
 
     /// Return the objective with other weights.
@@ -94,13 +94,13 @@ impl<'a> Objective<'a> {
     /// [`Error::Length`] for a wrong number of robust weights.
     pub fn with_weights(&self, weights: Weights) -> Result<Self> {
         let mut experiments = Vec::clone(&self.experiments);
-        if let Some(shares) = &weights.robust_weights {
-            check_length("runs with robust weights", experiments.len(), shares.len())?;
+        if let Some(robust_weights) = &weights.robust_weights {
+            check_length("runs with robust weights", experiments.len(), robust_weights.len())?;
         }
         for (k, experiment) in experiments.iter_mut().enumerate() {
             experiment.sample_weights.clone_from(&self.sample_mask[k]);
-            let shares = weights.robust_weights.as_ref().map(|of| of[k].as_slice());
-            *experiment = experiment.clone().with_weights(&weights.outputs, shares)?;
+            let run_weights = weights.robust_weights.as_ref().map(|runs| runs[k].as_slice());
+            *experiment = experiment.clone().with_weights(&weights.outputs, run_weights)?;
         }
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
@@ -125,8 +125,8 @@ impl<'a> Objective<'a> {
     /// after a stop request.
     pub fn finer(&self) -> Result<Self> {
         let sampling = Sampling { pulses_per_sample: 2 * self.sampling.pulses_per_sample, ..self.sampling };
-        let whole = (self.problem, self.source, self.stop);
-        let finer = Self::new(whole, self.weights.clone(), sampling, self.requires_stability)?;
+        let fit_inputs = (self.problem, self.source, self.stop);
+        let finer = Self::new(fit_inputs, self.weights.clone(), sampling, self.requires_stability)?;
         Ok(Self { tolerance: self.tolerance, ..finer })
     }
 
@@ -202,16 +202,16 @@ impl<'a> Objective<'a> {
     /// must not be decimated. Each delay must be a whole number of sampling intervals, so that no input switches within
     /// a pulse.
     #[must_use]
-    pub fn is_exact(&self, place: &Iterate) -> bool {
-        let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
+    pub fn is_exact(&self, iterate: &Iterate) -> bool {
+        let is_whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
         let runs = self.source.runs().iter().zip(self.source.intervals_and_durations());
         self.sampling.decimation == 1
             && self.problem.is_linear()
             && runs
                 .flat_map(|(run, (step, _))| run.channels().iter().map(move |c| (c.delay, step)))
-                .all(|(delay, step)| delay.is_none_or(|delay| whole(delay, step)))
-            && (IntegerOrders::of(&self.problem.model, &self.experiments, &place.point).is_some()
-                || FractionalOrders::accepts(&self.problem.model, &self.experiments, &place.point))
+                .all(|(delay, step)| delay.is_none_or(|delay| is_whole(delay, step)))
+            && (IntegerOrders::of(&self.problem.model, &self.experiments, &iterate.point).is_some()
+                || FractionalOrders::accepts(&self.problem.model, &self.experiments, &iterate.point))
     }
 
     /// Return true if halving the step changes the simulated samples significantly relative to the residuals.
@@ -222,8 +222,8 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// An error if the runs cannot be sampled at half the step ([`Recordings::experiments`]). [`Error::Interrupted`]
     /// after a stop request.
-    pub fn is_discretization_significant(&self, place: &Iterate) -> Result<bool> {
-        self.is_refinement_significant(place, &self.finer()?)
+    pub fn is_discretization_significant(&self, iterate: &Iterate) -> Result<bool> {
+        self.is_refinement_significant(iterate, &self.finer()?)
     }
 
     /// Return true if the simulated samples change significantly, relative to the residuals, on the pulse grid of
@@ -231,8 +231,8 @@ impl<'a> Objective<'a> {
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
-    pub fn is_refinement_significant(&self, place: &Iterate, finer: &Self) -> Result<bool> {
-        let (Some(evaluation), Some(finer_evaluation)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
+    pub fn is_refinement_significant(&self, iterate: &Iterate, finer: &Self) -> Result<bool> {
+        let (Some(evaluation), Some(finer_evaluation)) = (self.evaluate(iterate)?, finer.evaluate(iterate)?) else {
             // The simulation is not finite on at least one of the grids, so the difference counts as significant.
             return Ok(true);
         };
@@ -252,16 +252,16 @@ impl<'a> Objective<'a> {
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
-    pub fn rank_results(&self, attempts: &[&OptimizationResult]) -> Result<Vec<usize>> {
-        let worse = |attempt: &&OptimizationResult| {
-            let evaluation = self.evaluate(&attempt.iterate)?;
+    pub fn rank_results(&self, results: &[&OptimizationResult]) -> Result<Vec<usize>> {
+        let larger_cost = |result: &&OptimizationResult| {
+            let evaluation = self.evaluate(&result.iterate)?;
             Ok(evaluation
-                .map_or(f64::INFINITY, |evaluation| attempt.cost_per_residual().max(evaluation.cost_per_residual())))
+                .map_or(f64::INFINITY, |evaluation| result.cost_per_residual().max(evaluation.cost_per_residual())))
         };
-        let costs: Vec<f64> = attempts.iter().map(worse).collect::<Result<_>>()?;
-        let any = costs.iter().any(|cost| cost.is_finite());
-        let key = |i: usize| (if any { costs[i] } else { 0.0 }, attempts[i].cost_per_residual());
-        let mut order: Vec<usize> = (0..attempts.len()).collect();
+        let costs: Vec<f64> = results.iter().map(larger_cost).collect::<Result<_>>()?;
+        let has_finite_cost = costs.iter().any(|cost| cost.is_finite());
+        let key = |i: usize| (if has_finite_cost { costs[i] } else { 0.0 }, results[i].cost_per_residual());
+        let mut order: Vec<usize> = (0..results.len()).collect();
         order.sort_by(|&i, &j| {
             let ((a, b), (c, d)) = (key(i), key(j));
             a.total_cmp(&c).then(b.total_cmp(&d))
@@ -273,8 +273,8 @@ impl<'a> Objective<'a> {
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
-    pub fn evaluate(&self, place: &Iterate) -> Result<Option<OptimizationResult>> {
-        match self.minimize(place, 0) {
+    pub fn evaluate(&self, iterate: &Iterate) -> Result<Option<OptimizationResult>> {
+        match self.minimize(iterate, 0) {
             Ok(evaluation) => Ok(Some(evaluation)),
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
@@ -295,62 +295,66 @@ impl<'a> Objective<'a> {
     ///
     /// Robust weights are not applied. The residual of a missing sample is NaN.
     #[must_use]
-    pub fn residuals(&self, attempt: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
+    pub fn residuals(&self, result: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();
-        let (mut parts, mut rest) = (Vec::new(), attempt.residuals.as_slice());
-        for (experiment, i, shares) in self.sample_weights() {
-            let (own, others) = rest.split_at(experiment.compared_count().min(rest.len()));
-            rest = others;
+        let (mut residuals_by_run, mut remaining_residuals) = (Vec::new(), result.residuals.as_slice());
+        for (experiment, i, sample_weights) in self.sample_weights() {
+            let (series, remaining) =
+                remaining_residuals.split_at(experiment.compared_count().min(remaining_residuals.len()));
+            remaining_residuals = remaining;
             if i == 0 {
-                parts.push(Vec::with_capacity(outputs));
+                residuals_by_run.push(Vec::with_capacity(outputs));
             }
-            let whole = match shares {
-                None => own.to_vec(),
-                Some(shares) => {
-                    own.iter().zip(shares).map(|(e, &share)| e / if share > 0.0 { share } else { f64::NAN }).collect()
-                }
+            let unweighted = match sample_weights {
+                None => series.to_vec(),
+                Some(sample_weights) => series
+                    .iter()
+                    .zip(sample_weights)
+                    .map(|(e, &weight)| e / if weight > 0.0 { weight } else { f64::NAN })
+                    .collect(),
             };
-            if let Some(part) = parts.last_mut() {
-                part.push(whole);
+            if let Some(run) = residuals_by_run.last_mut() {
+                run.push(unweighted);
             }
         }
-        parts
+        residuals_by_run
     }
 
     /// Return the robust weight of every residual, in the sequence of the residual vector.
     #[must_use]
     pub fn flat_sample_weights(&self) -> Vec<f64> {
-        let of = |(experiment, _, shares): (&Experiment, usize, Option<&[f64]>)| {
-            shares.map_or_else(|| vec![1.0; experiment.compared_count()], <[f64]>::to_vec)
+        let weights_or_ones = |(experiment, _, sample_weights): (&Experiment, usize, Option<&[f64]>)| {
+            sample_weights.map_or_else(|| vec![1.0; experiment.compared_count()], <[f64]>::to_vec)
         };
-        self.sample_weights().flat_map(of).collect()
+        self.sample_weights().flat_map(weights_or_ones).collect()
     }
 
     /// Return the residuals of each output in standard deviations of the noise, with all runs concatenated.
     ///
     /// Missing samples are omitted, and robust weights are not applied.
     #[must_use]
-    pub fn residuals_by_output(&self, attempt: &OptimizationResult) -> Vec<Vec<f64>> {
-        let parts = self.residuals(attempt);
-        let of = |i: usize| parts.iter().flat_map(|part| &part[i]).copied().filter(|e| !e.is_nan()).collect();
-        (0..self.problem.outputs.len()).map(of).collect()
+    pub fn residuals_by_output(&self, result: &OptimizationResult) -> Vec<Vec<f64>> {
+        let residuals_by_run = self.residuals(result);
+        let output_residuals =
+            |i: usize| residuals_by_run.iter().flat_map(|run| &run[i]).copied().filter(|e| !e.is_nan()).collect();
+        (0..self.problem.outputs.len()).map(output_residuals).collect()
     }
 
     /// Root mean square of the residuals of each output in noise standard deviations; infinite on overflow.
     #[must_use]
-    pub fn residual_root_mean_squares(&self, attempt: &OptimizationResult) -> Vec<f64> {
-        self.residuals_by_output(attempt).iter().map(|e| root_mean_square(e)).collect()
+    pub fn residual_root_mean_squares(&self, result: &OptimizationResult) -> Vec<f64> {
+        self.residuals_by_output(result).iter().map(|e| root_mean_square(e)).collect()
     }
 
     /// Robust standard deviation of the residuals of each output, in noise standard deviations.
     ///
     /// If more than half of the residuals are zero, it is the root mean square of all residuals.
     #[must_use]
-    pub fn residual_scales(&self, attempt: &OptimizationResult) -> Vec<f64> {
-        let of = |e: &Vec<f64>| match robust_deviation(e) {
+    pub fn residual_scales(&self, result: &OptimizationResult) -> Vec<f64> {
+        let scale = |e: &Vec<f64>| match robust_deviation(e) {
             0.0 => root_mean_square(e),
             deviation => deviation,
         };
-        self.residuals_by_output(attempt).iter().map(of).collect()
+        self.residuals_by_output(result).iter().map(scale).collect()
     }
 }

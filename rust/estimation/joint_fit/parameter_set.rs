@@ -55,29 +55,29 @@ impl ParameterSet {
     /// ([`Problem::new`]).
     pub fn from_structure(structure: ParametricStructure) -> Result<Self> {
         structure.check()?;
-        let named = structure.coefficient_names();
+        let coefficient_names = structure.coefficient_names();
         let law = |name: &String| structure.laws.iter().rev().find(|law| law.name == *name).cloned();
-        let products: Vec<Law> = named.iter().filter_map(law).collect();
-        let plain = named.iter().filter(|name| !products.iter().any(|law| law.name == **name));
-        let factors = products.iter().flat_map(|law| &law.factors).filter(|factor| !named.contains(factor));
-        let coefficients = unique(plain.chain(factors));
+        let products: Vec<Law> = coefficient_names.iter().filter_map(law).collect();
+        let free_names = coefficient_names.iter().filter(|name| !products.iter().any(|law| law.name == **name));
+        let factors = products.iter().flat_map(|law| &law.factors).filter(|factor| !coefficient_names.contains(factor));
+        let coefficients = unique(free_names.chain(factors));
         let orders = structure.order_names();
         let bounds = bounds(&structure, &orders);
         let powers = |name: &String| -> (f64, Vec<(usize, i32)>) {
             let law = products.iter().find(|law| law.name == *name);
-            let own = std::slice::from_ref(name);
-            let (sign, factors) = law.map_or((1.0, own), |law| (law.sign, law.factors.as_slice()));
+            let single_name = std::slice::from_ref(name);
+            let (sign, factors) = law.map_or((1.0, single_name), |law| (law.sign, law.factors.as_slice()));
             let mut powers: Vec<(usize, i32)> = Vec::new();
-            for at in factors.iter().filter_map(|factor| coefficients.iter().position(|c| c == factor)) {
-                match powers.iter_mut().find(|(i, _)| *i == at) {
+            for index in factors.iter().filter_map(|factor| coefficients.iter().position(|c| c == factor)) {
+                match powers.iter_mut().find(|(i, _)| *i == index) {
                     Some((_, n)) => *n += 1,
-                    None => powers.push((at, 1)),
+                    None => powers.push((index, 1)),
                 }
             }
             (sign, powers)
         };
         let monomial = |coefficient: &Coefficient, factor: f64| match coefficient {
-            Coefficient::Known(value) => Monomial { factor: factor * value, powers: Vec::new() },
+            Coefficient::Fixed(value) => Monomial { factor: factor * value, powers: Vec::new() },
             Coefficient::Free(name) => {
                 let (sign, powers) = powers(name);
                 Monomial { factor: factor * sign, powers }
@@ -90,9 +90,9 @@ impl ParameterSet {
                 .map(|t| (t.signal, t.order.affine(&orders), monomial(&t.coefficient, t.factor)))
                 .collect(),
         };
-        let frictions = structure.equations.iter().enumerate().filter_map(|(place, e)| {
+        let frictions = structure.equations.iter().enumerate().filter_map(|(equation, e)| {
             let [coulomb, stribeck, speed] = e.friction.as_ref()?.parameters().map(|(factor, c)| monomial(c, *factor));
-            Some((place, FreeFrictionLaw { coulomb, stribeck, speed }))
+            Some((equation, FreeFrictionLaw { coulomb, stribeck, speed }))
         });
         let inputs = structure.inputs.iter().map(|input| &input.name);
         let prior = |(parameter, name): (usize, &String)| {
@@ -104,7 +104,7 @@ impl ParameterSet {
             equations: structure.equations.iter().map(equation).collect(),
             order_bounds: bounds,
             coordinates: vec![Coordinate::Plain; coefficients.len()],
-            inputs: structure.inputs.iter().map(|input| input.free).collect(),
+            inputs: structure.inputs.iter().map(|input| input.parameter).collect(),
             coupled: structure.coupled,
             initial: structure.initial.clone(),
         };
@@ -139,22 +139,25 @@ impl ParameterSet {
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
-        let named = self.structure.coefficient_names();
+        let coefficient_names = self.structure.coefficient_names();
         let plain = plain || !problem.derived.is_empty();
         for (j, (name, &value)) in self.coefficients.iter().zip(&start.point.coefficients).enumerate() {
             let is_speed = problem.frictions.iter().any(|(_, law)| law.speed.powers.iter().any(|&(i, _)| i == j));
-            let ratio = !named.contains(name) && self.ratio_lower_bound(name) == 1.0;
+            let is_ratio = !coefficient_names.contains(name) && self.ratio_lower_bound(name) == 1.0;
             problem.model.coordinates[j] = match () {
                 // The Stribeck velocity is always positive.
                 () if (plain || value == 0.0) && !is_speed => Coordinate::Plain,
-                () if ratio && value > 1.0 => Coordinate::ExcessLogarithm,
+                () if is_ratio && value > 1.0 => Coordinate::ExcessLogarithm,
                 () => Coordinate::Logarithm,
             };
         }
         let (orders, coefficients) = (self.orders.len(), self.coefficients.len());
-        for &number in fixed {
-            match number.checked_sub(orders) {
-                None => problem.model.order_bounds[number] = (start.point.orders[number], start.point.orders[number]),
+        for &parameter in fixed {
+            match parameter.checked_sub(orders) {
+                None => {
+                    problem.model.order_bounds[parameter] =
+                        (start.point.orders[parameter], start.point.orders[parameter])
+                }
                 Some(j) if j < coefficients => problem.model.coordinates[j] = Coordinate::Fixed,
                 Some(j) => {
                     let value = start.point.inputs[j - coefficients];
@@ -168,40 +171,43 @@ impl ParameterSet {
     /// Return all coefficients of the structure by name, from the values of the free coefficients.
     #[must_use]
     pub fn coefficients_by_name(&self, values: &[f64]) -> BTreeMap<String, f64> {
-        let free: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
-        let at = |name: &String| free.get(name).copied().unwrap_or(f64::NAN);
-        let of = |name: String| {
+        let values_by_name: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
+        let coefficient_value = |name: &String| values_by_name.get(name).copied().unwrap_or(f64::NAN);
+        let named_value = |name: String| {
             let law = self.products.iter().find(|law| law.name == name);
-            let value = law.map_or_else(|| at(&name), |law| law.sign * law.factors.iter().map(at).product::<f64>());
+            let value = law.map_or_else(
+                || coefficient_value(&name),
+                |law| law.sign * law.factors.iter().map(coefficient_value).product::<f64>(),
+            );
             (name, value)
         };
-        self.structure.coefficient_names().into_iter().map(of).collect()
+        self.structure.coefficient_names().into_iter().map(named_value).collect()
     }
 
     /// Return the values of the free coefficients, given unconstrained estimates of coefficients by name.
     ///
     /// A ratio without an estimate is the median of its values from all coefficient laws that contain it.
     #[must_use]
-    pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
-        let of = |name: &String| {
+    pub fn free_coefficients(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
+        let value_or_ratio = |name: &String| {
             if let Some(&value) = estimated.get(name) {
                 return value;
             }
-            let least = self.ratio_lower_bound(name);
+            let lower_bound = self.ratio_lower_bound(name);
             let ratios = self.products.iter().filter(|law| law.factors.contains(name)).filter_map(|law| {
-                let others = law.factors.iter().filter(|factor| *factor != name);
-                let product: f64 = others.filter_map(|factor| estimated.get(factor)).product();
+                let other_factors = law.factors.iter().filter(|factor| *factor != name);
+                let product: f64 = other_factors.filter_map(|factor| estimated.get(factor)).product();
                 (product != 0.0).then(|| law.sign * estimated.get(&law.name).copied().unwrap_or(f64::NAN) / product)
             });
-            let usable: Vec<f64> =
-                ratios.filter(|v| v.is_finite() && *v > least + MIN_RATIO_EXCESS && *v < MAX_RATIO).collect();
-            if usable.is_empty() {
-                least + DEFAULT_RATIO_EXCESS
+            let valid_ratios: Vec<f64> =
+                ratios.filter(|v| v.is_finite() && *v > lower_bound + MIN_RATIO_EXCESS && *v < MAX_RATIO).collect();
+            if valid_ratios.is_empty() {
+                lower_bound + DEFAULT_RATIO_EXCESS
             } else {
-                median(usable)
+                median(valid_ratios)
             }
         };
-        self.coefficients.iter().map(of).collect()
+        self.coefficients.iter().map(value_or_ratio).collect()
     }
 
     /// Return the usual integer values of the free orders, limited to their bounds.
@@ -210,17 +216,19 @@ impl ParameterSet {
     /// have the order 0.
     #[must_use]
     pub fn integer_orders(&self) -> Vec<f64> {
-        let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
+        let mut usual_orders: BTreeMap<&String, f64> = BTreeMap::new();
         for equation in &self.structure.equations {
-            usual.extend(equation.order.names().map(|name| (name, 2.0)));
-            let own = equation.autoregressive_terms().flat_map(|term| term.order.names()).enumerate();
+            usual_orders.extend(equation.order.names().map(|name| (name, 2.0)));
+            let autoregressive_names = equation.autoregressive_terms().flat_map(|term| term.order.names()).enumerate();
             let value = |i| if i == 0 { 1.0 } else { 0.0 };
-            let own: Vec<_> = own.map(|(i, name)| (name, usual.get(name).copied().unwrap_or(value(i)))).collect();
-            usual.extend(own);
+            let autoregressive_orders: Vec<_> = autoregressive_names
+                .map(|(i, name)| (name, usual_orders.get(name).copied().unwrap_or(value(i))))
+                .collect();
+            usual_orders.extend(autoregressive_orders);
         }
         let pairs = self.orders.iter().zip(self.bounds());
         // `clamp` would panic on crossed bounds, which are rejected elsewhere.
-        pairs.map(|(name, (low, high))| usual.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
+        pairs.map(|(name, (low, high))| usual_orders.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
     }
 
     /// Return the parameter set of the same structure with other initial terms.
@@ -249,28 +257,32 @@ fn bounds(structure: &ParametricStructure, orders: &[String]) -> Vec<(f64, f64)>
         .filter(|e| e.friction.is_some() && e.order.is_single())
         .flat_map(|e| e.order.names())
         .collect();
-    let of = |name: &String| {
-        let above = highest.contains(&name);
-        let own = || (if above { ALPHA_BOUNDS.0 } else { 0.0 }, upper_order_bound(structure, name, above));
-        let (low, high) = structure.bounds.get(name).copied().unwrap_or_else(own);
+    let order_bounds = |name: &String| {
+        let is_highest = highest.contains(&name);
+        let default_bounds =
+            || (if is_highest { ALPHA_BOUNDS.0 } else { 0.0 }, upper_order_bound(structure, name, is_highest));
+        let (low, high) = structure.bounds.get(name).copied().unwrap_or_else(default_bounds);
         if inertia.contains(&name) {
             // Friction needs a velocity state, and is defined for orders up to 2.
             return (low.max(FRICTION_BOUNDS.0), high.min(FRICTION_BOUNDS.1));
         }
         (low, high)
     };
-    orders.iter().map(of).collect()
+    orders.iter().map(order_bounds).collect()
 }
 
 /// Default upper bound of a free order, which is at least 3.
 ///
 /// If the equations that contain the free order have a fixed order n > 3, the bound is raised to n. For the highest
-/// order of an equation (`above`), it is raised to n + 1 for n > 2.
-fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool) -> f64 {
-    let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
-    let numbers =
-        beside.flat_map(ParametricEquation::orders).filter(|order| !order.is_free()).map(|order| order.constant);
-    numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
+/// order of an equation (`is_highest`), it is raised to n + 1 for n > 2.
+fn upper_order_bound(structure: &ParametricStructure, name: &String, is_highest: bool) -> f64 {
+    let equations_with_name =
+        structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
+    let fixed_orders = equations_with_name
+        .flat_map(ParametricEquation::orders)
+        .filter(|order| !order.is_free())
+        .map(|order| order.constant);
+    fixed_orders.map(|n| n + f64::from(u8::from(is_highest))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
 /// Time scaling of a problem: a unit of time, and the exponent of this unit in the unit of each parameter.
@@ -306,11 +318,11 @@ impl TimeScaling {
 
     /// Factors that convert the parameters from seconds to the scaled unit of time. They depend on the orders only.
     fn factors(&self, values: &[f64]) -> Vec<f64> {
-        let of = |i: usize| match i.checked_sub(self.orders) {
+        let factor = |i: usize| match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
             _ => 1.0,
         };
-        (0..self.size).map(of).collect()
+        (0..self.size).map(factor).collect()
     }
 
     /// Return the relative decrease of the value of parameter `i` in seconds if the orders change by `step`.
@@ -318,9 +330,11 @@ impl TimeScaling {
     /// The value of the parameter in the scaled unit of time is held constant.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
-            Some(j) if j < self.coefficients => {
-                step[..self.orders].iter().enumerate().map(|(k, by)| self.unit.relative_decrease(j, k) * by).sum()
-            }
+            Some(j) if j < self.coefficients => step[..self.orders]
+                .iter()
+                .enumerate()
+                .map(|(k, order_step)| self.unit.relative_decrease(j, k) * order_step)
+                .sum(),
             _ => 0.0,
         }
     }
@@ -341,8 +355,9 @@ impl TimeScaling {
     #[must_use]
     pub fn step(&self, values: &[f64], changes: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
-        let of = |(i, value): (usize, &f64)| changes[i] / factors[i] - value * self.relative_decrease(i, changes);
-        values.iter().enumerate().map(of).collect()
+        let unscaled_step =
+            |(i, value): (usize, &f64)| changes[i] / factors[i] - value * self.relative_decrease(i, changes);
+        values.iter().enumerate().map(unscaled_step).collect()
     }
 
     /// Return the standard errors in the scaled unit of time from a row-major covariance matrix in seconds.
@@ -352,15 +367,15 @@ impl TimeScaling {
     pub fn standard_errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));
         let is_finite: Vec<bool> = (0..n).map(|i| covariance[i * n + i].is_finite()).collect();
-        let of = |i: usize| {
+        let standard_error = |i: usize| {
             let mut row = vec![0.0; n];
             row[i] = factors[i];
-            for (k, by) in row.iter_mut().enumerate().take(self.orders) {
-                let mut one = vec![0.0; self.orders];
-                one[k] = 1.0;
-                *by += factors[i] * values[i] * self.relative_decrease(i, &one);
+            for (k, entry) in row.iter_mut().enumerate().take(self.orders) {
+                let mut unit_step = vec![0.0; self.orders];
+                unit_step[k] = 1.0;
+                *entry += factors[i] * values[i] * self.relative_decrease(i, &unit_step);
             }
-            if row.iter().zip(&is_finite).any(|(by, is_finite)| !is_finite && *by != 0.0) {
+            if row.iter().zip(&is_finite).any(|(entry, is_finite)| !is_finite && *entry != 0.0) {
                 return f64::INFINITY;
             }
             let mut variance = 0.0;
@@ -371,7 +386,7 @@ impl TimeScaling {
             }
             variance.max(0.0).sqrt()
         };
-        (0..n).map(of).collect()
+        (0..n).map(standard_error).collect()
     }
 }
 
@@ -407,8 +422,8 @@ mod tests {
         for ((value, power), scaled) in values.iter().zip(powers).zip(&scaled) {
             assert!((value * libm::pow(unit, power) - scaled).abs() <= 1e-12 * scaled.abs());
         }
-        let back = minutes.to_unscaled(&scaled);
-        assert!(back.iter().zip(values).all(|(a, b)| (a - b).abs() <= 1e-12 * b.abs()));
+        let unscaled = minutes.to_unscaled(&scaled);
+        assert!(unscaled.iter().zip(values).all(|(a, b)| (a - b).abs() <= 1e-12 * b.abs()));
         let tiny = [1e-7, -2e-7, 3e-7, 4e-7, -5e-7, 6e-7, 7e-7];
         let shifted: Vec<f64> = values.iter().zip(tiny).map(|(v, by)| v + by).collect();
         let change: Vec<f64> = minutes.to_scaled(&shifted).iter().zip(&scaled).map(|(a, b)| a - b).collect();
@@ -420,9 +435,9 @@ mod tests {
         let covariance: Vec<f64> =
             (0..n * n).map(|k| if k % (n + 1) == 0 { deviations[k / n] * deviations[k / n] } else { 0.0 }).collect();
         let slope = |i: usize, j: usize| {
-            let mut near = values;
-            near[j] += 1e-6;
-            (minutes.to_scaled(&near)[i] - scaled[i]) / 1e-6
+            let mut perturbed_values = values;
+            perturbed_values[j] += 1e-6;
+            (minutes.to_scaled(&perturbed_values)[i] - scaled[i]) / 1e-6
         };
         for (i, error) in minutes.standard_errors(&values, &covariance).into_iter().enumerate() {
             let expected = (0..n).map(|j| (slope(i, j) * deviations[j]).powi(2)).sum::<f64>().sqrt();

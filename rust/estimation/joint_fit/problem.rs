@@ -37,29 +37,32 @@ impl Problem {
     pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeFrictionLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
         let coefficients = model.coordinates.len();
-        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
-        let missing = |number: &Monomial| number.powers.iter().any(|&(i, _)| i >= coefficients);
+        let structure_error = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        let has_missing_coefficient = |monomial: &Monomial| monomial.powers.iter().any(|&(i, _)| i >= coefficients);
         for equation in &model.equations {
             equation.order.check(&model.order_bounds)?;
             for (_, order, coefficient) in &equation.terms {
                 order.check(&model.order_bounds)?;
-                if missing(coefficient) {
-                    return refuse(
+                if has_missing_coefficient(coefficient) {
+                    return structure_error(
                         "an equation refers to a coefficient that does not exist".into(),
                         "number them from 0",
                     );
                 }
             }
         }
-        for (place, law) in &frictions {
-            if *place >= model.equations.len() || [&law.coulomb, &law.stribeck, &law.speed].into_iter().any(missing) {
-                let what = format!("friction of equation {place} refers to an equation or signal that does not exist");
-                return refuse(what, "number equations and coefficients from 0");
+        for (equation, law) in &frictions {
+            if *equation >= model.equations.len()
+                || [&law.coulomb, &law.stribeck, &law.speed].into_iter().any(has_missing_coefficient)
+            {
+                let what =
+                    format!("friction of equation {equation} refers to an equation or signal that does not exist");
+                return structure_error(what, "number equations and coefficients from 0");
             }
         }
         let bounds = model.order_bounds.iter().copied().chain(model.inputs.iter().map(|input| input.bounds));
         if let Some((low, high)) = bounds.into_iter().find(|(low, high)| low.is_nan() || high.is_nan() || low > high) {
-            return refuse(format!("bounds {low} to {high}"), "give two increasing numbers");
+            return structure_error(format!("bounds {low} to {high}"), "give two increasing numbers");
         }
         for (_, law) in &frictions {
             law.speed.powers.iter().for_each(|&(j, _)| model.coordinates[j] = Coordinate::Logarithm);
@@ -112,8 +115,8 @@ impl Problem {
         for (_, law) in &self.frictions {
             law.speed.powers.iter().for_each(|&(j, _)| coefficients[j].0 = f64::MIN_POSITIVE);
         }
-        let ends = self.model.inputs.iter().map(|input| input.bounds);
-        self.model.order_bounds.iter().copied().chain(coefficients).chain(ends).collect()
+        let input_bounds = self.model.inputs.iter().map(|input| input.bounds);
+        self.model.order_bounds.iter().copied().chain(coefficients).chain(input_bounds).collect()
     }
 
     /// Return true if an equation is unstable at a point and has free initial terms.
@@ -279,56 +282,59 @@ struct Constraint {
 }
 
 impl Problem {
-    /// Move from the feasible point `at` toward `towards` and return the last feasible point.
+    /// Move from the feasible point `start` toward `target` and return the last feasible point.
     ///
-    /// The move ends at a bound or a constraint of the orders. The direction `towards − at` is first projected on the
-    /// constraints that are active at `at`, so the path may leave the straight line. All constraints are affine, so the
-    /// result is exact.
+    /// The move ends at a bound or a constraint of the orders. The direction `target − start` is first projected on the
+    /// constraints that are active at `start`, so the path may leave the straight line. All constraints are affine, so
+    /// the result is exact.
     ///
     /// # Errors
     /// [`Error::Length`] for a number of values that differs from the number of free parameters.
-    pub fn last_feasible_point(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
-        check_length("point to start from", self.size(), at.len())?;
-        check_length("point to move towards", self.size(), towards.len())?;
+    pub fn last_feasible_point(&self, start: &[f64], target: &[f64]) -> Result<Vec<f64>> {
+        check_length("point to start from", self.size(), start.len())?;
+        check_length("point to move towards", self.size(), target.len())?;
         let constraints = self.constraints();
-        let room: Vec<f64> = (constraints.iter())
+        let distances: Vec<f64> = (constraints.iter())
             .map(|c| {
-                let room = inner(&c.normal, at) + c.offset;
+                let distances = inner(&c.normal, start) + c.offset;
                 // A point that is within the margin keeps its distance from the constraint.
-                (room - c.margin.min(room)).max(0.0)
+                (distances - c.margin.min(distances)).max(0.0)
             })
             .collect();
-        let mut step: Vec<f64> = towards.iter().zip(at).map(|(b, a)| b - a).collect();
+        let mut step: Vec<f64> = target.iter().zip(start).map(|(b, a)| b - a).collect();
         let mut active = vec![false; constraints.len()];
         loop {
-            let blocked = |i: usize| {
-                room[i] <= ORDER_ROUNDING_TOLERANCE && inner(&constraints[i].normal, &step) < -1e-15 && !active[i]
+            let is_blocking = |i: usize| {
+                distances[i] <= ORDER_ROUNDING_TOLERANCE && inner(&constraints[i].normal, &step) < -1e-15 && !active[i]
             };
-            let more: Vec<usize> = (0..constraints.len()).filter(|&i| blocked(i)).collect();
-            if more.is_empty() {
+            let newly_active: Vec<usize> = (0..constraints.len()).filter(|&i| is_blocking(i)).collect();
+            if newly_active.is_empty() {
                 break;
             }
-            more.iter().for_each(|&i| active[i] = true);
+            newly_active.iter().for_each(|&i| active[i] = true);
             let active_constraints = constraints.iter().zip(&active).filter(|(_, active)| **active);
             let normals: Vec<Vec<f64>> = active_constraints.map(|(c, _)| c.normal.clone()).collect();
-            let dense::SingularValues { left: basis, values: sizes, .. } = dense::singular_values(&normals)
-                .ok_or_else(|| Error::Internal { what: "constraints of orders without a basis".into() })?;
-            let whole = step.clone();
-            for (direction, _) in
-                basis.iter().zip(&sizes).filter(|(_, size)| **size > DIRECTION_RANK_TOLERANCE * sizes[0])
+            let dense::SingularValues { left: basis, values: singular_values, .. } =
+                dense::singular_values(&normals)
+                    .ok_or_else(|| Error::Internal { what: "constraints of orders without a basis".into() })?;
+            let full_step = step.clone();
+            for (direction, _) in basis
+                .iter()
+                .zip(&singular_values)
+                .filter(|(_, size)| **size > DIRECTION_RANK_TOLERANCE * singular_values[0])
             {
-                let along = inner(direction, &whole);
-                step.iter_mut().zip(direction).for_each(|(s, d)| *s -= along * d);
+                let component = inner(direction, &full_step);
+                step.iter_mut().zip(direction).for_each(|(s, d)| *s -= component * d);
             }
         }
-        let mut share: f64 = 1.0;
+        let mut fraction: f64 = 1.0;
         for (i, constraint) in constraints.iter().enumerate().filter(|(i, _)| !active[*i]) {
             let change = inner(&constraint.normal, &step);
-            if change < 0.0 && room[i] + change < 0.0 {
-                share = share.min(room[i] / -change);
+            if change < 0.0 && distances[i] + change < 0.0 {
+                fraction = fraction.min(distances[i] / -change);
             }
         }
-        Ok(at.iter().zip(&step).map(|(a, s)| a + share * s).collect())
+        Ok(start.iter().zip(&step).map(|(a, s)| a + fraction * s).collect())
     }
 
     /// Highest order of a derivative of a signal in the expressions of the nonlinear terms; 0 if it has none.
@@ -339,36 +345,40 @@ impl Problem {
 
     fn constraints(&self) -> Vec<Constraint> {
         let size = self.size();
-        let wide = |weights: &dyn Fn(usize) -> f64| (0..size).map(weights).collect::<Vec<_>>();
-        let of = |order: &AffineOrder, k: usize| order.weights.get(k).copied().unwrap_or(0.0);
-        let mut limits = Vec::new();
+        let normal_vector = |weights: &dyn Fn(usize) -> f64| (0..size).map(weights).collect::<Vec<_>>();
+        let order_weight = |order: &AffineOrder, k: usize| order.weights.get(k).copied().unwrap_or(0.0);
+        let mut constraints = Vec::new();
         for (i, (low, high)) in self.bounds().into_iter().enumerate() {
-            let along = |sign: f64| wide(&|k| if k == i { sign } else { 0.0 });
+            let unit_normal = |sign: f64| normal_vector(&|k| if k == i { sign } else { 0.0 });
             if low.is_finite() {
-                limits.push(Constraint { normal: along(1.0), offset: -low, margin: 0.0 });
+                constraints.push(Constraint { normal: unit_normal(1.0), offset: -low, margin: 0.0 });
             }
             if high.is_finite() {
-                limits.push(Constraint { normal: along(-1.0), offset: high, margin: 0.0 });
+                constraints.push(Constraint { normal: unit_normal(-1.0), offset: high, margin: 0.0 });
             }
         }
         for equation in &self.model.equations {
             let derivative = self.highest_derivative(equation.output);
             for (signal, order, _) in &equation.terms {
-                let own = *signal == equation.output;
+                let is_autoregressive = *signal == equation.output;
                 // Derivatives of an output in expressions are integrals of all terms except those of the output itself.
-                let above = if own { 0.0 } else { derivative };
-                limits.push(Constraint {
-                    normal: wide(&|k| of(&equation.order, k) - of(order, k)),
-                    offset: equation.order.constant - order.constant - above,
-                    margin: if own { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
+                let derivative_order = if is_autoregressive { 0.0 } else { derivative };
+                constraints.push(Constraint {
+                    normal: normal_vector(&|k| order_weight(&equation.order, k) - order_weight(order, k)),
+                    offset: equation.order.constant - order.constant - derivative_order,
+                    margin: if is_autoregressive { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
                 });
-                if own {
-                    limits.push(Constraint { normal: wide(&|k| of(order, k)), offset: order.constant, margin: 0.0 });
+                if is_autoregressive {
+                    constraints.push(Constraint {
+                        normal: normal_vector(&|k| order_weight(order, k)),
+                        offset: order.constant,
+                        margin: 0.0,
+                    });
                 }
             }
         }
-        limits.retain(|c| c.normal.iter().any(|v| *v != 0.0));
-        limits
+        constraints.retain(|c| c.normal.iter().any(|v| *v != 0.0));
+        constraints
     }
 }
 
@@ -388,15 +398,15 @@ pub struct Candidate {
 impl Candidate {
     /// Candidate before its first optimization.
     #[must_use]
-    pub fn at(place: Iterate, origin: impl Into<String>) -> Self {
-        let result = OptimizationResult::initial_result(place);
+    pub fn at(iterate: Iterate, origin: impl Into<String>) -> Self {
+        let result = OptimizationResult::initial_result(iterate);
         Self { result, origin: origin.into(), duplicates: Vec::new(), cost_before: f64::INFINITY }
     }
 
     /// Return the candidate with a new optimization result.
     #[must_use]
-    pub fn with_result(&self, attempt: OptimizationResult) -> Self {
-        Self { result: attempt, cost_before: self.result.cost, ..self.clone() }
+    pub fn with_result(&self, result: OptimizationResult) -> Self {
+        Self { result, cost_before: self.result.cost, ..self.clone() }
     }
 
     /// Mean square of the weighted residuals.

@@ -40,27 +40,32 @@ pub struct RobustSummary {
 impl RobustSummary {
     /// Count the downweighted residuals and the outliers at an optimum.
     #[must_use]
-    pub fn from_result(grid: &Objective<'_>, attempt: &OptimizationResult) -> Self {
-        let mut counted = Self { reduced_weight_count: 0, outliers: 0, samples: 0 };
-        for (residuals, level) in grid.residuals_by_output(attempt).iter().zip(grid.residual_scales(attempt)) {
-            let count_beyond =
-                |most: f64| residuals.iter().filter(|e| (*e / level.max(MIN_DEVIATION)).abs() > most).count();
-            counted.reduced_weight_count += count_beyond(HUBER_THRESHOLD);
-            counted.outliers += count_beyond(OUTLIER_DEVIATIONS);
-            counted.samples += residuals.len();
+    pub fn from_result(objective: &Objective<'_>, result: &OptimizationResult) -> Self {
+        let mut summary = Self { reduced_weight_count: 0, outliers: 0, samples: 0 };
+        for (residuals, level) in objective.residuals_by_output(result).iter().zip(objective.residual_scales(result)) {
+            let count_above =
+                |limit: f64| residuals.iter().filter(|e| (*e / level.max(MIN_DEVIATION)).abs() > limit).count();
+            summary.reduced_weight_count += count_above(HUBER_THRESHOLD);
+            summary.outliers += count_above(OUTLIER_DEVIATIONS);
+            summary.samples += residuals.len();
         }
-        counted
+        summary
     }
 }
 
 /// Square roots of Huber's weights of the compared samples, by run and output; 1 for missing samples.
 ///
 /// `levels` contains the standard deviation of the residuals of each output.
-pub(super) fn huber_weights(grid: &Objective<'_>, attempt: &OptimizationResult, levels: &[f64]) -> Vec<Vec<Vec<f64>>> {
-    let root = |size: f64| if size > HUBER_THRESHOLD { (HUBER_THRESHOLD / size).sqrt() } else { 1.0 };
-    let of = |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| root(e.abs() / level.max(MIN_DEVIATION))).collect();
-    let parts = grid.residuals(attempt).into_iter();
-    parts.map(|part| part.into_iter().zip(levels).map(of).collect()).collect()
+pub(super) fn huber_weights(
+    objective: &Objective<'_>,
+    result: &OptimizationResult,
+    levels: &[f64],
+) -> Vec<Vec<Vec<f64>>> {
+    let weight_root = |size: f64| if size > HUBER_THRESHOLD { (HUBER_THRESHOLD / size).sqrt() } else { 1.0 };
+    let weights_of_output =
+        |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| weight_root(e.abs() / level.max(MIN_DEVIATION))).collect();
+    let residuals_by_run = objective.residuals(result).into_iter();
+    residuals_by_run.map(|run| run.into_iter().zip(levels).map(weights_of_output).collect()).collect()
 }
 
 /// Return true if two sets of robust weights agree within the tolerance, or if there are none.
@@ -88,39 +93,39 @@ const NOISE_LEVEL_TOLERANCE: f64 = 0.01;
 /// Return the optimum and the objective with the final weights.
 ///
 /// # Errors
-/// The error of the simulation of `start` if it fails. [`Error::Beyond`] if the residuals overflow.
+/// The error of the simulation of `start` if it fails. [`Error::Overflow`] if the residuals overflow.
 /// [`Error::Interrupted`] after a stop request.
 pub fn fit_reweighted<'a>(
     start: &Iterate,
-    grid: Objective<'a>,
+    objective: Objective<'a>,
     loss: Loss,
 ) -> Result<(OptimizationResult, Objective<'a>)> {
     let max_reweightings = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
     // The residuals of noise-free samples are rounding errors, so the weights have upper limits relative to the first
     // ones.
-    let limits: Vec<f64> = grid.weights.outputs.iter().map(|weight| weight / f64::EPSILON).collect();
-    let (mut place, mut grid, mut reweighting) = (start.clone(), grid, 0);
+    let limits: Vec<f64> = objective.weights.outputs.iter().map(|weight| weight / f64::EPSILON).collect();
+    let (mut iterate, mut objective, mut reweighting) = (start.clone(), objective, 0);
     loop {
         reweighting += 1;
-        let attempt = grid.minimize(&place, EVALUATIONS_PER_REWEIGHTING)?;
+        let result = objective.minimize(&iterate, EVALUATIONS_PER_REWEIGHTING)?;
         let levels = if loss == Loss::Huber {
-            grid.residual_scales(&attempt)
+            objective.residual_scales(&result)
         } else {
-            grid.residual_root_mean_squares(&attempt)
+            objective.residual_root_mean_squares(&result)
         };
         if let Some(output) = levels.iter().position(|level| !level.is_finite()) {
-            return Err(Error::Beyond { output: grid.problem.outputs[output].clone() });
+            return Err(Error::Overflow { output: objective.problem.outputs[output].clone() });
         }
         let has_converged = levels.iter().all(|level| (level - 1.0).abs() < NOISE_LEVEL_TOLERANCE);
-        let robust_weights = (loss == Loss::Huber).then(|| huber_weights(&grid, &attempt, &levels));
+        let robust_weights = (loss == Loss::Huber).then(|| huber_weights(&objective, &result, &levels));
         if reweighting == max_reweightings
-            || (has_converged && are_weights_equal(grid.weights.robust_weights.as_ref(), robust_weights.as_ref()))
+            || (has_converged && are_weights_equal(objective.weights.robust_weights.as_ref(), robust_weights.as_ref()))
         {
-            return Ok((attempt, grid));
+            return Ok((result, objective));
         }
-        let inverse = grid.weights.outputs.iter().zip(&levels).map(|(weight, level)| weight / level);
+        let inverse = objective.weights.outputs.iter().zip(&levels).map(|(weight, level)| weight / level);
         let outputs = inverse.zip(&limits).map(|(weight, &limit)| weight.min(limit)).collect();
-        grid = grid.with_weights(Weights { outputs, robust_weights })?;
-        place = attempt.iterate;
+        objective = objective.with_weights(Weights { outputs, robust_weights })?;
+        iterate = result.iterate;
     }
 }

@@ -6,9 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use super::multistart::{
-    fixed_order_problems as known_orders, select_survivors, sort_by_cost, FIRST_BUDGET_EVALUATIONS,
-};
+use super::multistart::{fixed_order_problems, select_survivors, sort_by_cost, FIRST_BUDGET_EVALUATIONS};
 use super::objective::Objective;
 use super::parameter_set::ParameterSet;
 use super::problem::{Candidate, OptimizationResult};
@@ -46,43 +44,46 @@ pub struct StabilityComparison {
 /// Choose between the best optimum, if it is unstable, and a stable one.
 ///
 /// Return the chosen optimum, its objective and the comparison. The comparison is None if the best optimum is stable.
-/// The objective requires stability if the stable optimum is chosen. `reached` contains the candidates of the
-/// multistart.
+/// The objective requires stability if the stable optimum is chosen. `multistart_candidates` contains the candidates of
+/// the multistart.
 ///
 /// # Errors
 /// An error if the runs cannot be sampled at half the step. [`Error::Interrupted`] after a stop request.
 pub fn prefer_stable<'a>(
-    free: &ParameterSet,
-    best: Candidate,
-    grid: Objective<'a>,
-    reached: &[Candidate],
+    parameter_set: &ParameterSet,
+    unstable_optimum: Candidate,
+    objective: Objective<'a>,
+    multistart_candidates: &[Candidate],
 ) -> Result<(Candidate, Objective<'a>, Option<StabilityComparison>)> {
-    if !is_unstable(free, &best) {
-        return Ok((best, grid, None));
+    if !is_unstable(parameter_set, &unstable_optimum) {
+        return Ok((unstable_optimum, objective, None));
     }
-    let constrained = grid.with_stability_constraint();
-    let search = StableSearch { free, grid: constrained.clone() };
-    let mut first = search.short_fits(&best, reached)?;
-    let unit = grid.time_scaling();
-    for one in known_orders(free) {
+    let constrained_objective = objective.with_stability_constraint();
+    let search = StableSearch { parameter_set, objective: constrained_objective.clone() };
+    let mut first = search.short_fits(&unstable_optimum, multistart_candidates)?;
+    let unit = objective.time_scaling();
+    for fixed_order in fixed_order_problems(parameter_set) {
         // A stable optimum with one order fixed is a candidate for the full problem. The optima of the multistart with
-        // one order fixed are in `reached` already.
-        let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
-        let fits = narrow.short_fits(&one.restrict(&best, &unit), &[])?;
-        first.extend(fits.iter().map(|fit| one.embed(fit, free)));
+        // one order fixed are in `multistart_candidates` already.
+        let fixed_order_search = StableSearch {
+            parameter_set: &fixed_order.parameter_set,
+            objective: constrained_objective.with_problem(&fixed_order.parameter_set.problem),
+        };
+        let fits = fixed_order_search.short_fits(&fixed_order.restrict(&unstable_optimum, &unit), &[])?;
+        first.extend(fits.iter().map(|fit| fixed_order.embed(fit, parameter_set)));
     }
-    let mut ends = Vec::new();
-    for near in select_survivors(&sort_by_cost(first)) {
-        ends.extend(ignore_failure(search.minimize(&near, &[], EVALUATIONS_PER_CANDIDATE))?);
+    let mut stable_candidates = Vec::new();
+    for survivor in select_survivors(&sort_by_cost(first)) {
+        stable_candidates.extend(ignore_failure(search.minimize(&survivor, &[], EVALUATIONS_PER_CANDIDATE))?);
     }
-    let mut ends = sort_by_cost(ends);
-    if let Some(limited) = ends.iter_mut().find(|end| !end.result.has_converged()) {
-        *limited = search.minimize_along_limit(limited)?;
+    let mut stable_candidates = sort_by_cost(stable_candidates);
+    if let Some(at_limit_candidate) = stable_candidates.iter_mut().find(|stable| !stable.result.has_converged()) {
+        *at_limit_candidate = search.minimize_along_limit(at_limit_candidate)?;
     }
-    if ends.is_empty() {
+    if stable_candidates.is_empty() {
         return Ok((
-            best,
-            grid,
+            unstable_optimum,
+            objective,
             Some(StabilityComparison {
                 keeps_unstable: true,
                 residual_excess: f64::INFINITY,
@@ -90,23 +91,23 @@ pub fn prefer_stable<'a>(
             }),
         ));
     }
-    let other = search.select_optimum(&ends)?;
-    let excess = if best.cost_per_residual() > 0.0 {
-        (other.cost_per_residual() / best.cost_per_residual()).sqrt() - 1.0
+    let stable_optimum = search.select_optimum(&stable_candidates)?;
+    let excess = if unstable_optimum.cost_per_residual() > 0.0 {
+        (stable_optimum.cost_per_residual() / unstable_optimum.cost_per_residual()).sqrt() - 1.0
     } else {
         f64::INFINITY
     };
-    if is_significantly_better(&grid, &best.result, &other.result) {
+    if is_significantly_better(&objective, &unstable_optimum.result, &stable_optimum.result) {
         return Ok((
-            best,
-            grid,
+            unstable_optimum,
+            objective,
             Some(StabilityComparison { keeps_unstable: true, residual_excess: excess, at_stability_limit: false }),
         ));
     }
-    let at_limit = !other.result.has_converged();
+    let at_limit = !stable_optimum.result.has_converged();
     Ok((
-        other,
-        constrained,
+        stable_optimum,
+        constrained_objective,
         Some(StabilityComparison { keeps_unstable: false, residual_excess: excess, at_stability_limit: at_limit }),
     ))
 }
@@ -120,18 +121,19 @@ fn ignore_failure<T>(outcome: Result<T>) -> Result<Option<T>> {
 }
 
 /// Return true if an equation is unstable at a candidate.
-fn is_unstable(free: &ParameterSet, candidate: &Candidate) -> bool {
-    free.problem.is_unstable(&candidate.result.iterate.point)
+fn is_unstable(parameter_set: &ParameterSet, candidate: &Candidate) -> bool {
+    parameter_set.problem.is_unstable(&candidate.result.iterate.point)
 }
 
 /// The known factor of each free autoregressive coefficient in its term, by name of the coefficient.
-fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
-    let own = free.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
-    own.filter_map(|term| match &term.coefficient {
-        Coefficient::Free(name) => Some((name, term.factor)),
-        Coefficient::Known(_) => None,
-    })
-    .collect()
+fn autoregressive_factors(parameter_set: &ParameterSet) -> BTreeMap<&String, f64> {
+    let factors = parameter_set.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
+    factors
+        .filter_map(|term| match &term.coefficient {
+            Coefficient::Free(name) => Some((name, term.factor)),
+            Coefficient::Fixed(_) => None,
+        })
+        .collect()
 }
 
 /// Return the candidate with the coefficients of all its autoregressive terms made negative, and the parameter indices
@@ -141,17 +143,17 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
 /// coefficients should first be fixed while the others adapt. The input coefficients still belong to the unstable
 /// optimum.
 #[must_use]
-pub fn dissipative_candidate(free: &ParameterSet, candidate: &Candidate) -> (Candidate, Vec<usize>) {
-    let own = autoregressive_factors(free);
-    let mut place = candidate.result.iterate.clone();
+pub fn dissipative_candidate(parameter_set: &ParameterSet, candidate: &Candidate) -> (Candidate, Vec<usize>) {
+    let factors = autoregressive_factors(parameter_set);
+    let mut iterate = candidate.result.iterate.clone();
     let mut changed = Vec::new();
-    for (k, (name, value)) in free.coefficients.iter().zip(&mut place.point.coefficients).enumerate() {
-        if own.get(name).is_some_and(|factor| *value * factor > 0.0) {
+    for (k, (name, value)) in parameter_set.coefficients.iter().zip(&mut iterate.point.coefficients).enumerate() {
+        if factors.get(name).is_some_and(|factor| *value * factor > 0.0) {
             *value = -*value;
-            changed.push(free.orders.len() + k);
+            changed.push(parameter_set.orders.len() + k);
         }
     }
-    (candidate_at(candidate, place, "stable signs of the coefficients"), changed)
+    (candidate_at(candidate, iterate, "stable signs of the coefficients"), changed)
 }
 
 /// Return one candidate per autoregressive coefficient, with that coefficient at 0, and its parameter index.
@@ -159,56 +161,59 @@ pub fn dissipative_candidate(free: &ParameterSet, candidate: &Candidate) -> (Can
 /// In a fit, the coefficient should first be fixed while the others adapt. The result is empty if there is only one
 /// autoregressive coefficient.
 #[must_use]
-pub fn candidates_without_term(free: &ParameterSet, candidate: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
-    let places = autoregressive_indices(free);
-    let without = |&k: &usize| {
-        let mut place = candidate.result.iterate.clone();
-        place.point.coefficients[k] = 0.0;
-        let words = format!("from {} = 0", free.coefficients[k]);
-        (candidate_at(candidate, place, &words), vec![free.orders.len() + k])
+pub fn candidates_without_term(parameter_set: &ParameterSet, candidate: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
+    let indices = autoregressive_indices(parameter_set);
+    let without_coefficient = |&k: &usize| {
+        let mut iterate = candidate.result.iterate.clone();
+        iterate.point.coefficients[k] = 0.0;
+        let description = format!("from {} = 0", parameter_set.coefficients[k]);
+        (candidate_at(candidate, iterate, &description), vec![parameter_set.orders.len() + k])
     };
-    if places.len() > 1 {
-        places.iter().map(without).collect()
+    if indices.len() > 1 {
+        indices.iter().map(without_coefficient).collect()
     } else {
         Vec::new()
     }
 }
 
 /// Indices of the free autoregressive coefficients among the free coefficients.
-fn autoregressive_indices(free: &ParameterSet) -> Vec<usize> {
-    let own = autoregressive_factors(free);
-    (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
+fn autoregressive_indices(parameter_set: &ParameterSet) -> Vec<usize> {
+    let factors = autoregressive_factors(parameter_set);
+    (0..parameter_set.coefficients.len()).filter(|&k| factors.contains_key(&parameter_set.coefficients[k])).collect()
 }
 
-fn candidate_at(candidate: &Candidate, place: super::problem::Iterate, words: &str) -> Candidate {
-    let origin = format!("{}, {words}", candidate.origin);
-    Candidate { origin, result: OptimizationResult { iterate: place, ..candidate.result.clone() }, ..candidate.clone() }
+fn candidate_at(candidate: &Candidate, iterate: super::problem::Iterate, description: &str) -> Candidate {
+    let origin = format!("{}, {description}", candidate.origin);
+    Candidate { origin, result: OptimizationResult { iterate, ..candidate.result.clone() }, ..candidate.clone() }
 }
 
 /// Search for stable optima of a problem.
 struct StableSearch<'f, 'g> {
-    free: &'f ParameterSet,
-    grid: Objective<'g>,
+    parameter_set: &'f ParameterSet,
+    objective: Objective<'g>,
 }
 
 impl StableSearch<'_, '_> {
     fn minimize(&self, start: &Candidate, fixed: &[usize], evaluations: usize) -> Result<Candidate> {
-        let place = &start.result.iterate;
-        let problem = self.free.problem_at(place, true, fixed);
-        Ok(start.with_result(self.grid.minimize_in(&problem, place, evaluations)?))
+        let iterate = &start.result.iterate;
+        let problem = self.parameter_set.problem_at(iterate, true, fixed);
+        Ok(start.with_result(self.objective.minimize_in(&problem, iterate, evaluations)?))
     }
 
     /// Fit briefly from stable candidates of the multistart and from modifications of the unstable optimum.
-    fn short_fits(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
-        let stable = reached.iter().filter(|candidate| !is_unstable(self.free, candidate)).take(MAX_STABLE_CANDIDATES);
+    fn short_fits(&self, unstable_optimum: &Candidate, multistart_candidates: &[Candidate]) -> Result<Vec<Candidate>> {
+        let stable = multistart_candidates
+            .iter()
+            .filter(|candidate| !is_unstable(self.parameter_set, candidate))
+            .take(MAX_STABLE_CANDIDATES);
         let mut starts: Vec<(Candidate, Vec<usize>)> =
             stable.map(|candidate| (candidate.clone(), Vec::new())).collect();
-        starts.push(dissipative_candidate(self.free, best));
-        starts.extend(candidates_without_term(self.free, best));
+        starts.push(dissipative_candidate(self.parameter_set, unstable_optimum));
+        starts.extend(candidates_without_term(self.parameter_set, unstable_optimum));
         let mut fits = Vec::new();
-        for (start, changed) in starts.into_iter().filter(|(start, _)| !is_unstable(self.free, start)) {
-            let adapt = |fixed: &[usize]| self.minimize(&start, fixed, FIRST_BUDGET_EVALUATIONS);
-            let adapted = if changed.is_empty() { Ok(start.clone()) } else { adapt(&changed) };
+        for (start, changed) in starts.into_iter().filter(|(start, _)| !is_unstable(self.parameter_set, start)) {
+            let fit_with_fixed = |fixed: &[usize]| self.minimize(&start, fixed, FIRST_BUDGET_EVALUATIONS);
+            let adapted = if changed.is_empty() { Ok(start.clone()) } else { fit_with_fixed(&changed) };
             // Candidates without a finite simulation on this grid are skipped.
             fits.extend(ignore_failure(
                 adapted.and_then(|adapted| self.minimize(&adapted, &[], FIRST_BUDGET_EVALUATIONS)),
@@ -222,70 +227,78 @@ impl StableSearch<'_, '_> {
     /// The optimization of all parameters stopped at `end` because its next step would be unstable. The cost can still
     /// decrease along the limit. Each autoregressive coefficient in turn is therefore fixed at its value in `end`, and
     /// the cost is minimized over the other parameters.
-    fn minimize_along_limit(&self, end: &Candidate) -> Result<Candidate> {
-        let status = end.result.status;
-        let mut best = end.clone();
-        for k in autoregressive_indices(self.free) {
-            let fixed = [self.free.orders.len() + k];
-            let optimum = ignore_failure(self.minimize(end, &fixed, EVALUATIONS_PER_CANDIDATE))?;
-            best = optimum.filter(|optimum| optimum.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
+    fn minimize_along_limit(&self, stopped_candidate: &Candidate) -> Result<Candidate> {
+        let status = stopped_candidate.result.status;
+        let mut best_candidate = stopped_candidate.clone();
+        for k in autoregressive_indices(self.parameter_set) {
+            let fixed = [self.parameter_set.orders.len() + k];
+            let optimum = ignore_failure(self.minimize(stopped_candidate, &fixed, EVALUATIONS_PER_CANDIDATE))?;
+            best_candidate = optimum
+                .filter(|optimum| optimum.cost_per_residual() < best_candidate.cost_per_residual())
+                .unwrap_or(best_candidate);
         }
         // Convergence with one coefficient fixed does not imply convergence of all parameters.
-        best.result.status = status;
-        Ok(best)
+        best_candidate.result.status = status;
+        Ok(best_candidate)
     }
 
     /// Select the stable candidate that is compared with the unstable optimum.
     ///
     /// A converged optimum is preferred over a candidate on the stability limit. The exception is a candidate that fits
     /// significantly better than all converged optima.
-    fn select_optimum(&self, ends: &[Candidate]) -> Result<Candidate> {
-        let attempts: Vec<&OptimizationResult> = ends.iter().map(|candidate| &candidate.result).collect();
-        let order = self.grid.finer()?.rank_results(&attempts)?;
+    fn select_optimum(&self, stable_candidates: &[Candidate]) -> Result<Candidate> {
+        let results: Vec<&OptimizationResult> = stable_candidates.iter().map(|candidate| &candidate.result).collect();
+        let order = self.objective.finer()?.rank_results(&results)?;
         let first = order.first().copied().unwrap_or(0);
         let is_preferred = |&&i: &&usize| {
-            attempts[i].has_converged() && !is_significantly_better(&self.grid, attempts[first], attempts[i])
+            results[i].has_converged() && !is_significantly_better(&self.objective, results[first], results[i])
         };
-        Ok(ends[order.iter().find(is_preferred).copied().unwrap_or(first)].clone())
+        Ok(stable_candidates[order.iter().find(is_preferred).copied().unwrap_or(first)].clone())
     }
 }
 
-/// Return true if the result `best` fits significantly better than `other`, by Vuong's test of non-nested models.
+/// Return true if `better_result` fits significantly better than `worse_result`, by Vuong's test.
 ///
 /// The test compares the mean squares over segments of the runs (Vuong, doi:10.2307/1912557; for autocorrelated
 /// residuals Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071). If there are fewer than two segments, no test is
 /// possible, and the result is true.
 #[must_use]
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, other: &OptimizationResult) -> bool {
-    if other.cost_per_residual() > DECISIVE_RESIDUAL_RATIO * DECISIVE_RESIDUAL_RATIO * best.cost_per_residual() {
+pub fn is_significantly_better(
+    objective: &Objective<'_>,
+    better_result: &OptimizationResult,
+    worse_result: &OptimizationResult,
+) -> bool {
+    if worse_result.cost_per_residual()
+        > DECISIVE_RESIDUAL_RATIO * DECISIVE_RESIDUAL_RATIO * better_result.cost_per_residual()
+    {
         return true;
     }
-    let squares = |attempt: &OptimizationResult| {
-        grid.residuals(attempt).iter().map(|run| squares_by_sample(run)).collect::<Vec<_>>()
+    let squares_of_result = |result: &OptimizationResult| {
+        objective.residuals(result).iter().map(|run| squares_by_sample(run)).collect::<Vec<_>>()
     };
-    let (best_squares, other_squares) = (squares(best), squares(other));
+    let (best_squares, other_squares) = (squares_of_result(better_result), squares_of_result(worse_result));
     let samples: usize = other_squares.iter().map(Vec::len).sum();
-    let mut less = Vec::new();
-    for (one, two) in other_squares.iter().zip(&best_squares) {
-        let fall: Vec<f64> = one.iter().zip(two).map(|(a, b)| a - b).collect();
-        let count = (COMPARISON_SEGMENTS * fall.len() as f64 / samples as f64).round_ties_even().max(1.0) as usize;
-        let (short, longer) = (fall.len() / count, fall.len() % count);
-        let mut rest = fall.as_slice();
+    let mut decreases = Vec::new();
+    for (stable_run, unstable_run) in other_squares.iter().zip(&best_squares) {
+        let decrease: Vec<f64> = stable_run.iter().zip(unstable_run).map(|(a, b)| a - b).collect();
+        let count = (COMPARISON_SEGMENTS * decrease.len() as f64 / samples as f64).round_ties_even().max(1.0) as usize;
+        let (segment_length, longer_segments) = (decrease.len() / count, decrease.len() % count);
+        let mut remaining = decrease.as_slice();
         for k in 0..count {
-            let (part, others) = rest.split_at(short + usize::from(k < longer));
-            rest = others;
-            if !part.is_empty() {
-                less.push(mean(part));
+            let (segment, tail) = remaining.split_at(segment_length + usize::from(k < longer_segments));
+            remaining = tail;
+            if !segment.is_empty() {
+                decreases.push(mean(segment));
             }
         }
     }
-    if less.len() < 2 {
+    if decreases.len() < 2 {
         return true;
     }
-    let (middle, count) = (mean(&less), less.len() as f64);
-    let variance = less.iter().map(|v| (v - middle).powi(2)).sum::<f64>() / (count - 1.0);
-    middle > STUDENT_T_QUANTILE_99 * (variance / count).sqrt()
+    let (mean_decrease, count) = (mean(&decreases), decreases.len() as f64);
+    let variance = decreases.iter().map(|v| (v - mean_decrease).powi(2)).sum::<f64>() / (count - 1.0);
+    mean_decrease > STUDENT_T_QUANTILE_99 * (variance / count).sqrt()
 }
 
 /// Sum of squared weighted residuals over all outputs, by sample. A missing sample contributes 0.

@@ -29,9 +29,9 @@ const MAX_CORRECTIONS: usize = 4;
 #[derive(Clone)]
 pub struct Optimum<'a> {
     /// Optimum on the finest pulse grid.
-    pub attempt: OptimizationResult,
+    pub result: OptimizationResult,
     /// Objective on the finest pulse grid.
-    pub grid: Objective<'a>,
+    pub objective: Objective<'a>,
     /// Values of all free parameters, extrapolated to zero step from two pulse grids.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
@@ -44,7 +44,7 @@ pub struct Optimum<'a> {
 #[non_exhaustive]
 pub struct OptimumStatistics {
     /// Optimum on the finest pulse grid.
-    pub attempt: OptimizationResult,
+    pub result: OptimizationResult,
     /// Weights of outputs and samples at the optimum.
     pub weights: Weights,
     /// Number of block pulses per sampling interval of the finest pulse grid.
@@ -72,63 +72,63 @@ pub struct OptimumStatistics {
 /// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
 ///
 /// On a coarse pulse grid, an optimization can follow a flat valley to the limit of its domain. From there, an
-/// optimization on a finer pulse grid makes no progress. Then the other survivors of the multistart, `others`, are
-/// optimized on the finer pulse grid as well.
+/// optimization on a finer pulse grid makes no progress. Then the other survivors of the multistart, `alternatives`,
+/// are optimized on the finer pulse grid as well.
 ///
 /// # Errors
-/// The error of a simulation that fails. [`Error::Beyond`] if residuals overflow. [`Error::NotFinite`] if the Jacobian
-/// is not finite. [`Error::Interrupted`] after a stop request.
+/// The error of a simulation that fails. [`Error::Overflow`] if residuals overflow. [`Error::NotFinite`] if the
+/// Jacobian is not finite. [`Error::Interrupted`] after a stop request.
 pub fn refine_step<'a>(
-    best: OptimizationResult,
-    grid: Objective<'a>,
+    optimum: OptimizationResult,
+    objective: Objective<'a>,
     loss: Loss,
-    others: &[Iterate],
+    alternatives: &[Iterate],
 ) -> Result<Optimum<'a>> {
-    let time_scaling = grid.time_scaling();
-    let (mut best, mut grid, mut others) = (best, grid, others);
-    let (mut estimate, mut has_converged, mut before) = (best.values(), false, None::<OptimizationResult>);
-    let mut spread = None;
-    while !has_converged && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+    let time_scaling = objective.time_scaling();
+    let (mut optimum, mut objective, mut alternatives) = (optimum, objective, alternatives);
+    let (mut estimate, mut has_converged, mut previous) = (optimum.values(), false, None::<OptimizationResult>);
+    let mut covariance_matrix = None;
+    while !has_converged && objective.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         // Residuals can shrink to the noise on a finer grid, so the weights are iterated again.
-        let half = grid.finer()?;
-        let start = extrapolated_start(&half, &time_scaling, &best, before.as_ref())?;
-        let (finer, fine) = match fit_reweighted(&start, half.clone(), loss) {
+        let halved_objective = objective.finer()?;
+        let start = extrapolated_start(&halved_objective, &time_scaling, &optimum, previous.as_ref())?;
+        let (finer, finer_objective) = match fit_reweighted(&start, halved_objective.clone(), loss) {
             // The extrapolated start may have no finite simulation.
-            Err(error) if error != Error::Interrupted => fit_reweighted(&best.iterate, half, loss)?,
+            Err(error) if error != Error::Interrupted => fit_reweighted(&optimum.iterate, halved_objective, loss)?,
             fit => fit?,
         };
-        let has_increased =
-            negative_log_likelihood(&finer, &fine) > negative_log_likelihood(&best, &grid) + MAX_LOG_RESIDUAL_INCREASE;
-        let mut fine = fine;
-        if (finer.status == Status::DomainLimit && before.is_none()) || (has_increased && !others.is_empty()) {
-            let alternative = best_alternative(&finer, &fine, others, loss)?;
+        let has_increased = negative_log_likelihood(&finer, &finer_objective)
+            > negative_log_likelihood(&optimum, &objective) + MAX_LOG_RESIDUAL_INCREASE;
+        let mut finer_objective = finer_objective;
+        if (finer.status == Status::DomainLimit && previous.is_none()) || (has_increased && !alternatives.is_empty()) {
+            let alternative = best_alternative(&finer, &finer_objective, alternatives, loss)?;
             // The other survivors are tried only once.
-            others = &[];
-            if let Some((other, finer_values)) = alternative {
+            alternatives = &[];
+            if let Some((alternative_result, alternative_objective)) = alternative {
                 // The two grids have different optima, so they cannot be extrapolated.
-                (before, spread) = (None, None);
-                estimate = other.values();
-                (best, grid) = (other, finer_values);
+                (previous, covariance_matrix) = (None, None);
+                estimate = alternative_result.values();
+                (optimum, objective) = (alternative_result, alternative_objective);
                 continue;
             }
         }
-        std::mem::swap(&mut grid, &mut fine);
-        let (finer_values, own_values) = (finer.values(), best.values());
-        let fit = covariance(&finer, &grid)?;
+        std::mem::swap(&mut objective, &mut finer_objective);
+        let (finer_values, optimum_values) = (finer.values(), optimum.values());
+        let fit = covariance(&finer, &objective)?;
         // The scheme is of second order. Richardson extrapolation of two grids yields the limit, and a third grid
         // confirms it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = finer_values.clone();
-        if finer.has_converged() && best.has_converged() {
-            limit = extrapolate(&grid, &time_scaling, &finer_values, &own_values, 3.0)?;
+        if finer.has_converged() && optimum.has_converged() {
+            limit = extrapolate(&objective, &time_scaling, &finer_values, &optimum_values, 3.0)?;
         }
         has_converged = is_within_errors(&time_scaling, &limit, &estimate, (&finer_values, &fit))
-            || is_within_errors(&time_scaling, &finer_values, &own_values, (&finer_values, &fit));
+            || is_within_errors(&time_scaling, &finer_values, &optimum_values, (&finer_values, &fit));
         estimate = limit;
-        (before, best, spread) = (Some(best), finer, Some(fit));
+        (previous, optimum, covariance_matrix) = (Some(optimum), finer, Some(fit));
     }
-    let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
-    let estimate = select_limit_or_optimum(&best, &grid, estimate, &time_scaling, has_converged)?;
-    Ok(Optimum { attempt: best, grid, estimate, step_converged: has_converged, covariance: spread })
+    let covariance_matrix = covariance_matrix.map_or_else(|| covariance(&optimum, &objective), Ok)?;
+    let estimate = select_limit_or_optimum(&optimum, &objective, estimate, &time_scaling, has_converged)?;
+    Ok(Optimum { result: optimum, objective, estimate, step_converged: has_converged, covariance: covariance_matrix })
 }
 
 /// Return the optimum for zero step by deferred correction; None if this fails or is not worth its overhead.
@@ -136,44 +136,59 @@ pub fn refine_step<'a>(
 /// It serves long records, and nonlinear terms without friction, whose fits on fine pulse grids are slow.
 ///
 /// At the optimum, the residuals on two finer pulse grids are extrapolated to zero step. The difference of this limit
-/// from the residuals on `grid` hardly depends on the parameters. It is added to the samples, and the model is fitted
-/// again on `grid` until the estimate does not change (Stetter, doi:10.1007/BF01432879). The finer pulse grids are
-/// simulated without derivatives.
+/// from the residuals on `objective` hardly depends on the parameters. It is added to the samples, and the model is
+/// fitted again on `objective` until the estimate does not change (Stetter, doi:10.1007/BF01432879). The finer pulse
+/// grids are simulated without derivatives.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]). An error if the runs cannot be sampled at a
 /// shorter step. [`Error::Interrupted`] after a stop request.
-pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: Loss) -> Result<Option<Optimum<'a>>> {
-    let pulses: usize = grid.experiments().iter().map(|experiment| experiment.record.m()).sum();
-    let is_smooth = grid.problem.frictions.is_empty();
-    let is_slow = is_smooth && !grid.problem.is_linear();
-    if !(is_slow || pulses >= MIN_CORRECTED_PULSES) || !best.has_converged() {
+pub fn correct_step<'a>(
+    optimum: &OptimizationResult,
+    objective: &Objective<'a>,
+    loss: Loss,
+) -> Result<Option<Optimum<'a>>> {
+    let pulses: usize = objective.experiments().iter().map(|experiment| experiment.record.m()).sum();
+    let is_smooth = objective.problem.frictions.is_empty();
+    let is_slow = is_smooth && !objective.problem.is_linear();
+    if !(is_slow || pulses >= MIN_CORRECTED_PULSES) || !optimum.has_converged() {
         return Ok(None);
     }
-    let time_scaling = grid.time_scaling();
-    let (mut place, mut own_grid, mut coarse) = (best.clone(), grid.clone(), grid.clone());
+    let time_scaling = objective.time_scaling();
+    let (mut current, mut current_objective, mut coarse) = (optimum.clone(), objective.clone(), objective.clone());
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let fine = coarse.finer()?;
         for correction in 0..MAX_CORRECTIONS {
-            let Some(shifts) = limit_shifts(&place.iterate, grid, &coarse, &fine)? else { return Ok(None) };
-            let corrected = grid.with_weights(own_grid.weights.clone())?.with_residual_shifts(&shifts);
-            let (next, next_grid) = match fit_reweighted(&place.iterate, corrected, loss) {
+            let Some(shifts) = limit_shifts(&current.iterate, objective, &coarse, &fine)? else { return Ok(None) };
+            let corrected = objective.with_weights(current_objective.weights.clone())?.with_residual_shifts(&shifts);
+            let (next_result, next_objective) = match fit_reweighted(&current.iterate, corrected, loss) {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
                 Ok(fit) if fit.0.has_converged() => fit,
                 _ => return Ok(None),
             };
-            let spread = covariance(&next, &next_grid)?;
-            let has_converged =
-                is_within_errors(&time_scaling, &next.values(), &place.values(), (&next.values(), &spread));
+            let covariance_matrix = covariance(&next_result, &next_objective)?;
+            let has_converged = is_within_errors(
+                &time_scaling,
+                &next_result.values(),
+                &current.values(),
+                (&next_result.values(), &covariance_matrix),
+            );
             if has_converged && correction == 0 {
                 // The optimum is the same as with the previous pair of coarser grids.
-                let estimate = next.values();
-                let iterate = Iterate { point: best.iterate.point.clone(), states: next.iterate.states.clone() };
-                let attempt = OptimizationResult { iterate, ..next };
-                let grid = next_grid;
-                return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
+                let estimate = next_result.values();
+                let iterate =
+                    Iterate { point: optimum.iterate.point.clone(), states: next_result.iterate.states.clone() };
+                let result = OptimizationResult { iterate, ..next_result };
+                let objective = next_objective;
+                return Ok(Some(Optimum {
+                    result,
+                    objective,
+                    estimate,
+                    step_converged: true,
+                    covariance: covariance_matrix,
+                }));
             }
-            (place, own_grid) = (next, next_grid);
+            (current, current_objective) = (next_result, next_objective);
             if has_converged {
                 break;
             }
@@ -183,34 +198,34 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     Ok(None)
 }
 
-/// Return residuals extrapolated to zero step minus residuals on `grid`, in units of the outputs.
+/// Return residuals extrapolated to zero step minus residuals on `objective`, in units of the outputs.
 ///
 /// The values are indexed by run, output and sample. Return None if the differences are large relative to the noise, or
 /// if a simulation is not finite.
 fn limit_shifts(
-    place: &Iterate,
-    grid: &Objective<'_>,
+    iterate: &Iterate,
+    objective: &Objective<'_>,
     coarse: &Objective<'_>,
     fine: &Objective<'_>,
 ) -> Result<Option<Vec<Vec<Vec<f64>>>>> {
     let mut shifts: Vec<Vec<Vec<f64>>> = Vec::new();
     let (mut power, mut noise) = (0.0, 0.0);
     // Richardson extrapolation of a scheme of second order.
-    for (objective, share) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (grid, -1.0)] {
-        let Some(evaluation) = objective.evaluate(place)? else { return Ok(None) };
+    for (objective, weight_of_grid) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (objective, -1.0)] {
+        let Some(evaluation) = objective.evaluate(iterate)? else { return Ok(None) };
         let residuals = objective.residuals(&evaluation);
         if shifts.is_empty() {
             shifts = residuals.iter().map(|run| run.iter().map(|e| vec![0.0; e.len()]).collect()).collect();
         }
         for (shifts, run) in shifts.iter_mut().zip(&residuals) {
             for ((shifts, residuals), weight) in shifts.iter_mut().zip(run).zip(&objective.weights.outputs) {
-                shifts.iter_mut().zip(residuals).for_each(|(sum, e)| *sum += share * e / weight);
-                noise = if share > 0.0 { noise + finite_squares(residuals, 1.0) } else { noise };
+                shifts.iter_mut().zip(residuals).for_each(|(sum, e)| *sum += weight_of_grid * e / weight);
+                noise = if weight_of_grid > 0.0 { noise + finite_squares(residuals, 1.0) } else { noise };
             }
         }
     }
     for run in &shifts {
-        power += run.iter().zip(&grid.weights.outputs).map(|(s, weight)| finite_squares(s, *weight)).sum::<f64>();
+        power += run.iter().zip(&objective.weights.outputs).map(|(s, weight)| finite_squares(s, *weight)).sum::<f64>();
     }
     Ok((power <= noise).then_some(shifts))
 }
@@ -225,19 +240,20 @@ impl<'a> Optimum<'a> {
     ///
     /// # Errors
     /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]).
-    pub fn without_refinement(attempt: OptimizationResult, grid: Objective<'a>) -> Result<Self> {
-        let covariance = covariance(&attempt, &grid)?;
-        Ok(Self { estimate: attempt.values(), step_converged: true, covariance, attempt, grid })
+    pub fn without_refinement(result: OptimizationResult, objective: Objective<'a>) -> Result<Self> {
+        let covariance = covariance(&result, &objective)?;
+        Ok(Self { estimate: result.values(), step_converged: true, covariance, result, objective })
     }
 
     /// Convert to the statistics of the optimum, with noise levels and residuals.
     #[must_use]
     pub fn into_statistics(self) -> OptimumStatistics {
-        let Self { attempt, grid, estimate, step_converged: has_converged, covariance } = self;
-        let robust = grid.weights.robust_weights.is_some();
-        let levels = if robust { grid.residual_scales(&attempt) } else { grid.residual_root_mean_squares(&attempt) };
-        let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
-        let mut residuals = grid.residuals(&attempt);
+        let Self { result, objective, estimate, step_converged: has_converged, covariance } = self;
+        let is_robust = objective.weights.robust_weights.is_some();
+        let levels =
+            if is_robust { objective.residual_scales(&result) } else { objective.residual_root_mean_squares(&result) };
+        let limit_to_bounds = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
+        let mut residuals = objective.residuals(&result);
         for run in &mut residuals {
             // The weights equal the inverse noise levels within a tolerance only, so the residuals are scaled again.
             for (series, &level) in run.iter_mut().zip(&levels).filter(|(_, level)| **level > 0.0) {
@@ -245,14 +261,14 @@ impl<'a> Optimum<'a> {
             }
         }
         OptimumStatistics {
-            estimate: estimate.into_iter().zip(grid.problem.bounds()).map(inside).collect(),
-            noise: levels.iter().zip(&grid.weights.outputs).map(|(level, weight)| level / weight).collect(),
+            estimate: estimate.into_iter().zip(objective.problem.bounds()).map(limit_to_bounds).collect(),
+            noise: levels.iter().zip(&objective.weights.outputs).map(|(level, weight)| level / weight).collect(),
             residuals,
-            robust: robust.then(|| RobustSummary::from_result(&grid, &attempt)),
-            weights: grid.weights,
-            pulses_per_sample: grid.sampling.pulses_per_sample,
-            prior_fractions: prior_fractions(&attempt, &grid.problem.model.priors),
-            attempt,
+            robust: is_robust.then(|| RobustSummary::from_result(&objective, &result)),
+            weights: objective.weights,
+            pulses_per_sample: objective.sampling.pulses_per_sample,
+            prior_fractions: prior_fractions(&result, &objective.problem.model.priors),
+            result,
             step_converged: has_converged,
             covariance,
         }
@@ -260,137 +276,149 @@ impl<'a> Optimum<'a> {
 }
 
 /// Return the fraction of the information on its parameter that each prior contributes; NaN if not computable.
-fn prior_fractions(attempt: &OptimizationResult, priors: &[Prior]) -> Vec<f64> {
-    let size = attempt.jacobian.len();
-    let posterior = covariance_of_residuals(&attempt.jacobian, &[], 1.0, priors.len()).unwrap_or_default();
+fn prior_fractions(result: &OptimizationResult, priors: &[Prior]) -> Vec<f64> {
+    let size = result.jacobian.len();
+    let posterior = covariance_of_residuals(&result.jacobian, &[], 1.0, priors.len()).unwrap_or_default();
     let variance = |parameter: usize| posterior.get(parameter * size + parameter).copied().unwrap_or(f64::NAN);
     priors.iter().map(|prior| variance(prior.parameter) / prior.deviation.powi(2)).collect()
 }
 
 /// Return true if two estimates differ by at most a tenth of the standard errors in scaled time.
 ///
-/// The standard errors are those of the covariance matrix `spread` at the parameter values `at`.
-fn is_within_errors(time_scaling: &TimeScaling, one: &[f64], other: &[f64], (at, spread): (&[f64], &[f64])) -> bool {
-    let pairs = time_scaling.to_scaled(one).into_iter().zip(time_scaling.to_scaled(other));
-    let errors = time_scaling.standard_errors(at, spread);
+/// The standard errors are those of `covariance_matrix` at the parameter values `values`.
+fn is_within_errors(
+    time_scaling: &TimeScaling,
+    first: &[f64],
+    second: &[f64],
+    (values, covariance_matrix): (&[f64], &[f64]),
+) -> bool {
+    let pairs = time_scaling.to_scaled(first).into_iter().zip(time_scaling.to_scaled(second));
+    let errors = time_scaling.standard_errors(values, covariance_matrix);
     pairs.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
 }
 
-/// Extrapolate the estimates of two pulse grids to zero step: add the difference `fine` − `coarse`, divided by `share`,
-/// to `fine`.
+/// Extrapolate the estimates of two pulse grids to zero step: `fine` + (`fine` − `coarse`) / `divisor`.
 ///
 /// The result is limited to feasible values.
 fn extrapolate(
-    grid: &Objective<'_>,
+    objective: &Objective<'_>,
     time_scaling: &TimeScaling,
     fine: &[f64],
     coarse: &[f64],
-    share: f64,
+    divisor: f64,
 ) -> Result<Vec<f64>> {
     let (fine, coarse) = (time_scaling.to_scaled(fine), time_scaling.to_scaled(coarse));
-    let target: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(time_scaling.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
+    let target: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / divisor).collect();
+    Ok(time_scaling.to_unscaled(&objective.problem.last_feasible_point(&fine, &target)?))
 }
 
 /// Return the initial guess of the fit at half the step.
 ///
 /// The optimum is expected to move a quarter as far as at the last halving.
 fn extrapolated_start(
-    grid: &Objective<'_>,
+    objective: &Objective<'_>,
     time_scaling: &TimeScaling,
-    best: &OptimizationResult,
-    before: Option<&OptimizationResult>,
+    optimum: &OptimizationResult,
+    previous: Option<&OptimizationResult>,
 ) -> Result<Iterate> {
-    match before {
-        Some(before) if best.has_converged() && before.has_converged() => {
-            Ok(best.iterate_at(&extrapolate(grid, time_scaling, &best.values(), &before.values(), 4.0)?))
+    match previous {
+        Some(previous) if optimum.has_converged() && previous.has_converged() => {
+            Ok(optimum.iterate_at(&extrapolate(objective, time_scaling, &optimum.values(), &previous.values(), 4.0)?))
         }
-        _ => Ok(best.iterate.clone()),
+        _ => Ok(optimum.iterate.clone()),
     }
 }
 
-/// Return the best fit that starts from one of `others`, with converged weights; None if no such fit is better than the
-/// result `stalled`.
+/// Return the best fit that starts from one of `alternatives`, with converged weights; None if no such fit is better
+/// than the result `stalled_result`.
 ///
-/// `stalled` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires stability.
+/// `stalled_result` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires
+/// stability.
 ///
 /// # Errors
 /// [`Error::Interrupted`] after a stop request.
 pub fn best_alternative<'a>(
-    stalled: &OptimizationResult,
-    grid: &Objective<'a>,
-    others: &[Iterate],
+    stalled_result: &OptimizationResult,
+    objective: &Objective<'a>,
+    alternatives: &[Iterate],
     loss: Loss,
 ) -> Result<Option<(OptimizationResult, Objective<'a>)>> {
-    let (mut best, mut least) = (None, negative_log_likelihood(stalled, grid));
-    for other in others {
-        let outcome = match fit_reweighted(other, grid.clone(), loss) {
+    let (mut best_fit, mut lowest_level) = (None, negative_log_likelihood(stalled_result, objective));
+    for other in alternatives {
+        let outcome = match fit_reweighted(other, objective.clone(), loss) {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(_) => continue,
             Ok(outcome) => outcome,
         };
         let level = negative_log_likelihood(&outcome.0, &outcome.1);
-        if level < least && !(grid.requires_stability && grid.problem.is_unstable(&outcome.0.iterate.point)) {
-            (best, least) = (Some(outcome), level);
+        if level < lowest_level
+            && !(objective.requires_stability && objective.problem.is_unstable(&outcome.0.iterate.point))
+        {
+            (best_fit, lowest_level) = (Some(outcome), level);
         }
     }
-    Ok(best)
+    Ok(best_fit)
 }
 
 /// Negative log-likelihood per sample, summed over outputs, up to a constant.
-fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -> f64 {
-    grid.residual_root_mean_squares(attempt)
+fn negative_log_likelihood(result: &OptimizationResult, objective: &Objective<'_>) -> f64 {
+    objective
+        .residual_root_mean_squares(result)
         .iter()
-        .zip(&grid.weights.outputs)
+        .zip(&objective.weights.outputs)
         .map(|(level, w)| libm::log(level.max(1e-300) / w))
         .sum()
 }
 
-/// Return the extrapolated estimate `limit` or the optimum `best` of the finest pulse grid, whichever fits better at
+/// Return the extrapolated estimate `limit` or the optimum `optimum` of the finest pulse grid, whichever fits better at
 /// half the step.
 ///
 /// If poorly determined parameters have a curved valley, a straight extrapolation leaves the valley. The limit is
 /// returned without this comparison if the residuals hardly change between both points. It is also returned if they
 /// change linearly and the step has converged.
 fn select_limit_or_optimum(
-    best: &OptimizationResult,
-    grid: &Objective<'_>,
+    optimum: &OptimizationResult,
+    objective: &Objective<'_>,
     limit: Vec<f64>,
     time_scaling: &TimeScaling,
     has_converged: bool,
 ) -> Result<Vec<f64>> {
-    let own_values = best.values();
-    let shift: Vec<f64> =
-        time_scaling.to_scaled(&limit).iter().zip(time_scaling.to_scaled(&own_values)).map(|(a, b)| a - b).collect();
-    let mut change = vec![0.0; best.residuals.len()];
-    for (by, column) in time_scaling.step(&own_values, &shift).iter().zip(&best.jacobian) {
-        change.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
+    let optimum_values = optimum.values();
+    let shift: Vec<f64> = time_scaling
+        .to_scaled(&limit)
+        .iter()
+        .zip(time_scaling.to_scaled(&optimum_values))
+        .map(|(a, b)| a - b)
+        .collect();
+    let mut change = vec![0.0; optimum.residuals.len()];
+    for (parameter_change, column) in time_scaling.step(&optimum_values, &shift).iter().zip(&optimum.jacobian) {
+        change.iter_mut().zip(column).for_each(|(sum, slope)| *sum += parameter_change * slope);
     }
-    let length = |row: &[f64]| inner(row, row).sqrt();
+    let euclidean_norm = |row: &[f64]| inner(row, row).sqrt();
     if inner(&change, &change) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
         // Both points have nearly the same residuals.
         return Ok(limit);
     }
-    let limit_iterate = best.iterate_at(&limit);
-    if has_converged && let Some(evaluation) = grid.evaluate(&limit_iterate)? {
-        let predicted = best.residuals.iter().zip(&change).map(|(e, w)| e + w);
+    let limit_iterate = optimum.iterate_at(&limit);
+    if has_converged && let Some(evaluation) = objective.evaluate(&limit_iterate)? {
+        let predicted = optimum.residuals.iter().zip(&change).map(|(e, w)| e + w);
         let deviation: Vec<f64> =
             evaluation.residuals.iter().zip(predicted).map(|(e, predicted)| e - predicted).collect();
-        if length(&deviation) <= MAX_CHANGE_STANDARD_ERRORS * length(&change) {
+        if euclidean_norm(&deviation) <= MAX_CHANGE_STANDARD_ERRORS * euclidean_norm(&change) {
             return Ok(limit);
         }
     }
-    let finer = match grid.finer() {
+    let finer = match objective.finer() {
         Ok(finer) => finer,
         Err(Error::Interrupted) => return Err(Error::Interrupted),
         // Neither point can be simulated on half the step.
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];
-    for (cost, place) in costs.iter_mut().zip([&limit_iterate, &best.iterate]) {
-        if let Some(evaluation) = finer.evaluate(place)? {
+    for (cost, iterate) in costs.iter_mut().zip([&limit_iterate, &optimum.iterate]) {
+        if let Some(evaluation) = finer.evaluate(iterate)? {
             *cost = evaluation.cost;
         }
     }
-    Ok(if costs[0] <= costs[1] { limit } else { own_values })
+    Ok(if costs[0] <= costs[1] { limit } else { optimum_values })
 }

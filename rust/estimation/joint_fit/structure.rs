@@ -17,7 +17,7 @@ pub enum Coefficient {
     /// Name of the free coefficient.
     Free(String),
     /// Value of the fixed coefficient.
-    Known(f64),
+    Fixed(f64),
 }
 
 impl Coefficient {
@@ -26,12 +26,12 @@ impl Coefficient {
     pub fn name(&self) -> Option<&String> {
         match self {
             Self::Free(name) => Some(name),
-            Self::Known(_) => None,
+            Self::Fixed(_) => None,
         }
     }
 
     fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
-        self.name().and_then(|name| values.get(name)).map_or_else(|| self.clone(), |&value| Self::Known(value))
+        self.name().and_then(|name| values.get(name)).map_or_else(|| self.clone(), |&value| Self::Fixed(value))
     }
 }
 
@@ -53,7 +53,7 @@ impl ParametricTerm {
     #[must_use]
     pub fn fixed_coefficient(&self) -> Option<f64> {
         match self.coefficient {
-            Coefficient::Known(value) => Some(self.factor * value),
+            Coefficient::Fixed(value) => Some(self.factor * value),
             Coefficient::Free(_) => None,
         }
     }
@@ -110,8 +110,11 @@ impl ParametricEquation {
 
     /// Names of the free coefficients in order of appearance, friction last.
     pub fn coefficient_names(&self) -> impl Iterator<Item = &String> {
-        let friction_names =
-            self.friction.iter().flat_map(|friction| friction.parameters()).filter_map(|(_, number)| number.name());
+        let friction_names = self
+            .friction
+            .iter()
+            .flat_map(|friction| friction.parameters())
+            .filter_map(|(_, coefficient)| coefficient.name());
         self.terms.iter().filter_map(|term| term.coefficient.name()).chain(friction_names)
     }
 
@@ -131,27 +134,27 @@ impl ParametricEquation {
     }
 
     fn check(&self) -> Result<()> {
-        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        let structure_error = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         if self.terms.is_empty() {
-            return refuse(format!("the equation of output {} has no term", self.output), "add one");
+            return structure_error(format!("the equation of output {} has no term", self.output), "add one");
         }
         if self.order.is_free() {
             return Ok(());
         }
         let alpha = self.order.constant;
         if !alpha_fits(alpha) || (self.friction.is_some() && !(alpha > 1.0 && alpha <= 2.0)) {
-            return refuse(format!("order alpha = {alpha} of output {}", self.output), "choose another order");
+            return structure_error(format!("order alpha = {alpha} of output {}", self.output), "choose another order");
         }
         for term in self.terms.iter().filter(|term| !term.order.is_free()) {
             let order = term.order.constant;
-            let fits = if term.signal == self.output {
+            let is_in_range = if term.signal == self.output {
                 (0.0..alpha).contains(&order)
             } else {
                 order >= MIN_INPUT_ORDER && order < alpha + MAX_ORDER_EXCESS - ORDER_TOLERANCE
             };
-            if !fits {
+            if !is_in_range {
                 let what = format!("order {order} of signal {} with order alpha = {alpha} of the output", term.signal);
-                return refuse(what, "lower it");
+                return structure_error(what, "lower it");
             }
         }
         Ok(())
@@ -164,7 +167,7 @@ pub struct Input {
     /// Name of the parameter, such as `delay_u`.
     pub name: String,
     /// Kind of the parameter, its bounds and its input.
-    pub free: FreeInput,
+    pub parameter: FreeInput,
 }
 
 /// Coefficient law: a coefficient equals sign · Π factors.
@@ -184,13 +187,13 @@ pub struct Hints {
     /// Typical interval of the highest orders of the equations.
     pub highest: Option<(f64, f64)>,
     /// Typical values of free orders, by name.
-    pub natural: BTreeMap<String, Vec<f64>>,
+    pub typical_orders: BTreeMap<String, Vec<f64>>,
     /// Physical lower bound of each ratio (factor of a coefficient law), by name; 1 by default.
     pub ratio_lower_bounds: BTreeMap<String, f64>,
     /// Names of coefficients that a coefficient law determines from another equation and that are physically positive.
     pub positive: BTreeSet<String>,
     /// Approximate physical values of coefficients, by name.
-    pub known: BTreeMap<String, f64>,
+    pub physical_values: BTreeMap<String, f64>,
 }
 
 /// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and coefficient laws.
@@ -294,10 +297,10 @@ impl ParametricStructure {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
         }
-        let of_equation = |e: &ParametricEquation| e.terms.iter().map(|t| t.signal).chain([e.output]).max();
-        let inputs = self.inputs.iter().map(|input| input.free.signal);
-        let highest = self.equations.iter().filter_map(of_equation).chain(inputs).max();
-        if let Some(signal) = highest.filter(|&signal| signal >= self.signals.len()) {
+        let highest_signal_of = |e: &ParametricEquation| e.terms.iter().map(|t| t.signal).chain([e.output]).max();
+        let inputs = self.inputs.iter().map(|input| input.parameter.signal);
+        let highest_signal = self.equations.iter().filter_map(highest_signal_of).chain(inputs).max();
+        if let Some(signal) = highest_signal.filter(|&signal| signal >= self.signals.len()) {
             return Err(missing_signal_error(signal, self.signals.len()));
         }
         let channels = self.derived.iter().flat_map(|derived| &derived.channels).map(|channel| channel.0);
@@ -330,8 +333,8 @@ impl ParametricStructure {
         for equation in &mut out.equations {
             equation.terms.iter_mut().for_each(|term| term.coefficient = term.coefficient.substitute(values));
             if let Some(friction) = &mut equation.friction {
-                for (_, number) in [&mut friction.coulomb, &mut friction.stribeck, &mut friction.speed] {
-                    *number = number.substitute(values);
+                for (_, coefficient) in [&mut friction.coulomb, &mut friction.stribeck, &mut friction.speed] {
+                    *coefficient = coefficient.substitute(values);
                 }
             }
         }
@@ -344,11 +347,11 @@ impl ParametricStructure {
         Self { inputs: Vec::new(), ..self.clone() }
     }
 
-    /// Return the structure with another equation at index `place`, without the bounds of orders that no longer occur.
+    /// Return the structure with another equation at index `index`, without the bounds of orders that no longer occur.
     #[must_use]
-    pub fn with_equation(&self, place: usize, equation: ParametricEquation) -> Self {
+    pub fn with_equation(&self, index: usize, equation: ParametricEquation) -> Self {
         let mut out = self.clone();
-        out.equations[place] = equation;
+        out.equations[index] = equation;
         let names: BTreeSet<String> = out.order_names().into_iter().collect();
         out.bounds.retain(|name, _| names.contains(name));
         out

@@ -37,7 +37,7 @@ pub struct Experiment {
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonuniformSamples {
     /// Interpolation of block-pulse means at the sample times.
-    pub readings: SampleInterpolation,
+    pub interpolation: SampleInterpolation,
     /// Jumps near the samples of each zero-order-hold signal of the record; None for other signals.
     pub jumps: Vec<Option<Jumps>>,
 }
@@ -163,7 +163,7 @@ impl Experiment {
             check_finite(&format!("samples of output {i}"), samples)?;
             check_length(
                 "samples",
-                self.nonuniform.as_ref().map_or(m / every + 1, |own| own.readings.len()),
+                self.nonuniform.as_ref().map_or(m / every + 1, |own| own.interpolation.len()),
                 samples.len(),
             )?;
         }
@@ -231,7 +231,7 @@ impl Experiment {
     #[must_use]
     pub fn compared_count(&self) -> usize {
         match &self.nonuniform {
-            Some(own) => own.readings.len(),
+            Some(own) => own.interpolation.len(),
             None => (self.record.m() / self.pulses_per_sample).saturating_sub(1),
         }
     }
@@ -274,7 +274,7 @@ impl Experiment {
     /// Values of a signal at the compared samples, computed from its pulse means.
     fn samples_of_pulses(&self, means: &[f64]) -> Vec<f64> {
         match &self.nonuniform {
-            Some(own) => own.readings.interpolate(means),
+            Some(own) => own.interpolation.interpolate(means),
             None => self.sides(means).map(|(a, b)| 0.5 * (a + b)).collect(),
         }
     }

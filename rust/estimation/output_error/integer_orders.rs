@@ -49,7 +49,7 @@ struct EquationOrders {
 pub(crate) struct SourceInput<'a> {
     /// Values of the input: one per pulse if it is held, one per pulse edge if it is linear.
     pub(crate) samples: Cow<'a, [f64]>,
-    pub(crate) between: Intersample,
+    pub(crate) intersample: Intersample,
     /// Delay of a zero-order-hold input in pulses.
     pub(crate) delay: f64,
     /// Value of the input before the first pulse.
@@ -174,7 +174,7 @@ impl Companion {
         let n = self.order;
         let total = if behind.is_some() { 2 * n } else { n };
         let fraction = input.map_or(0.0, |input| input.delay - input.delay.floor());
-        let discretization = self.discretization(input.map(|input| input.between), fraction, behind)?;
+        let discretization = self.discretization(input.map(|input| input.intersample), fraction, behind)?;
         let mut start = vec![0.0; total];
         if input.is_none() {
             start[n - 1] = 1.0;
@@ -188,11 +188,11 @@ impl Companion {
     /// fractional part of the delay in pulses.
     fn discretization(
         &self,
-        between: Option<Intersample>,
+        intersample: Option<Intersample>,
         fraction: f64,
         behind: Option<(&[f64], f64)>,
     ) -> Option<Rc<Discretization>> {
-        let key = (between, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
+        let key = (intersample, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
         if let Some(cached) = self.discretizations.borrow().iter().find(|d| d.key == key) {
             return Some(cached.clone());
         }
@@ -216,9 +216,9 @@ impl Companion {
             drive[total - 1] = self.step * direct;
         }
         let interval = Transition::new(&system, total, 1.0)?;
-        let gains = match between {
+        let gains = match intersample {
             None => None,
-            Some(between) => Some(InputGains::new(&interval, &system, &drive, between, fraction)?),
+            Some(intersample) => Some(InputGains::new(&interval, &system, &drive, intersample, fraction)?),
         };
         // Columns are contiguous, so that the states of a step are independent sums.
         let transition_increment =
@@ -243,7 +243,7 @@ impl Discretization {
         let n = state.len();
         let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
         let lag = input.map_or(0, |input| {
-            let is_fractional_delay = input.between == Intersample::Hold && input.delay > input.delay.floor();
+            let is_fractional_delay = input.intersample == Intersample::Hold && input.delay > input.delay.floor();
             input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(is_fractional_delay)
         });
         let at = |k: usize| match (input, delayed_row(k, lag)) {
@@ -253,15 +253,15 @@ impl Discretization {
         };
         let mut next = vec![0.0; n];
         for k in 0..=count * every {
-            let (now, later) = (at(k), at(k + 1));
+            let (current_value, next_value) = (at(k), at(k + 1));
             if k > 0 && k % every == 0 {
                 states.extend_from_slice(&state);
-                values.push(now);
+                values.push(current_value);
             }
             next.copy_from_slice(&state);
             if let Some(gains) = &self.gains {
-                for ((v, a), b) in next.iter_mut().zip(&gains.now).zip(&gains.later) {
-                    *v += a * now + b * later;
+                for ((v, a), b) in next.iter_mut().zip(&gains.current_gains).zip(&gains.next_gains) {
+                    *v += a * current_value + b * next_value;
                 }
             }
             for (column, x) in self.transition_increment.chunks_exact(n).zip(&state) {
@@ -445,13 +445,13 @@ impl IntegerOrders {
             }
             for &e in powers.iter().filter(|&&e| e >= orders.order) {
                 // The input is a constant, or a ramp with one value per pulse edge.
-                let (between, length) = match e == orders.order {
+                let (intersample, length) = match e == orders.order {
                     true => (Intersample::Hold, 1),
                     false => (Intersample::Linear, record.m() + 1),
                 };
                 #[allow(clippy::cast_precision_loss)]
                 let samples = (0..length).map(|k| if length == 1 { 1.0 } else { k as f64 * step }).collect();
-                add(SourceKind::Power(e), Some(SourceInput { samples, between, delay: 0.0, before: 0.0 }))?;
+                add(SourceKind::Power(e), Some(SourceInput { samples, intersample, delay: 0.0, before: 0.0 }))?;
             }
             let simulation = EquationSimulation { companion, sources };
             for &e in &powers {
@@ -555,7 +555,7 @@ pub(crate) fn source_input<'a>(
             values[row] + if rest > 0.0 { rest * (values[row + 1] - values[row]) } else { 0.0 }
         };
         let samples = if every == 1 { Cow::Borrowed(&values[..]) } else { (0..=record.m()).map(edge).collect() };
-        return Ok(SourceInput { samples, between: Intersample::Linear, delay: 0.0, before: 0.0 });
+        return Ok(SourceInput { samples, intersample: Intersample::Linear, delay: 0.0, before: 0.0 });
     }
     let (mut samples, mut delay, mut before) = (Cow::Borrowed(means), 0.0, 0.0);
     if let Some(law) = model.law_of(signal) {
@@ -566,7 +566,7 @@ pub(crate) fn source_input<'a>(
             samples = model.apply_input_law(record, model.inputs[law], point.inputs[law])?.0.into();
         }
     }
-    Ok(SourceInput { samples, between: Intersample::Hold, delay, before })
+    Ok(SourceInput { samples, intersample: Intersample::Hold, delay, before })
 }
 
 impl Source<'_> {
@@ -750,7 +750,8 @@ impl ExactSimulation<'_> {
                     continue;
                 }
                 let slope = model.apply_input_law(&experiment.record, input, point.inputs[law])?.1;
-                let slope = SourceInput { samples: slope.into(), between: Intersample::Hold, delay: 0.0, before: 0.0 };
+                let slope =
+                    SourceInput { samples: slope.into(), intersample: Intersample::Hold, delay: 0.0, before: 0.0 };
                 let grid = (experiment.pulses_per_sample, count);
                 let (states, values) = simulation
                     .companion

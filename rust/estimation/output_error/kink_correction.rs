@@ -36,7 +36,7 @@ pub(crate) struct KinkCorrection {
 impl KinkCorrection {
     /// Return the kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
-        let NonuniformSamples { readings, jumps } = experiment.nonuniform.as_ref()?;
+        let NonuniformSamples { interpolation, jumps } = experiment.nonuniform.as_ref()?;
         let step = experiment.record.step();
         let mut all = Vec::new();
         for (equation, structure) in structures.iter().enumerate() {
@@ -57,11 +57,11 @@ impl KinkCorrection {
                     }
                     let shift = ORDER_DIFFERENCE_STEP.min(0.5 * eta);
                     let (up, down) = (
-                        readings.kink_corrections(near, eta + shift, step),
-                        readings.kink_corrections(near, eta - shift, step),
+                        interpolation.kink_corrections(near, eta + shift, step),
+                        interpolation.kink_corrections(near, eta - shift, step),
                     );
                     let slopes = up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
-                    all.push(Kink { equation, terms, values: readings.kink_corrections(near, eta, step), slopes });
+                    all.push(Kink { equation, terms, values: interpolation.kink_corrections(near, eta, step), slopes });
                 }
             }
         }
@@ -72,8 +72,8 @@ impl KinkCorrection {
     pub(crate) fn initial_term_correction(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
         let mut rows = vec![vec![0.0; experiment.compared_count()]; experiment.samples.len()];
         if let Some(own) = experiment.nonuniform.as_ref().filter(|_| exponent.fract() != 0.0) {
-            let start = own.readings.jumps(&[0.0], &[libm::tgamma(exponent + 1.0)]);
-            rows[equation] = own.readings.kink_corrections(&start, exponent, experiment.record.step());
+            let start = own.interpolation.jumps(&[0.0], &[libm::tgamma(exponent + 1.0)]);
+            rows[equation] = own.interpolation.kink_corrections(&start, exponent, experiment.record.step());
         }
         experiment.weighted_corrections(&rows)
     }

@@ -139,7 +139,7 @@ impl CellBisection<'_> {
         let mut cells = self.initial_cells()?;
         if cells.is_empty() {
             return Err(Error::EmptyOrderGrid {
-                why: format!(
+                reason: format!(
                     "no orders in these intervals differ by {} or more from alpha and from each other",
                     self.region.min_separation
                 ),

@@ -139,12 +139,12 @@ impl OrderGrid {
             .collect();
         let mut blocks = Vec::new();
         let mut count: u128 = 0;
-        let mut why = "no value of alpha".to_owned();
+        let mut reason = "no value of alpha".to_owned();
         for (&alpha, firsts) in alphas.iter().zip(firsts) {
             let slices: Vec<GroupTuples> =
                 groups.iter().zip(firsts).map(|(group, first)| group.tuples_below(first)).collect();
             if let Some(empty) = slices.iter().position(|slice| slice.count == 0) {
-                why = format!("no orders of signal {} fit below alpha = {alpha}", groups[empty].signal);
+                reason = format!("no orders of signal {} fit below alpha = {alpha}", groups[empty].signal);
                 continue;
             }
             let size = slices.iter().fold(1u128, |size, slice| size.saturating_mul(u128::from(slice.count)));
@@ -156,7 +156,7 @@ impl OrderGrid {
             }
         }
         if count == 0 {
-            return Err(Error::EmptyOrderGrid { why });
+            return Err(Error::EmptyOrderGrid { reason });
         }
         #[allow(clippy::cast_possible_truncation)]
         Ok(Self { output, width: terms.len(), groups, blocks, count: count as u64 })

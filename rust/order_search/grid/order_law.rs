@@ -75,7 +75,7 @@ impl OrderLawGrid {
             })
             .collect();
         if let Some(empty) = axes.iter().position(Vec::is_empty) {
-            return Err(Error::EmptyOrderGrid { why: format!("free order {empty} has no value") });
+            return Err(Error::EmptyOrderGrid { reason: format!("free order {empty} has no value") });
         }
         let product = axes.iter().fold(1u128, |p, a| p.saturating_mul(a.len() as u128));
         match u64::try_from(product) {

@@ -153,7 +153,7 @@ impl<'a> CoupledSearch<'a> {
         let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
         let (join, candidate_ids) = Join::new(&grid, &mut candidates, options.memory, pool, control)?;
         if join.tuples() == 0 {
-            return Err(Error::EmptyOrderGrid { why: "no tuple of free orders gives orders in range".into() });
+            return Err(Error::EmptyOrderGrid { reason: "no tuple of free orders gives orders in range".into() });
         }
         #[allow(clippy::cast_precision_loss)]
         let samples = records.iter().map(Record::m).sum::<usize>() as f64;

@@ -35,9 +35,9 @@ pub struct JointMultistart {
 
 /// Return the runs as the data of a fit. Return an error if their signals or outputs are not those of the parameter
 /// set.
-pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
-    let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
-    recordings(runs, free.structure.recorded_count(), &outputs, free.structure.inputs.len())
+pub(super) fn source(parameter_set: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
+    let outputs: Vec<usize> = parameter_set.structure.equations.iter().map(|e| e.output).collect();
+    recordings(runs, parameter_set.structure.recorded_count(), &outputs, parameter_set.structure.inputs.len())
 }
 
 /// Run the multistart of a joint fit and return its candidates. `progress` is called with (steps done, all steps).
@@ -52,12 +52,18 @@ pub fn joint_multistart(
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<JointMultistart> {
-    let (free, (threads, memory)) = (Arc::clone(&problem.inner), resources);
-    let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
+    let (parameter_set, (threads, memory)) = (Arc::clone(&problem.inner), resources);
+    let source = source(&parameter_set, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let candidates = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let order_grids = OrderGrids::new(&source, threads, memory, stop);
-        let output_scale = OutputScale::of_recordings(&source)?;
-        let fit_problem = FitProblem { free: &free, source: &source, starts: &order_grids, sizes: &output_scale, stop };
+        let output_scale = OutputScale::from_recordings(&source)?;
+        let fit_problem = FitProblem {
+            parameter_set: &parameter_set,
+            source: &source,
+            guess_source: &order_grids,
+            scales: &output_scale,
+            stop,
+        };
         fit_problem.run_multistart(threads, &mut FitProgress::new(&report))
     })?;
     Ok(JointMultistart { inner: Arc::new(candidates) })
@@ -88,7 +94,7 @@ pub fn joint_fit<'py>(
     progress: Option<Py<PyAny>>,
     stop: Option<&Stop>,
 ) -> PyResult<Option<Bound<'py, PyDict>>> {
-    let (free, (threads, memory)) = (Arc::clone(&problem.inner), resources);
+    let (parameter_set, (threads, memory)) = (Arc::clone(&problem.inner), resources);
     let candidates = candidates.map(|fit| Vec::clone(&fit.inner));
     let initialization = match (warm_start, initial_guess) {
         (Some((values, noise, pulses_per_sample)), _) => Initialization::WarmStart {
@@ -98,16 +104,22 @@ pub fn joint_fit<'py>(
             candidates: candidates.unwrap_or_default(),
         },
         (None, Some(values)) => Initialization::InitialGuess(values.into()),
-        (None, None) => Initialization::Multistart { known: to_vectors(guesses), candidates },
+        (None, None) => Initialization::Multistart { given_guesses: to_vectors(guesses), candidates },
     };
     let loss = if huber { Loss::Huber } else { Loss::Squares };
     let settings = Settings { loss, refine, threads };
-    let size = free.problem.size();
-    let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
+    let size = parameter_set.problem.size();
+    let source = source(&parameter_set, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
     let fit = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let order_grids = OrderGrids::new(&source, threads, memory, stop);
-        let output_scale = OutputScale::of_recordings(&source)?;
-        let fit_problem = FitProblem { free: &free, source: &source, starts: &order_grids, sizes: &output_scale, stop };
+        let output_scale = OutputScale::from_recordings(&source)?;
+        let fit_problem = FitProblem {
+            parameter_set: &parameter_set,
+            source: &source,
+            guess_source: &order_grids,
+            scales: &output_scale,
+            stop,
+        };
         fit::fit(fit_problem, initialization, settings, report)
     })?;
     fit.map(|fit| fit_to_dict(py, fit, size)).transpose()
@@ -121,7 +133,7 @@ fn tables<'py>(py: Python<'py>, runs: &[Vec<Vec<f64>>]) -> PyResult<Vec<Table<'p
 fn fit_to_dict(py: Python<'_>, fit: JointFit, size: usize) -> PyResult<Bound<'_, PyDict>> {
     let JointFit { optimum, candidates, stability } = fit;
     let OptimumStatistics {
-        attempt,
+        result,
         weights,
         pulses_per_sample,
         estimate,
@@ -132,7 +144,7 @@ fn fit_to_dict(py: Python<'_>, fit: JointFit, size: usize) -> PyResult<Bound<'_,
         robust,
         prior_fractions,
     } = optimum;
-    let OptimizationResult { iterate, cost, initial, .. } = &attempt;
+    let OptimizationResult { iterate, cost, initial, .. } = &result;
     let dict = PyDict::new(py);
     dict.set_item("robust_weights", weights.robust_weights.map(|runs| tables(py, &runs)).transpose()?)?;
     dict.set_item("pulses_per_sample", pulses_per_sample)?;
@@ -143,10 +155,10 @@ fn fit_to_dict(py: Python<'_>, fit: JointFit, size: usize) -> PyResult<Bound<'_,
     dict.set_item("residuals", tables(py, &residuals)?)?;
     dict.set_item("robust", robust.map(|robust| (robust.reduced_weight_count, robust.outliers, robust.samples)))?;
     dict.set_item("prior_fractions", prior_fractions)?;
-    dict.set_item("on_grid", PyArray1::from_vec(py, attempt.values()))?;
+    dict.set_item("on_grid", PyArray1::from_vec(py, result.values()))?;
     dict.set_item("states", &iterate.states)?;
     dict.set_item("cost", cost)?;
-    dict.set_item("status", status(attempt.status))?;
+    dict.set_item("status", status(result.status))?;
     dict.set_item("initial_terms", initial.iter().flatten().map(Vec::len).sum::<usize>())?;
     let origins = candidates.iter().flat_map(|candidate| {
         std::iter::once(&candidate.origin)

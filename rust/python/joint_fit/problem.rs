@@ -76,8 +76,8 @@ impl JointProblem {
     /// `start` holds the values of the free parameters, and the initial states of runs with friction. The coordinate of
     /// a nonzero coefficient is its logarithm, or the coefficient itself if `plain` is true or there are non-linear
     /// terms. `fixed` holds the indices of fixed parameters. With `requires_stability`, no step leads from a stable
-    /// model to an unstable one. The cost includes the priors of the structure. The returned residuals and the Jacobian are
-    /// those of the samples alone.
+    /// model to an unstable one. The cost includes the priors of the structure. The returned residuals and the Jacobian
+    /// are those of the samples alone.
     #[pyo3(signature = (runs, start, plain, fixed, evaluations, tolerance, requires_stability, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn minimize<'py>(
@@ -93,17 +93,23 @@ impl JointProblem {
         stop: Option<&Stop>,
     ) -> PyResult<Bound<'py, PyDict>> {
         let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-        let place = Iterate { point: self.inner.problem.point(&start.0)?, states: to_vectors(start.1) };
+        let iterate = Iterate { point: self.inner.problem.point(&start.0)?, states: to_vectors(start.1) };
         let size = self.inner.problem.size();
         if let Some(index) = fixed.iter().find(|&&number| number >= size) {
             let what = format!("the parameter to be fixed has index {index}, but there are {size}");
             return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
         }
-        let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
+        let (parameter_set, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
         let points = count_evaluated_pulses(&experiments, evaluations);
         let priors = self.inner.problem.model.priors.len();
         let mut optimum = run_interruptible(py, points, stop, move |stop| {
-            free.problem_at(&place, plain, &fixed).minimize(&experiments, &place, settings, requires_stability, stop)
+            parameter_set.problem_at(&iterate, plain, &fixed).minimize(
+                &experiments,
+                &iterate,
+                settings,
+                requires_stability,
+                stop,
+            )
         })?;
         for values in std::iter::once(&mut optimum.residuals).chain(&mut optimum.jacobian) {
             values.truncate(values.len().saturating_sub(priors));

@@ -42,7 +42,7 @@ fn fit_state(fit: FitArg<'_>) -> PyResult<FitState> {
     let robust_weights = fit.robust_weights.map(|runs| runs.iter().map(rows).collect::<PyResult<_>>()).transpose()?;
     Ok(FitState {
         estimate: vector("estimate", &fit.estimate)?,
-        on_grid: vector("values on the grid", &fit.on_grid)?,
+        grid_optimum: vector("values on the grid", &fit.on_grid)?,
         weights: Weights { outputs: fit.weights.into(), robust_weights },
         pulses_per_sample: fit.pulses_per_sample,
         step_converged: fit.step_converged,
@@ -88,11 +88,11 @@ pub fn profile_intervals<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     check_parameters(problem, parameters.as_deref().map_or(&[], Vec::as_slice))?;
     check_finite("half-width of the intervals", &[width])?;
-    let (free, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
-    let source = source(&free, &runs)?;
+    let (parameter_set, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
+    let source = source(&parameter_set, &runs)?;
     let settings = ProfileSettings { parameters: parameters.map(Vec::from), width, budget, threads };
     let result = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
-        search_intervals(ProfileLikelihood::new((&free, &source, stop), &fit, evaluations)?, &settings, report)
+        search_intervals(ProfileLikelihood::new((&parameter_set, &source, stop), &fit, evaluations)?, &settings, report)
     })?;
     let dict = PyDict::new(py);
     let intervals = result
@@ -142,13 +142,13 @@ pub fn cost_surface<'py>(
 ) -> PyResult<SurfaceTuple<'py>> {
     check_parameters(problem, &pair)?;
     check_surface_points(points)?;
-    let (free, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
-    let source = source(&free, &runs)?;
+    let (parameter_set, fit) = (Arc::clone(&problem.inner), fit_state(fit)?);
+    let source = source(&parameter_set, &runs)?;
     let (minimum, [first, second], scores) = run_with_progress(py, stop, None, move |stop, _| {
-        let surface = CostSurface::new((&free, &source, stop), &fit, pair, refit, evaluations)?;
+        let surface = CostSurface::new((&parameter_set, &source, stop), &fit, pair, refit, evaluations)?;
         let axes = [0, 1].map(|k| surface.axis(k, half_widths[k], points));
         let scores = surface.scores(&axes[0], &axes[1])?;
-        Ok((surface.least(), axes, scores))
+        Ok((surface.minimum(), axes, scores))
     })?;
     Ok((minimum, PyArray1::from_vec(py, first), PyArray1::from_vec(py, second), matrix(py, scores, points)?))
 }

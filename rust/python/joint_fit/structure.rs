@@ -24,14 +24,14 @@ type EquationArg = (usize, OrderArg, List<TermArg>, Option<[NumberArg; 3]>);
 #[derive(FromPyObject)]
 pub enum CoefficientArg {
     Free(String),
-    Known(f64),
+    Fixed(f64),
 }
 
 impl From<CoefficientArg> for Coefficient {
     fn from(argument: CoefficientArg) -> Self {
         match argument {
             CoefficientArg::Free(name) => Self::Free(name),
-            CoefficientArg::Known(value) => Self::Known(value),
+            CoefficientArg::Fixed(value) => Self::Fixed(value),
         }
     }
 }
@@ -90,7 +90,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> 
     };
     let mut inputs = Vec::new();
     for (name, signal, law, bounds) in argument.inputs {
-        inputs.push(Input { name, free: FreeInput { signal, law: input_law(&law)?, bounds } });
+        inputs.push(Input { name, parameter: FreeInput { signal, law: input_law(&law)?, bounds } });
     }
     let hints = argument.hints;
     let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };
@@ -108,16 +108,16 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> 
         laws: argument.laws.into_iter().map(law).collect(),
         hints: Hints {
             highest: hints.highest,
-            natural: hints.natural.into_iter().map(|(name, values)| (name, values.into())).collect(),
+            typical_orders: hints.natural.into_iter().map(|(name, values)| (name, values.into())).collect(),
             ratio_lower_bounds: hints.exceeds.into_iter().collect(),
             positive: hints.positive.into_iter().collect(),
-            known: hints.known.into_iter().collect(),
+            physical_values: hints.known.into_iter().collect(),
         },
     };
     let signals = structure.signals.len();
     let missing =
         structure.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
-    if let Some(signal) = missing.chain(structure.inputs.iter().map(|i| i.free.signal)).find(|&s| s >= signals) {
+    if let Some(signal) = missing.chain(structure.inputs.iter().map(|i| i.parameter.signal)).find(|&s| s >= signals) {
         let what = format!("signal {signal} of {signals}");
         return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());
     }

@@ -79,7 +79,7 @@ struct Equation<'a> {
     /// order of the derivative. The factor is −1 for a term such as −a y.
     ///
     /// Derivatives of a lower order than the first entry do not occur in the equation. Their number is `integrators`.
-    own: Vec<(usize, f64)>,
+    autoregressive_terms: Vec<(usize, f64)>,
     integrators: usize,
     stop: &'a Stop,
     /// Frequency \[rad/s\] below which half of the output power lies; median over the runs.
@@ -104,29 +104,29 @@ struct Guess {
 /// # Errors
 /// An error if a run cannot be simulated. [`Error::Interrupted`] after a stop request.
 pub fn integer_order_optima(
-    free: &ParameterSet,
-    grid: &Objective<'_>,
+    parameter_set: &ParameterSet,
+    objective: &Objective<'_>,
     delays: &[Vec<f64>],
 ) -> Result<Option<Vec<Candidate>>> {
-    let model = &free.problem.model;
-    let plain = free.products.is_empty()
-        && free.problem.is_linear()
-        && free.orders.is_empty()
+    let model = &parameter_set.problem.model;
+    let is_supported = parameter_set.products.is_empty()
+        && parameter_set.problem.is_linear()
+        && parameter_set.orders.is_empty()
         && (model.equations.len() == 1 || (!model.coupled && model.inputs.is_empty()))
         && model.inputs.iter().all(|input| input.law == InputLaw::Delay);
     let start = ParameterPoint {
         orders: Vec::new(),
-        coefficients: vec![0.0; free.coefficients.len()],
+        coefficients: vec![0.0; parameter_set.coefficients.len()],
         inputs: delays.first().cloned().unwrap_or_default(),
     };
-    if !plain || IntegerOrders::of(model, grid.experiments(), &start).is_none() {
+    if !is_supported || IntegerOrders::of(model, objective.experiments(), &start).is_none() {
         return Ok(None);
     }
     let mut candidates: Vec<Candidate> = Vec::new();
     for i in 0..model.equations.len() {
-        let representative = representative_runs(&model.equations[i], grid.experiments());
+        let representative = representative_runs(&model.equations[i], objective.experiments());
         let experiments: Vec<Experiment> = representative.into_iter().map(|e| single_output(e, i)).collect();
-        let Some(equation) = Equation::new(model, i, &experiments, grid.stop()) else { return Ok(None) };
+        let Some(equation) = Equation::new(model, i, &experiments, objective.stop()) else { return Ok(None) };
         let guesses = equation.optima(&start, delays)?;
         if guesses.is_empty() {
             return Ok(None);
@@ -134,12 +134,12 @@ pub fn integer_order_optima(
         // Optima of different equations are independent, so the k-th candidate has the k-th optimum of each equation.
         for (k, guess) in guesses.into_iter().enumerate() {
             if i == 0 {
-                let place = Iterate { point: guess.point, states: Vec::new() };
-                candidates.push(Candidate::at(place, guess.origin));
+                let iterate = Iterate { point: guess.point, states: Vec::new() };
+                candidates.push(Candidate::at(iterate, guess.origin));
             } else if k < candidates.len() {
-                let place = &mut candidates[k].result.iterate.point;
+                let point = &mut candidates[k].result.iterate.point;
                 for j in equation.coefficients() {
-                    place.coefficients[j] = guess.point.coefficients[j];
+                    point.coefficients[j] = guess.point.coefficients[j];
                 }
             }
         }
@@ -159,20 +159,20 @@ fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment
     inputs.dedup();
     let variation = |experiment: &Experiment, signal: usize| {
         let means = experiment.record.signal(signal);
-        let middle = mean(means);
-        means.iter().map(|v| (v - middle) * (v - middle)).sum::<f64>()
+        let center = mean(means);
+        means.iter().map(|v| (v - center) * (v - center)).sum::<f64>()
     };
     let ranked: Vec<Vec<usize>> = inputs
         .iter()
         .map(|&signal| {
-            let sizes: Vec<f64> = experiments.iter().map(|e| variation(e, signal)).collect();
+            let variations: Vec<f64> = experiments.iter().map(|e| variation(e, signal)).collect();
             let mut order: Vec<usize> = (0..experiments.len()).collect();
-            order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
+            order.sort_by(|&a, &b| variations[b].total_cmp(&variations[a]));
             order
         })
         .collect();
     let (mut selection, mut samples) = (Vec::new(), 0);
-    for run in (0..experiments.len()).flat_map(|place| ranked.iter().map(move |order| order[place])) {
+    for run in (0..experiments.len()).flat_map(|rank| ranked.iter().map(move |order| order[rank])) {
         if selection.len() >= MIN_RUNS.max(inputs.len()) && samples >= MAX_COARSE_SAMPLES {
             break;
         }
@@ -190,11 +190,11 @@ fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment
 
 /// Return the experiment with output `i` alone.
 fn single_output(experiment: &Experiment, i: usize) -> Experiment {
-    let mut one = experiment.clone();
-    one.samples = vec![experiment.samples[i].clone()];
-    one.weights = vec![experiment.weights[i]];
-    one.sample_weights = experiment.sample_weights.get(i).cloned().into_iter().collect();
-    one
+    let mut single = experiment.clone();
+    single.samples = vec![experiment.samples[i].clone()];
+    single.weights = vec![experiment.weights[i]];
+    single.sample_weights = experiment.sample_weights.get(i).cloned().into_iter().collect();
+    single
 }
 
 impl<'a> Equation<'a> {
@@ -208,7 +208,7 @@ impl<'a> Equation<'a> {
         let equation = &model.equations[i];
         let model = FreeModel { equations: vec![equation.clone()], coupled: false, ..model.clone() };
         let order = integer(&equation.order)?;
-        let mut own = vec![None; order];
+        let mut autoregressive_terms = vec![None; order];
         let single_parameter = |monomial: &Monomial| match monomial.powers[..] {
             [(j, 1)] if monomial.factor != 0.0 => Some(j),
             _ => None,
@@ -217,15 +217,19 @@ impl<'a> Equation<'a> {
         for (signal, nu, monomial) in &equation.terms {
             if *signal == equation.output {
                 let (j, nu) = (single_parameter(monomial)?, integer(nu)?);
-                if nu >= order || own[nu].replace((j, monomial.factor)).is_some() || linear.contains(&j) {
+                if nu >= order
+                    || autoregressive_terms[nu].replace((j, monomial.factor)).is_some()
+                    || linear.contains(&j)
+                {
                     return None;
                 }
             } else if monomial.powers.iter().any(|(j, _)| !linear.contains(j)) {
                 return None;
             }
         }
-        let integrators = own.iter().position(Option::is_some).unwrap_or(order);
-        let own: Vec<(usize, f64)> = own[integrators..].iter().copied().collect::<Option<_>>()?;
+        let integrators = autoregressive_terms.iter().position(Option::is_some).unwrap_or(order);
+        let autoregressive_terms: Vec<(usize, f64)> =
+            autoregressive_terms[integrators..].iter().copied().collect::<Option<_>>()?;
         let frequency = median(
             experiments
                 .iter()
@@ -235,16 +239,29 @@ impl<'a> Equation<'a> {
         );
         let step = experiments.iter().map(|e| e.record.step()).fold(f64::INFINITY, f64::min);
         let duration = experiments.iter().map(|e| e.record.step() * e.record.m() as f64).fold(0.0, f64::max);
-        (frequency > 0.0).then_some(Self { model, experiments, own, integrators, stop, frequency, step, duration })
+        (frequency > 0.0).then_some(Self {
+            model,
+            experiments,
+            autoregressive_terms,
+            integrators,
+            stop,
+            frequency,
+            step,
+            duration,
+        })
     }
 
     fn order(&self) -> usize {
-        self.integrators + self.own.len()
+        self.integrators + self.autoregressive_terms.len()
     }
 
     /// Indices of the free coefficients of the equation: those of the denominator, then the linear ones.
     fn coefficients(&self) -> Vec<usize> {
-        self.own.iter().map(|own| own.0).chain(self.model.linear_coefficients()).collect()
+        self.autoregressive_terms
+            .iter()
+            .map(|autoregressive_terms| autoregressive_terms.0)
+            .chain(self.model.linear_coefficients())
+            .collect()
     }
 
     /// Return the same equation at a lower order, without the input terms that exceed this order.
@@ -252,37 +269,37 @@ impl<'a> Equation<'a> {
     fn at_order(&self, order: usize) -> Self {
         let mut model = self.model.clone();
         let equation = &mut model.equations[0];
-        let (output, full) = (equation.output, self.order());
+        let (output, full_order) = (equation.output, self.order());
         equation.terms.retain(|(signal, nu, _)| {
             let nu = integer(nu).unwrap_or(usize::MAX);
-            nu < order || (nu == full && *signal != output && order == full)
+            nu < order || (nu == full_order && *signal != output && order == full_order)
         });
-        if order < full {
+        if order < full_order {
             equation.order = AffineOrder { constant: order as f64, ..equation.order.clone() };
         }
-        Self { model, own: self.own[..order - self.integrators].to_vec(), ..*self }
+        Self { model, autoregressive_terms: self.autoregressive_terms[..order - self.integrators].to_vec(), ..*self }
     }
 
     /// Return the optima of the equation at the most likely delays, best first.
     fn optima(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
         let delays = self.likely_delays(start, delays)?;
-        let mut lower: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
+        let mut poles_by_delay: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
         let mut evaluations = Vec::new();
         for order in (self.integrators.max(1))..=self.order() {
-            let last = order == self.order();
+            let is_full_order = order == self.order();
             let equation = self.at_order(order);
-            let mut ends_of_round = Vec::new();
-            for (delay, poles) in delays.iter().zip(&mut lower) {
-                let begin = ParameterPoint { inputs: delay.clone(), ..start.clone() };
-                let mut guesses = equation.instrumental_variables(&begin)?;
-                guesses.extend(equation.with_added_poles(&begin, poles)?);
-                let ends = equation.refine(guesses)?;
-                let best = ends.first().map(|end| equation.poles(&end.point)).unwrap_or_default();
-                poles.push(best);
-                ends_of_round.extend(ends);
+            let mut optima_of_order = Vec::new();
+            for (delay, poles) in delays.iter().zip(&mut poles_by_delay) {
+                let start_at_delay = ParameterPoint { inputs: delay.clone(), ..start.clone() };
+                let mut guesses = equation.instrumental_variables(&start_at_delay)?;
+                guesses.extend(equation.with_added_poles(&start_at_delay, poles)?);
+                let optima = equation.refine(guesses)?;
+                let best_poles = optima.first().map(|optimum| equation.poles(&optimum.point)).unwrap_or_default();
+                poles.push(best_poles);
+                optima_of_order.extend(optima);
             }
-            if last {
-                evaluations = ends_of_round;
+            if is_full_order {
+                evaluations = optima_of_order;
             }
         }
         evaluations.sort_by(|a, b| a.cost.total_cmp(&b.cost));
@@ -301,13 +318,13 @@ impl<'a> Equation<'a> {
         let mut costs = Vec::with_capacity(delays.len());
         for delay in delays {
             let point = ParameterPoint { inputs: delay.clone(), ..start.clone() };
-            let mut least = f64::INFINITY;
+            let mut least_cost = f64::INFINITY;
             for ratio in [1.0, 4.0] {
                 if let Some(evaluation) = equation.filtered_least_squares(&point, ratio * self.frequency)? {
-                    least = least.min(equation.evaluate(&evaluation)?.map_or(f64::INFINITY, |e| cost(&e)));
+                    least_cost = least_cost.min(equation.evaluate(&evaluation)?.map_or(f64::INFINITY, |e| cost(&e)));
                 }
             }
-            costs.push(least);
+            costs.push(least_cost);
         }
         let mut order: Vec<usize> = (0..delays.len()).collect();
         order.sort_by(|&i, &j| costs[i].total_cmp(&costs[j]));
@@ -318,15 +335,15 @@ impl<'a> Equation<'a> {
     fn instrumental_variables(&self, start: &ParameterPoint) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for ratio in FILTER_RATIOS {
-            let corner = ratio * self.frequency;
-            if corner * self.step > PI {
+            let cutoff = ratio * self.frequency;
+            if cutoff * self.step > PI {
                 continue;
             }
-            let Some(point) = self.filtered_least_squares(start, corner)? else { continue };
-            let origin = format!("instrumental variables, filter {} rad/s", format_general(corner, 3));
-            if let Some(unbent) = self.evaluate(&point)?.filter(|_| !self.is_stable(&point)) {
+            let Some(point) = self.filtered_least_squares(start, cutoff)? else { continue };
+            let origin = format!("instrumental variables, filter {} rad/s", format_general(cutoff, 3));
+            if let Some(unstable) = self.evaluate(&point)?.filter(|_| !self.is_stable(&point)) {
                 let origin = format!("{origin}, unstable");
-                guesses.push(Guess { cost: cost(&unbent), point: unbent.point, origin });
+                guesses.push(Guess { cost: cost(&unstable), point: unstable.point, origin });
             }
             if let Some(refined) = self.refine_instruments(&self.stabilize(&point))? {
                 guesses.push(Guess { cost: cost(&refined), point: refined.point, origin });
@@ -338,22 +355,24 @@ impl<'a> Equation<'a> {
     /// Return guesses with one real pole or one pair of poles added to the optima of lower orders, `lower`.
     fn with_added_poles(&self, start: &ParameterPoint, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
-        for more in 1..=2_usize {
-            let Some(poles) = lower.len().checked_sub(more).map(|k| &lower[k]) else { continue };
-            if poles.len() + more != self.own.len() {
+        for added_count in 1..=2_usize {
+            let Some(poles) = lower.len().checked_sub(added_count).map(|k| &lower[k]) else { continue };
+            if poles.len() + added_count != self.autoregressive_terms.len() {
                 continue;
             }
             for ratio in ADDED_POLE_RATIOS {
-                let size = ratio * self.frequency;
-                let mut with = poles.clone();
-                match more {
-                    1 => with.push((-size, 0.0)),
+                let magnitude = ratio * self.frequency;
+                let mut extended_poles = poles.clone();
+                match added_count {
+                    1 => extended_poles.push((-magnitude, 0.0)),
                     _ => {
-                        let (decay, swing) = (ADDED_PAIR_DAMPING * size, (1.0 - ADDED_PAIR_DAMPING.powi(2)).sqrt());
-                        with.extend([(-decay, swing * size), (-decay, -swing * size)]);
+                        let (decay, damped_ratio) =
+                            (ADDED_PAIR_DAMPING * magnitude, (1.0 - ADDED_PAIR_DAMPING.powi(2)).sqrt());
+                        extended_poles
+                            .extend([(-decay, damped_ratio * magnitude), (-decay, -damped_ratio * magnitude)]);
                     }
                 }
-                let point = self.at_poles(start, &with);
+                let point = self.at_poles(start, &extended_poles);
                 if let Some(evaluation) = self.evaluate(&point)? {
                     guesses.push(Guess {
                         cost: cost(&evaluation),
@@ -372,9 +391,9 @@ impl<'a> Equation<'a> {
     fn refine(&self, mut guesses: Vec<Guess>) -> Result<Vec<Guess>> {
         guesses.retain(|guess| guess.cost.is_finite());
         guesses.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        let (mut ends, mut costs) = (Vec::<Guess>::new(), Vec::<f64>::new());
+        let (mut refined, mut costs) = (Vec::<Guess>::new(), Vec::<f64>::new());
         for guess in guesses {
-            if ends.len() >= CONTINUED_GUESSES {
+            if refined.len() >= CONTINUED_GUESSES {
                 break;
             }
             if costs.iter().any(|cost| (guess.cost / cost - 1.0).abs() < SAME_COST_TOLERANCE) {
@@ -382,7 +401,7 @@ impl<'a> Equation<'a> {
             }
             costs.push(guess.cost);
             if !self.is_stable(&guess.point) {
-                ends.push(guess);
+                refined.push(guess);
                 continue;
             }
             let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &guess.point) else { continue };
@@ -393,14 +412,14 @@ impl<'a> Equation<'a> {
             let start = [sections, guess.point.inputs.clone()].concat();
             match minimize(&problem, problem.clamp_to_bounds(start), settings) {
                 Ok(optimum) => {
-                    ends.push(Guess { cost: optimum.cost, point: optimum.evaluation.point, origin: guess.origin });
+                    refined.push(Guess { cost: optimum.cost, point: optimum.evaluation.point, origin: guess.origin });
                 }
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
-                Err(_) => ends.push(guess),
+                Err(_) => refined.push(guess),
             }
         }
-        ends.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        Ok(ends)
+        refined.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        Ok(refined)
     }
 
     /// Simulate at a point with the optimal input coefficients. Return None if the simulation is not finite.
@@ -413,8 +432,8 @@ impl<'a> Equation<'a> {
 
     /// Coefficients of s^0, …, s^(n − 1) of the monic denominator of degree n.
     fn divisor(&self, point: &ParameterPoint) -> Vec<f64> {
-        let own = self.own.iter().map(|&(j, factor)| -factor * point.coefficients[j]);
-        std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
+        let autoregressive_terms = self.autoregressive_terms.iter().map(|&(j, factor)| -factor * point.coefficients[j]);
+        std::iter::repeat_n(0.0, self.integrators).chain(autoregressive_terms).collect()
     }
 
     /// Poles without the integrators; empty if they are not found.
@@ -426,45 +445,46 @@ impl<'a> Equation<'a> {
 
     fn is_stable(&self, point: &ParameterPoint) -> bool {
         let poles = self.poles(point);
-        poles.len() == self.own.len() && poles.iter().all(|(re, _)| *re < 0.0)
+        poles.len() == self.autoregressive_terms.len() && poles.iter().all(|(re, _)| *re < 0.0)
     }
 
     fn at_poles(&self, point: &ParameterPoint, poles: &[Pole]) -> ParameterPoint {
-        let mut mirrored = point.clone();
-        for (&(j, factor), c) in self.own.iter().zip(polynomial(poles)) {
-            mirrored.coefficients[j] = -c / factor;
+        let mut point_at_poles = point.clone();
+        for (&(j, factor), c) in self.autoregressive_terms.iter().zip(polynomial(poles)) {
+            point_at_poles.coefficients[j] = -c / factor;
         }
-        mirrored
+        point_at_poles
     }
 
     /// Return the point with unstable poles reflected at the imaginary axis and fast poles moved below the Nyquist
     /// frequency.
     fn stabilize(&self, point: &ParameterPoint) -> ParameterPoint {
-        let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
+        let (max_magnitude, min_decay) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
         let poles = self.poles(point);
-        if poles.len() != self.own.len() {
+        if poles.len() != self.autoregressive_terms.len() {
             return point.clone();
         }
-        let within = |(re, im): Pole| {
-            let size = re.hypot(im);
-            let share = if size > fastest { fastest / size } else { 1.0 };
-            let decay = (re.abs() * share).max(MIN_DAMPING * size * share).max(slowest);
-            (-decay, im * share)
+        let limit_pole = |(re, im): Pole| {
+            let magnitude = re.hypot(im);
+            let scale = if magnitude > max_magnitude { max_magnitude / magnitude } else { 1.0 };
+            let decay = (re.abs() * scale).max(MIN_DAMPING * magnitude * scale).max(min_decay);
+            (-decay, im * scale)
         };
-        self.at_poles(point, &poles.into_iter().map(within).collect::<Vec<_>>())
+        self.at_poles(point, &poles.into_iter().map(limit_pole).collect::<Vec<_>>())
     }
 
     /// Return ln p and ln q of each section s² + p s + q, then the log magnitude of the remaining real pole, if any.
     fn sections(&self, poles: &[Pole]) -> Vec<f64> {
-        let slowest = MIN_POLE_DURATION / self.duration;
-        let mut real: Vec<f64> = poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(slowest)).collect();
+        let min_decay = MIN_POLE_DURATION / self.duration;
+        let mut real: Vec<f64> =
+            poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(min_decay)).collect();
         real.sort_by(f64::total_cmp);
         let mut out = Vec::with_capacity(poles.len());
         for (re, im) in poles.iter().filter(|(_, im)| *im > 0.0) {
-            out.extend([(-2.0 * re).max(slowest).ln(), (re * re + im * im).ln()]);
+            out.extend([(-2.0 * re).max(min_decay).ln(), (re * re + im * im).ln()]);
         }
         while real.len() >= 2 {
-            let (slow, fast) = (real.remove(0), real.pop().unwrap_or(slowest));
+            let (slow, fast) = (real.remove(0), real.pop().unwrap_or(min_decay));
             out.extend([(slow + fast).ln(), (slow * fast).ln()]);
         }
         out.extend(real.iter().map(|w| w.ln()));
@@ -474,13 +494,13 @@ impl<'a> Equation<'a> {
     /// Estimate the coefficients by least squares on samples that pass state-variable filters.
     ///
     /// The regression is [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u for output y and inputs u. The filter is
-    /// F = (s + λ)^n with λ = `corner` \[rad/s\]. Return None if a filtered signal is not finite or the coefficients
+    /// F = (s + λ)^n with λ = `cutoff` \[rad/s\]. Return None if a filtered signal is not finite or the coefficients
     /// are not determined.
     #[allow(clippy::type_complexity)]
-    fn filtered_least_squares(&self, start: &ParameterPoint, corner: f64) -> Result<Option<ParameterPoint>> {
+    fn filtered_least_squares(&self, start: &ParameterPoint, cutoff: f64) -> Result<Option<ParameterPoint>> {
         self.stop.check()?;
         let n = self.order();
-        let filter: Vec<f64> = polynomial(&vec![(-corner, 0.0); n]).iter().map(|c| -c).collect();
+        let filter: Vec<f64> = polynomial(&vec![(-cutoff, 0.0); n]).iter().map(|c| -c).collect();
         let linear = self.model.linear_coefficients();
         let equation = &self.model.equations[0];
         let mut companions = Vec::new();
@@ -488,33 +508,34 @@ impl<'a> Equation<'a> {
         for experiment in self.experiments {
             let (count, step) = (experiment.compared_count(), experiment.record.step());
             let companion = Companion::of_width(&mut companions, &filter, step);
-            let grid = (experiment.pulses_per_sample, count);
-            let respond = |input: Option<&SourceInput<'_>>| companion.respond(input, None, grid);
-            let weighted = |column: Vec<f64>| column.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
+            let sampling = (experiment.pulses_per_sample, count);
+            let respond = |input: Option<&SourceInput<'_>>| companion.respond(input, None, sampling);
+            let apply_weights =
+                |column: Vec<f64>| column.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
             let Some(output) = respond(Some(&measured_input(experiment))) else { return Ok(None) };
             let mut target = companion.derivative(&output, n);
-            let mut columns = vec![vec![0.0; count]; self.own.len() + linear.len()];
-            for (place, (column, (_, factor))) in columns.iter_mut().zip(&self.own).enumerate() {
-                let derivative = companion.derivative(&output, self.integrators + place);
+            let mut columns = vec![vec![0.0; count]; self.autoregressive_terms.len() + linear.len()];
+            for (index, (column, (_, factor))) in columns.iter_mut().zip(&self.autoregressive_terms).enumerate() {
+                let derivative = companion.derivative(&output, self.integrators + index);
                 *column = derivative.iter().map(|v| factor * v).collect();
             }
             for (signal, nu, monomial) in equation.terms.iter().filter(|(signal, ..)| *signal != equation.output) {
                 let input = source_input(&self.model, experiment, *signal, start)?;
                 let (Some(response), Some(nu)) = (respond(Some(&input)), integer(nu)) else { return Ok(None) };
-                let acted = companion.derivative(&response, nu);
+                let input_derivative = companion.derivative(&response, nu);
                 match monomial.powers.first().and_then(|(j, _)| linear.iter().position(|l| l == j)) {
-                    Some(place) => {
-                        let column = &mut columns[self.own.len() + place];
-                        column.iter_mut().zip(&acted).for_each(|(v, a)| *v += monomial.factor * a);
+                    Some(column_index) => {
+                        let column = &mut columns[self.autoregressive_terms.len() + column_index];
+                        column.iter_mut().zip(&input_derivative).for_each(|(v, a)| *v += monomial.factor * a);
                     }
-                    None => target.iter_mut().zip(&acted).for_each(|(v, a)| *v -= monomial.factor * a),
+                    None => target.iter_mut().zip(&input_derivative).for_each(|(v, a)| *v -= monomial.factor * a),
                 }
             }
             let mut basis = Vec::new();
             if !self.model.initial.is_at_rest() || self.model.initial.has_level() {
                 let constant_input = |samples: Vec<f64>| SourceInput {
                     samples: Cow::Owned(samples),
-                    between: Intersample::Hold,
+                    intersample: Intersample::Hold,
                     delay: 0.0,
                     before: 0.0,
                 };
@@ -522,13 +543,13 @@ impl<'a> Equation<'a> {
                     return Ok(None);
                 };
                 for j in 0..n {
-                    extend_orthonormal(&mut basis, weighted(companion.derivative(&impulse, j)), RANK_TOLERANCE);
+                    extend_orthonormal(&mut basis, apply_weights(companion.derivative(&impulse, j)), RANK_TOLERANCE);
                 }
                 if !self.model.initial.without_offset().eq(&self.model.initial) {
-                    extend_orthonormal(&mut basis, weighted(companion.derivative(&constant, 0)), RANK_TOLERANCE);
+                    extend_orthonormal(&mut basis, apply_weights(companion.derivative(&constant, 0)), RANK_TOLERANCE);
                 }
             }
-            sides.push((weighted(target), basis, columns.into_iter().map(weighted).collect()));
+            sides.push((apply_weights(target), basis, columns.into_iter().map(apply_weights).collect()));
         }
         let sides: Vec<LinearSide<'_>> = (sides.iter())
             .map(|(target, basis, columns)| (&target[..], &basis[..], columns.iter().map(Vec::as_slice).collect()))
@@ -546,19 +567,19 @@ impl<'a> Equation<'a> {
         let Some(mut iterate) = self.evaluate(start)? else { return Ok(None) };
         for _ in 0..INSTRUMENT_STEPS {
             let Some(step) = self.instrument_step(&iterate)? else { break };
-            let (mut share, mut next) = (1.0, None);
+            let (mut step_fraction, mut accepted) = (1.0, None);
             for _ in 0..MAX_HALVINGS {
                 let mut point = iterate.point.clone();
-                for (&(j, _), by) in self.own.iter().zip(&step) {
-                    point.coefficients[j] += share * by;
+                for (&(j, _), increment) in self.autoregressive_terms.iter().zip(&step) {
+                    point.coefficients[j] += step_fraction * increment;
                 }
-                next = self.evaluate(&self.stabilize(&point))?.filter(|trial| cost(trial) < cost(&iterate));
-                if next.is_some() {
+                accepted = self.evaluate(&self.stabilize(&point))?.filter(|trial| cost(trial) < cost(&iterate));
+                if accepted.is_some() {
                     break;
                 }
-                share *= 0.5;
+                step_fraction *= 0.5;
             }
-            let Some(trial) = next else { break };
+            let Some(trial) = accepted else { break };
             let gain = 1.0 - cost(&trial) / cost(&iterate);
             iterate = trial;
             if gain < 1e-4 {
@@ -576,39 +597,39 @@ impl<'a> Equation<'a> {
         let linear = self.model.linear_coefficients();
         let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, evaluation) else { return Ok(None) };
         let orders = evaluation.point.orders.len();
-        let places: Vec<usize> = self.coefficients().iter().map(|j| orders + j).collect();
-        let own: Vec<f64> = self.divisor(&evaluation.point).iter().map(|c| -c).collect();
-        let mut regressors: Vec<Vec<f64>> = vec![Vec::new(); self.own.len()];
+        let indices: Vec<usize> = self.coefficients().iter().map(|j| orders + j).collect();
+        let autoregressive_terms: Vec<f64> = self.divisor(&evaluation.point).iter().map(|c| -c).collect();
+        let mut regressors: Vec<Vec<f64>> = vec![Vec::new(); self.autoregressive_terms.len()];
         let mut companions = Vec::new();
         for (experiment, basis) in self.experiments.iter().zip(evaluation.parts.iter().map(ExactSimulation::basis)) {
-            let companion = Companion::of_width(&mut companions, &own, experiment.record.step());
-            let grid = (experiment.pulses_per_sample, experiment.compared_count());
-            let Some(output) = companion.respond(Some(&measured_input(experiment)), None, grid) else {
+            let companion = Companion::of_width(&mut companions, &autoregressive_terms, experiment.record.step());
+            let sampling = (experiment.pulses_per_sample, experiment.compared_count());
+            let Some(output) = companion.respond(Some(&measured_input(experiment)), None, sampling) else {
                 return Ok(None);
             };
-            for (place, (column, (_, factor))) in regressors.iter_mut().zip(&self.own).enumerate() {
-                let part = companion.derivative(&output, self.integrators + place);
-                let mut part: Vec<f64> =
-                    part.iter().zip(experiment.weights_of(0)).map(|(v, w)| factor * v * w).collect();
-                project_out(basis, &mut part);
-                column.extend(part);
+            for (index, (column, (_, factor))) in regressors.iter_mut().zip(&self.autoregressive_terms).enumerate() {
+                let regressor_part = companion.derivative(&output, self.integrators + index);
+                let mut regressor_part: Vec<f64> =
+                    regressor_part.iter().zip(experiment.weights_of(0)).map(|(v, w)| factor * v * w).collect();
+                project_out(basis, &mut regressor_part);
+                column.extend(regressor_part);
             }
         }
-        let k = places.len();
+        let k = indices.len();
         let (mut cross, mut right) = (vec![0.0; k * k], vec![0.0; k]);
-        for (a, &instrument) in places.iter().enumerate() {
+        for (a, &instrument) in indices.iter().enumerate() {
             // The Jacobian is the derivative of the residuals, which are measured minus simulated samples.
             right[a] = -inner(&jacobian[instrument], &evaluation.residuals);
             for b in 0..k {
                 cross[a * k + b] = match regressors.get(b) {
                     Some(regressor) => -inner(&jacobian[instrument], regressor),
-                    None => inner(&jacobian[instrument], &jacobian[places[b]]),
+                    None => inner(&jacobian[instrument], &jacobian[indices[b]]),
                 };
             }
         }
         let Ok(factor) = EquilibratedLu::new(&cross, k) else { return Ok(None) };
         let step = factor.solve(&right);
-        Ok(step.iter().all(|v| v.is_finite()).then(|| step[..self.own.len()].to_vec()))
+        Ok(step.iter().all(|v| v.is_finite()).then(|| step[..self.autoregressive_terms.len()].to_vec()))
     }
 }
 
@@ -619,8 +640,8 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
         return Cow::Borrowed(samples);
     };
     let value_or_missing = |(k, v): (usize, &f64)| {
-        let read = k == 0 || weights.get(k - 1).is_none_or(|w| *w > 0.0);
-        if read {
+        let is_present = k == 0 || weights.get(k - 1).is_none_or(|w| *w > 0.0);
+        if is_present {
             *v
         } else {
             f64::NAN
@@ -632,7 +653,7 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
 
 /// The measured output as input of a filter, linear between samples.
 fn measured_input(experiment: &Experiment) -> SourceInput<'_> {
-    SourceInput { samples: output_samples(experiment), between: Intersample::Linear, delay: 0.0, before: 0.0 }
+    SourceInput { samples: output_samples(experiment), intersample: Intersample::Linear, delay: 0.0, before: 0.0 }
 }
 
 /// Return an order as an integer; None if it is negative, not an integer, or depends on a free order.
@@ -694,17 +715,17 @@ impl SectionsProblem<'_, '_> {
 
     fn bounds(&self, k: usize) -> (f64, f64) {
         let equation = self.equation;
-        let count = equation.own.len();
-        let (slowest, decay, frequency) = (
+        let count = equation.autoregressive_terms.len();
+        let (min_decay, decay, frequency) = (
             (MIN_POLE_DURATION / equation.duration).ln(),
             (MAX_DECAY_STEP / equation.step).ln(),
             (MAX_FREQUENCY_STEP / equation.step).ln(),
         );
         match k {
             k if k >= count => equation.model.inputs[k - count].bounds,
-            k if k % 2 == 1 => (2.0 * slowest, 2.0 * frequency),
-            k if k + 1 == count => (slowest, decay),
-            _ => (slowest, decay + 2.0_f64.ln()),
+            k if k % 2 == 1 => (2.0 * min_decay, 2.0 * frequency),
+            k if k + 1 == count => (min_decay, decay),
+            _ => (min_decay, decay + 2.0_f64.ln()),
         }
     }
 
@@ -724,14 +745,14 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
     fn evaluate(&self, point: &Vec<f64>) -> Result<Evaluation<'a>> {
         let equation = self.equation;
         equation.stop.check()?;
-        let count = equation.own.len();
+        let count = equation.autoregressive_terms.len();
         let product = self.factors(&point[..count]).iter().fold(vec![1.0], |a, (section, _)| multiply(&a, section));
-        let mut at = self.base.clone();
-        at.inputs = point[count..].to_vec();
-        for (&(j, factor), c) in equation.own.iter().zip(&product) {
-            at.coefficients[j] = -c / factor;
+        let mut parameter_point = self.base.clone();
+        parameter_point.inputs = point[count..].to_vec();
+        for (&(j, factor), c) in equation.autoregressive_terms.iter().zip(&product) {
+            parameter_point.coefficients[j] = -c / factor;
         }
-        self.exact.evaluate(&equation.model, equation.experiments, &at, &self.linear)
+        self.exact.evaluate(&equation.model, equation.experiments, &parameter_point, &self.linear)
     }
 
     fn residuals<'e>(&self, evaluation: &'e Evaluation<'a>) -> &'e [f64] {
@@ -740,41 +761,48 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
 
     fn jacobian(&self, point: &Vec<f64>, evaluation: &Evaluation<'a>) -> Result<Vec<Vec<f64>>> {
         let equation = self.equation;
-        let mut of = self.exact.jacobian(&equation.model, equation.experiments, &self.linear, evaluation)?;
-        let (orders, count) = (evaluation.point.orders.len(), equation.own.len());
+        let mut jacobian = self.exact.jacobian(&equation.model, equation.experiments, &self.linear, evaluation)?;
+        let (orders, count) = (evaluation.point.orders.len(), equation.autoregressive_terms.len());
         let factors = self.factors(&point[..count]);
         // Variable projection in Kaufman's form: the columns of the input coefficients are projected out.
         let basis = {
             let mut basis = Vec::new();
             for &j in &self.linear {
-                extend_orthonormal(&mut basis, of[orders + j].clone(), RANK_TOLERANCE);
+                extend_orthonormal(&mut basis, jacobian[orders + j].clone(), RANK_TOLERANCE);
             }
             basis
         };
         let mut columns = Vec::with_capacity(point.len());
         for (k, (_, slopes)) in factors.iter().enumerate() {
-            let others = factors.iter().enumerate().filter(|(other, _)| *other != k);
-            let others = others.fold(vec![1.0], |a, (_, (section, _))| multiply(&a, section));
+            let remaining_factors = factors.iter().enumerate().filter(|(other, _)| *other != k);
+            let remaining_product = remaining_factors.fold(vec![1.0], |a, (_, (section, _))| multiply(&a, section));
             for slope in slopes {
                 let mut column = vec![0.0; evaluation.residuals.len()];
-                for (&(j, factor), by) in equation.own.iter().zip(multiply(&others, slope)) {
-                    column.iter_mut().zip(&of[orders + j]).for_each(|(v, d)| *v -= by / factor * d);
+                for (&(j, factor), coefficient_slope) in
+                    equation.autoregressive_terms.iter().zip(multiply(&remaining_product, slope))
+                {
+                    column
+                        .iter_mut()
+                        .zip(&jacobian[orders + j])
+                        .for_each(|(v, d)| *v -= coefficient_slope / factor * d);
                 }
                 columns.push(column);
             }
         }
-        columns.extend(of.drain(orders + evaluation.point.coefficients.len()..));
+        columns.extend(jacobian.drain(orders + evaluation.point.coefficients.len()..));
         columns.iter_mut().for_each(|column| project_out(&basis, column));
         Ok(columns)
     }
 
     fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
-        let count = self.equation.own.len();
-        let limited = |(k, (v, by)): (usize, (&f64, &f64))| if k < count { v + by.clamp(-1.5, 1.5) } else { v + by };
-        let next = self.clamp_to_bounds(point.iter().zip(steps).enumerate().map(limited).collect());
-        let size = |k: usize| if k < count { 1.0 } else { self.bounds(k).1.max(f64::MIN_POSITIVE) };
-        let change = next.iter().zip(point).enumerate().map(|(k, (a, b))| (a - b).abs() / size(k)).fold(0.0, f64::max);
-        (next, change)
+        let count = self.equation.autoregressive_terms.len();
+        let limit_step =
+            |(k, (v, step)): (usize, (&f64, &f64))| if k < count { v + step.clamp(-1.5, 1.5) } else { v + step };
+        let bounded_point = self.clamp_to_bounds(point.iter().zip(steps).enumerate().map(limit_step).collect());
+        let scale = |k: usize| if k < count { 1.0 } else { self.bounds(k).1.max(f64::MIN_POSITIVE) };
+        let change =
+            bounded_point.iter().zip(point).enumerate().map(|(k, (a, b))| (a - b).abs() / scale(k)).fold(0.0, f64::max);
+        (bounded_point, change)
     }
 
     fn distance_to_bounds(&self, point: &Vec<f64>, k: usize) -> (f64, f64) {
@@ -783,6 +811,6 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
     }
 
     fn has_kinks(&self, _point: &Vec<f64>, k: usize) -> bool {
-        k >= self.equation.own.len()
+        k >= self.equation.autoregressive_terms.len()
     }
 }

@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 
 pub use prefilter::power_frequency;
 
-use self::order_grid::{grid_candidates, law_candidates, linspace, natural_axes, start_axes, GridSearch};
+use self::order_grid::{grid_candidates, law_candidates, linspace, start_axes, typical_order_axes, GridSearch};
 use self::prefilter::LowPassCache;
 use self::resonances::scan_candidates;
 use super::format::format_general;
@@ -61,27 +61,27 @@ impl<'a> OrderGrids<'a> {
     /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
     /// duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints. [`Error::Interrupted`]
     /// after a stop request. Also an error if the runs have no block-pulse records or if a grid search fails.
-    pub fn candidates(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
-        let frequencies = self.frequencies(free)?;
-        if free.structure.inputs.is_empty() {
-            return self.candidates_at_inputs(free, &frequencies, &[]);
+    pub fn candidates(&self, parameter_set: &ParameterSet) -> Result<Vec<Candidate>> {
+        let frequencies = self.frequencies(parameter_set)?;
+        if parameter_set.structure.inputs.is_empty() {
+            return self.candidates_at_inputs(parameter_set, &frequencies, &[]);
         }
-        let fastest = frequencies.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
-        let mut attempts = Vec::new();
-        for (point, words) in input_points(free, self.source, fastest)? {
-            for mut attempt in self.candidates_at_inputs(free, &frequencies, &point)? {
-                attempt.origin = format!("{}, {words}", attempt.origin);
-                attempt.result.iterate.point.inputs.clone_from(&point);
-                attempts.push(attempt);
+        let max_frequency = frequencies.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mut candidates = Vec::new();
+        for (point, description) in input_points(parameter_set, self.source, max_frequency)? {
+            for mut candidate in self.candidates_at_inputs(parameter_set, &frequencies, &point)? {
+                candidate.origin = format!("{}, {description}", candidate.origin);
+                candidate.result.iterate.point.inputs.clone_from(&point);
+                candidates.push(candidate);
             }
         }
-        Ok(attempts)
+        Ok(candidates)
     }
 
     /// Bandwidth \[rad/s\] of the output of each equation, indexed by equation and run.
-    fn frequencies(&self, free: &ParameterSet) -> Result<Vec<Vec<f64>>> {
+    fn frequencies(&self, parameter_set: &ParameterSet) -> Result<Vec<Vec<f64>>> {
         let intervals_and_durations = self.source.intervals_and_durations();
-        let of = |output: usize| {
+        let output_frequencies = |output: usize| {
             let samples = self.source.samples(output)?;
             check_length("runs", intervals_and_durations.len(), samples.len())?;
             Ok(samples
@@ -90,14 +90,14 @@ impl<'a> OrderGrids<'a> {
                 .map(|(run, (step, _))| power_frequency(run, *step))
                 .collect())
         };
-        free.structure.equations.iter().map(|e| of(e.output)).collect()
+        parameter_set.structure.equations.iter().map(|e| output_frequencies(e.output)).collect()
     }
 
     /// Number of block pulses per record, limited by the samples of the shortest run.
-    fn pulse_count(&self, free: &ParameterSet) -> Result<usize> {
-        let output = free.structure.equations.first().map_or(0, |e| e.output);
-        let shortest = self.source.samples(output)?.iter().map(|run| run.len()).min().unwrap_or(0);
-        Ok(MAX_START_PULSES.min(shortest.saturating_sub(1)))
+    fn pulse_count(&self, parameter_set: &ParameterSet) -> Result<usize> {
+        let output = parameter_set.structure.equations.first().map_or(0, |e| e.output);
+        let min_samples = self.source.samples(output)?.iter().map(|run| run.len()).min().unwrap_or(0);
+        Ok(MAX_START_PULSES.min(min_samples.saturating_sub(1)))
     }
 
     /// Return candidates from order grids on prefiltered records, at given values of the free input parameters.
@@ -106,71 +106,72 @@ impl<'a> OrderGrids<'a> {
     /// while noise above the bandwidth is removed.
     fn candidates_at_inputs(
         &self,
-        free: &ParameterSet,
+        parameter_set: &ParameterSet,
         frequencies: &[Vec<f64>],
         input_values: &[f64],
     ) -> Result<Vec<Candidate>> {
-        self.check_hold_orders(free)?;
+        self.check_hold_orders(parameter_set)?;
         let frequency = median(frequencies.concat());
-        let natural = natural_axes(free);
-        let grids: Vec<_> = std::iter::once(start_axes(free)).chain(natural.clone()).collect();
-        let unfiltered = self.source.records(self.pulse_count(free)?, input_values)?;
+        let typical_axes = typical_order_axes(parameter_set);
+        let grids: Vec<_> = std::iter::once(start_axes(parameter_set)).chain(typical_axes.clone()).collect();
+        let unfiltered = self.source.records(self.pulse_count(parameter_set)?, input_values)?;
         let unfiltered = self.prefilter(&unfiltered, None)?;
-        let fastest = PI / unfiltered.iter().map(Record::step).fold(f64::NEG_INFINITY, f64::max);
+        let max_frequency = PI / unfiltered.iter().map(Record::step).fold(f64::NEG_INFINITY, f64::max);
         let inputs: Vec<bool> = self.source.inputs().iter().map(Option::is_some).collect();
-        let coarse = GridSearch {
+        let unfiltered_search = GridSearch {
             records: &unfiltered,
             inputs: &inputs,
-            initial: &free.structure.initial,
+            initial: &parameter_set.structure.initial,
             threads: self.threads,
             memory: self.memory,
             stop: self.stop,
         };
-        let mut attempts = Vec::new();
-        let by_law = free.structure.has_order_law();
-        let ratios = if by_law { &PREFILTER_CUTOFF_RATIOS_BY_LAW[..] } else { &PREFILTER_CUTOFF_RATIOS[..] };
-        for multiple in ratios {
+        let mut candidates = Vec::new();
+        let has_order_law = parameter_set.structure.has_order_law();
+        let ratios = if has_order_law { &PREFILTER_CUTOFF_RATIOS_BY_LAW[..] } else { &PREFILTER_CUTOFF_RATIOS[..] };
+        for ratio in ratios {
             self.stop.check()?;
-            let corner = multiple.map(|multiple| multiple * frequency);
-            if corner.is_some_and(|corner| corner >= fastest) {
+            let cutoff = ratio.map(|ratio| ratio * frequency);
+            if cutoff.is_some_and(|cutoff| cutoff >= max_frequency) {
                 // The cutoff is above the Nyquist frequency of the pulses.
                 continue;
             }
-            let records = self.prefilter(&unfiltered, corner)?;
-            let coarse = coarse.with_records(&records);
-            let words = |corner| format!("prefilter {} rad/s", format_general(corner, 3));
-            let origin = corner.map_or_else(|| "no prefilter".into(), words);
+            let records = self.prefilter(&unfiltered, cutoff)?;
+            let search = unfiltered_search.with_records(&records);
+            let description = |cutoff| format!("prefilter {} rad/s", format_general(cutoff, 3));
+            let origin = cutoff.map_or_else(|| "no prefilter".into(), description);
             let mut candidates_of_inputs: Vec<Candidate> = Vec::new();
             for axes in &grids {
-                let more = grid_candidates(free, &coarse, axes, &origin, &candidates_of_inputs)?;
-                candidates_of_inputs.extend(more);
+                let grid_guesses = grid_candidates(parameter_set, &search, axes, &origin, &candidates_of_inputs)?;
+                candidates_of_inputs.extend(grid_guesses);
             }
-            if let Some(axes) = &natural {
-                candidates_of_inputs.extend(law_candidates(free, &coarse, axes, &origin)?);
+            if let Some(axes) = &typical_axes {
+                candidates_of_inputs.extend(law_candidates(parameter_set, &search, axes, &origin)?);
             }
-            attempts.extend(candidates_of_inputs);
+            candidates.extend(candidates_of_inputs);
         }
-        let scanned = scan_candidates(free, &coarse, frequencies, &attempts)?;
-        attempts.extend(scanned);
-        Ok(attempts)
+        let scan_guesses = scan_candidates(parameter_set, &unfiltered_search, frequencies, &candidates)?;
+        candidates.extend(scan_guesses);
+        Ok(candidates)
     }
 
-    fn prefilter(&self, records: &[Record], corner: Option<f64>) -> Result<Vec<Record>> {
-        records.iter().map(|record| self.low_passes.filter_record(record, corner)).collect()
+    fn prefilter(&self, records: &[Record], cutoff: Option<f64>) -> Result<Vec<Record>> {
+        records.iter().map(|record| self.low_passes.filter_record(record, cutoff)).collect()
     }
 
     /// Return [`Error::Structure`] if the order of a zero-order-hold input exceeds that of its equation.
     ///
     /// The jumps of such an input have no derivative.
-    fn check_hold_orders(&self, free: &ParameterSet) -> Result<()> {
-        let (inputs, signals) = (self.source.inputs(), &free.structure.signals);
-        for item in free.structure.equations.iter().filter(|e| !e.order.is_free()) {
-            let alpha = item.order.constant;
-            let is_held_input = |signal: usize| inputs.get(signal).copied().flatten() == Some(Intersample::Hold);
-            let above = item.terms.iter().filter(|t| !t.order.is_free() && t.order.constant > alpha + ORDER_TOLERANCE);
-            if let Some(term) = above.into_iter().find(|t| is_held_input(t.signal)) {
+    fn check_hold_orders(&self, parameter_set: &ParameterSet) -> Result<()> {
+        let (inputs, signals) = (self.source.inputs(), &parameter_set.structure.signals);
+        for equation in parameter_set.structure.equations.iter().filter(|e| !e.order.is_free()) {
+            let alpha = equation.order.constant;
+            let is_zero_order_hold = |signal: usize| inputs.get(signal).copied().flatten() == Some(Intersample::Hold);
+            let excessive_terms =
+                equation.terms.iter().filter(|t| !t.order.is_free() && t.order.constant > alpha + ORDER_TOLERANCE);
+            if let Some(term) = excessive_terms.into_iter().find(|t| is_zero_order_hold(t.signal)) {
                 let (order, signal) = (format_general(term.order.constant, 6), &signals[term.signal]);
-                let (alpha, output) = (format_general(alpha, 6), &signals[item.output]);
+                let (alpha, output) = (format_general(alpha, 6), &signals[equation.output]);
                 let what = format!(
                     "order {order} of {signal} is above alpha = {alpha} of {output}, and the runs have a zero-order \
                      hold for {signal}, whose jumps have no derivative"
@@ -184,18 +185,26 @@ impl<'a> OrderGrids<'a> {
 }
 
 impl InitialGuessSource for OrderGrids<'_> {
-    fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
-        self.candidates(free)
+    fn initial_guesses(&self, parameter_set: &ParameterSet) -> Result<Vec<Candidate>> {
+        self.candidates(parameter_set)
     }
 
     fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b> {
         Box::new(OrderGrids::new(source, self.threads, self.memory, self.stop))
     }
 
-    fn integer_order_optima(&self, free: &ParameterSet, grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
-        let fastest = self.frequencies(free)?.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
-        let delays = input_points(free, self.source, fastest)?.into_iter().map(|(point, _)| point).collect::<Vec<_>>();
-        integer_orders::integer_order_optima(free, grid, &delays)
+    fn integer_order_optima(
+        &self,
+        parameter_set: &ParameterSet,
+        objective: &Objective<'_>,
+    ) -> Result<Option<Vec<Candidate>>> {
+        let max_frequency =
+            self.frequencies(parameter_set)?.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
+        let delays = input_points(parameter_set, self.source, max_frequency)?
+            .into_iter()
+            .map(|(point, _)| point)
+            .collect::<Vec<_>>();
+        integer_orders::integer_order_optima(parameter_set, objective, &delays)
     }
 }
 
@@ -210,44 +219,56 @@ const MIN_LIMIT_RATIO: f64 = 0.1;
 
 /// Return initial guesses of the free delays and limits (saturations and dead zones), each with a description.
 ///
-/// `fastest` is the highest bandwidth \[rad/s\] of an output. From a poor guess of the delay, a fit converges to a
-/// local optimum that is shifted by one period of an oscillation. Initial guesses of a limit are below the largest
+/// `max_frequency` is the highest bandwidth \[rad/s\] of an output. From a poor guess of the delay, a fit converges to
+/// a local optimum that is shifted by one period of an oscillation. Initial guesses of a limit are below the largest
 /// input magnitude, because a limit above all samples has no effect.
-pub(super) fn input_points(free: &ParameterSet, source: &Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
-    let inputs = &free.structure.inputs;
-    let axes = inputs.iter().map(|item| input_axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;
+pub(super) fn input_points(
+    parameter_set: &ParameterSet,
+    source: &Recordings,
+    max_frequency: f64,
+) -> Result<Vec<(Vec<f64>, String)>> {
+    let inputs = &parameter_set.structure.inputs;
+    let axes = inputs
+        .iter()
+        .map(|input| input_axis(input, inputs.len(), source, max_frequency))
+        .collect::<Result<Vec<_>>>()?;
     let mut points = vec![Vec::new()];
     for axis in axes {
-        let along = |point: Vec<f64>| axis.iter().map(|v| [point.as_slice(), &[*v]].concat()).collect::<Vec<_>>();
-        points = points.into_iter().flat_map(along).collect();
+        let extend_point =
+            |point: Vec<f64>| axis.iter().map(|v| [point.as_slice(), &[*v]].concat()).collect::<Vec<_>>();
+        points = points.into_iter().flat_map(extend_point).collect();
     }
-    let words = |point: &[f64]| {
-        inputs.iter().zip(point).map(|(item, v)| describe_input(item, *v)).collect::<Vec<_>>().join(", ")
+    let description = |point: &[f64]| {
+        inputs.iter().zip(point).map(|(input, v)| describe_input(input, *v)).collect::<Vec<_>>().join(", ")
     };
-    Ok(points.into_iter().map(|point| (words(&point), point)).map(|(words, point)| (point, words)).collect())
+    Ok(points
+        .into_iter()
+        .map(|point| (description(&point), point))
+        .map(|(description, point)| (point, description))
+        .collect())
 }
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-fn input_axis(item: &Input, count: usize, source: &Recordings, fastest: f64) -> Result<Vec<f64>> {
-    let (low, high) = item.free.bounds;
-    let most = (libm::pow(MAX_DELAY_STARTS, 1.0 / count as f64) as usize).max(2);
-    if item.free.law == InputLaw::Delay {
-        let axis_count = ((high - low) * fastest / MAX_DELAY_PHASE_RAD).ceil() as usize;
-        return Ok(linspace(low, high, axis_count.saturating_add(1).max(2).min(most)));
+fn input_axis(input: &Input, count: usize, source: &Recordings, max_frequency: f64) -> Result<Vec<f64>> {
+    let (low, high) = input.parameter.bounds;
+    let max_values = (libm::pow(MAX_DELAY_STARTS, 1.0 / count as f64) as usize).max(2);
+    if input.parameter.law == InputLaw::Delay {
+        let axis_count = ((high - low) * max_frequency / MAX_DELAY_PHASE_RAD).ceil() as usize;
+        return Ok(linspace(low, high, axis_count.saturating_add(1).max(2).min(max_values)));
     }
     // `max` ignores NaN, so missing samples are skipped.
-    let samples = source.samples(item.free.signal)?;
+    let samples = source.samples(input.parameter.signal)?;
     let largest = samples.into_iter().flatten().fold(0.0, |largest: f64, v| largest.max(v.abs()));
-    let (least, reached) = (low.max(MIN_LIMIT_RATIO * largest), high.min(largest));
-    let mut values = linspace(least.min(reached), reached, MAX_LIMIT_STARTS.min(most) + 1);
+    let (min_limit, max_limit) = (low.max(MIN_LIMIT_RATIO * largest), high.min(largest));
+    let mut values = linspace(min_limit.min(max_limit), max_limit, MAX_LIMIT_STARTS.min(max_values) + 1);
     values.pop();
     Ok(values)
 }
 
 /// Describe the initial guess of a delay, saturation or dead zone as text.
-fn describe_input(item: &Input, value: f64) -> String {
-    match item.free.law {
+fn describe_input(input: &Input, value: f64) -> String {
+    match input.parameter.law {
         InputLaw::Delay => format!("delay {} ms", format_general(1e3 * value, 3)),
-        InputLaw::Saturation | InputLaw::DeadZone => format!("{} {}", item.name, format_general(value, 3)),
+        InputLaw::Saturation | InputLaw::DeadZone => format!("{} {}", input.name, format_general(value, 3)),
     }
 }

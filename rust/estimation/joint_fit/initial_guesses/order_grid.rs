@@ -83,8 +83,8 @@ impl GridSearch<'_> {
         // Groups of equations without common orders are searched separately; their best rows are combined.
         let table = |stage: &ParametricStructure| {
             let names = stage.order_names();
-            let own: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
-            self.best_rows(stage, &own, top)
+            let stage_axes: Axes = axes.iter().filter(|(name, _)| names.contains(name)).cloned().collect();
+            self.best_rows(stage, &stage_axes, top)
         };
         Ok(merge_tables(&stages.iter().map(table).collect::<Result<Vec<_>>>()?, structure))
     }
@@ -101,7 +101,7 @@ impl GridSearch<'_> {
     /// Return the best rows of coupled equations with an order law, at most `top`.
     #[allow(clippy::cast_precision_loss)]
     fn search_coupled(&self, structure: &ParametricStructure, axes: &Axes, top: usize) -> Result<Vec<GridRow>> {
-        let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
+        let (names, axis_values_of_orders): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
         let law = |e: &ParametricEquation| LawEquation {
             output: e.output,
             order: e.order.affine(&names),
@@ -110,15 +110,17 @@ impl GridSearch<'_> {
         let equations = &structure.equations;
         let laws: Vec<LawEquation> = equations.iter().map(law).collect();
         let fixed: Vec<Vec<Option<f64>>> = equations.iter().map(fixed_coefficients).collect();
-        let size = |e: &ParametricEquation| {
+        let output_sum = |e: &ParametricEquation| {
             self.records.iter().map(|r| standard_deviation(r.signal(e.output)) * r.m() as f64).sum()
         };
-        let scales: Vec<f64> = equations.iter().map(size).collect();
-        let grid = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
+        let scales: Vec<f64> = equations.iter().map(output_sum).collect();
+        let grid = OrderLawGrid::new(&axis_values_of_orders, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
         let result = stage_join::search(self.records, &grid, &fixed, &scales, &self.options(top), &self.control())?;
         let row = |result: stage_join::StageRow| {
             let pairs = equations.iter().zip(&result.rows);
-            let coefficients = pairs.flat_map(|(item, part)| named_coefficients(item, &part.coefficients)).collect();
+            let coefficients = pairs
+                .flat_map(|(equation, equation_row)| named_coefficients(equation, &equation_row.coefficients))
+                .collect();
             GridRow { orders: names.iter().cloned().zip(result.free).collect(), coefficients }
         };
         Ok(result.rows.into_iter().map(row).collect())
@@ -128,11 +130,11 @@ impl GridSearch<'_> {
     fn search_equation(
         &self,
         structure: &ParametricStructure,
-        item: &ParametricEquation,
+        equation: &ParametricEquation,
         axes: &Axes,
         top: usize,
     ) -> Result<Vec<GridRow>> {
-        check_linear(structure, item, "an order search")?;
+        check_linear(structure, equation, "an order search")?;
         let axis = |order: &Order| match order.names().next() {
             Some(name) => axis_values(axes, name).to_vec(),
             None => vec![order.constant],
@@ -142,19 +144,21 @@ impl GridSearch<'_> {
             values: axis(&t.order),
             interchangeable: t.order.is_free() && t.fixed_coefficient().is_none(),
         };
-        let terms: Vec<TermAxis> = item.terms.iter().map(term).collect();
+        let terms: Vec<TermAxis> = equation.terms.iter().map(term).collect();
         let is_input = |signal: usize| self.inputs.get(signal).copied().unwrap_or(false);
-        let named = |error| name_signals(error, &structure.signals);
-        let grid = OrderGrid::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
+        let with_signal_names = |error| name_signals(error, &structure.signals);
+        let grid =
+            OrderGrid::new(equation.output, &axis(&equation.order), &terms, is_input).map_err(with_signal_names)?;
         let (options, control) = (self.options(top), self.control());
-        let result =
-            batches::search(self.records, &grid, &fixed_coefficients(item), &options, &control).map_err(named)?;
+        let result = batches::search(self.records, &grid, &fixed_coefficients(equation), &options, &control)
+            .map_err(with_signal_names)?;
         let row = |result: crate::order_search::result::Row| {
-            let at = grid.structure(result.index);
-            let term_orders = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
-            let pairs = item.orders().zip(term_orders);
+            let structure_of_row = grid.structure(result.index);
+            let term_orders =
+                std::iter::once(structure_of_row.order).chain(structure_of_row.terms.iter().map(|term| term.order));
+            let pairs = equation.orders().zip(term_orders);
             let orders = pairs.filter_map(|(order, value)| Some((order.names().next()?.clone(), value))).collect();
-            GridRow { orders, coefficients: named_coefficients(item, &result.coefficients).collect() }
+            GridRow { orders, coefficients: named_coefficients(equation, &result.coefficients).collect() }
         };
         Ok(result.rows.into_iter().map(row).collect())
     }
@@ -165,35 +169,35 @@ impl GridSearch<'_> {
 /// Merged rows that lack a coefficient are omitted.
 pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStructure) -> Vec<GridRow> {
     let count = structure.coefficient_names().len();
-    let merged = |rank: usize| {
-        let mut merged = GridRow::default();
-        tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|row| merged.merge(row));
-        merged
+    let merge_rank = |rank: usize| {
+        let mut row = GridRow::default();
+        tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|table_row| row.merge(table_row));
+        row
     };
     let ranks = tables.iter().map(Vec::len).max().unwrap_or(0);
-    (0..ranks).map(merged).filter(|row| row.coefficients.len() == count).collect()
+    (0..ranks).map(merge_rank).filter(|row| row.coefficients.len() == count).collect()
 }
 
 /// Return the free coefficients by name, from the products of factor and coefficient of all terms.
 pub(super) fn named_coefficients<'a>(
-    item: &'a ParametricEquation,
-    raw: &'a [f64],
+    equation: &'a ParametricEquation,
+    products: &'a [f64],
 ) -> impl Iterator<Item = (String, f64)> + 'a {
-    let pairs = item.terms.iter().zip(raw);
+    let pairs = equation.terms.iter().zip(products);
     pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
 }
 
 /// Return the product of factor and coefficient of each term; None if the coefficient is free.
-pub(super) fn fixed_coefficients(item: &ParametricEquation) -> Vec<Option<f64>> {
-    item.terms.iter().map(ParametricTerm::fixed_coefficient).collect()
+pub(super) fn fixed_coefficients(equation: &ParametricEquation) -> Vec<Option<f64>> {
+    equation.terms.iter().map(ParametricTerm::fixed_coefficient).collect()
 }
 
 /// Return [`Error::Structure`] if an equation has friction, which the method `what` does not support.
-pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEquation, what: &str) -> Result<()> {
-    if item.friction.is_none() {
+pub(super) fn check_linear(structure: &ParametricStructure, equation: &ParametricEquation, what: &str) -> Result<()> {
+    if equation.friction.is_none() {
         return Ok(());
     }
-    let output = &structure.signals[item.output];
+    let output = &structure.signals[equation.output];
     Err(Error::Structure {
         what: format!("the equation of {output} has friction, which {what} does not support"),
         remedy: "rank by the output error, or remove the friction".into(),
@@ -202,7 +206,7 @@ pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEqu
 
 /// Replace signal numbers by signal names in an error message.
 fn name_signals(error: Error, signals: &[String]) -> Error {
-    let named = |mut text: String| {
+    let with_signal_names = |mut text: String| {
         // In descending order, because the text of a number may be a prefix of a larger number.
         for (i, signal) in signals.iter().enumerate().rev() {
             text = text.replace(&format!("signal {i}"), &format!("signal '{signal}'"));
@@ -210,8 +214,8 @@ fn name_signals(error: Error, signals: &[String]) -> Error {
         text
     };
     match error {
-        Error::EmptyOrderGrid { why } => Error::EmptyOrderGrid { why: named(why) },
-        Error::Structure { what, remedy } => Error::Structure { what: named(what), remedy },
+        Error::EmptyOrderGrid { reason } => Error::EmptyOrderGrid { reason: with_signal_names(reason) },
+        Error::Structure { what, remedy } => Error::Structure { what: with_signal_names(what), remedy },
         other => other,
     }
 }
@@ -251,37 +255,42 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
 ///
 /// Without an order law, the only guess is the best row. Under an order law the equation error has several minima, so
 /// several rows are returned. Each row differs from every better one by [`MIN_ORDER_SEPARATION`] in at least one order.
-/// A row with the orders of a guess in `before` is omitted, but counts toward the maximum number.
+/// A row with the orders of a guess in `previous_guesses` is omitted, but counts toward the maximum number.
 pub(super) fn grid_candidates(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     coarse: &GridSearch<'_>,
     axes: &Axes,
     origin: &str,
-    before: &[Candidate],
+    previous_guesses: &[Candidate],
 ) -> Result<Vec<Candidate>> {
-    let (count, rows) =
-        if free.structure.has_order_law() { (MAX_GUESSES_UNDER_ORDER_LAW, ROWS_UNDER_ORDER_LAW) } else { (1, 1) };
+    let (max_guesses, row_count) = if parameter_set.structure.has_order_law() {
+        (MAX_GUESSES_UNDER_ORDER_LAW, ROWS_UNDER_ORDER_LAW)
+    } else {
+        (1, 1)
+    };
     let mut candidates: Vec<Candidate> = Vec::new();
     let mut selected: Vec<Vec<f64>> = Vec::new();
-    for row in coarse.best_rows(&free.structure, axes, rows)? {
-        let values = row.values(&free.orders);
-        let is_apart = |other: &Vec<f64>| values.iter().zip(other).any(|(a, b)| (a - b).abs() >= MIN_ORDER_SEPARATION);
-        if !selected.iter().all(is_apart) {
+    for row in coarse.best_rows(&parameter_set.structure, axes, row_count)? {
+        let values = row.values(&parameter_set.orders);
+        let differs = |guess_values: &Vec<f64>| {
+            values.iter().zip(guess_values).any(|(a, b)| (a - b).abs() >= MIN_ORDER_SEPARATION)
+        };
+        if !selected.iter().all(differs) {
             continue;
         }
-        if !before.iter().any(|other| are_orders_close(&values, &other.result.iterate.point.orders)) {
-            candidates.push(new_candidate(values.clone(), free.free_from(&row.coefficients), origin));
+        if !previous_guesses.iter().any(|guess| are_orders_close(&values, &guess.result.iterate.point.orders)) {
+            candidates.push(new_candidate(values.clone(), parameter_set.free_coefficients(&row.coefficients), origin));
         }
         selected.push(values);
-        if selected.len() == count {
+        if selected.len() == max_guesses {
             break;
         }
     }
     Ok(candidates)
 }
 
-fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
-    values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
+fn are_orders_close(first: &[f64], second: &[f64]) -> bool {
+    first.iter().zip(second).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
 }
 
 /// Return candidates in which coefficients of one equation follow from those of another equation by a coefficient law.
@@ -291,52 +300,53 @@ fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
 /// the link equation explains the rest of the acceleration equally well. An unconstrained estimate of the hub equation
 /// then converges to the link equation with the sign of the stiffness reversed.
 pub(super) fn law_candidates(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     coarse: &GridSearch<'_>,
     axes: &Axes,
     origin: &str,
 ) -> Result<Vec<Candidate>> {
-    let (structure, signs) = (&free.structure, &free.structure.hints.positive);
-    let sign_laws: Vec<(&Law, &String, usize)> = (free.products.iter())
+    let (structure, signs) = (&parameter_set.structure, &parameter_set.structure.hints.positive);
+    let sign_laws: Vec<(&Law, &String, usize)> = (parameter_set.products.iter())
         .filter_map(|law| law.factors.split_first().map(|(first, others)| (law, first, others.len())))
         .filter(|(_, first, _)| signs.contains(*first))
         .collect();
     if sign_laws.is_empty() {
         return Ok(Vec::new());
     }
-    let named = structure.coefficient_names();
-    let mut attempts = Vec::new();
+    let with_signal_names = structure.coefficient_names();
+    let mut candidates = Vec::new();
     for row in coarse.best_rows(structure, axes, ROWS_BY_LAW)? {
         let point: Axes = row.orders.iter().map(|(name, value)| (name.clone(), vec![*value])).collect();
         for ratio in LAW_RATIOS {
             let value = |(law, first, others): &(&Law, &String, usize)| {
-                let size = row.coefficients.get(&law.name).copied().unwrap_or(f64::NAN).abs();
-                ((*first).clone(), (0..*others).fold(size, |size, _| size / ratio))
+                let magnitude = row.coefficients.get(&law.name).copied().unwrap_or(f64::NAN).abs();
+                ((*first).clone(), (0..*others).fold(magnitude, |magnitude, _| magnitude / ratio))
             };
             let values_by_name: BTreeMap<String, f64> = sign_laws.iter().map(value).collect();
             if !values_by_name.values().all(|v| v.is_finite() && *v != 0.0) {
                 continue;
             }
-            if let Some(missing_name) = values_by_name.keys().find(|name| !named.contains(name)) {
+            if let Some(missing_name) = values_by_name.keys().find(|name| !with_signal_names.contains(name)) {
                 let what = format!("coefficient {missing_name} is not a free coefficient");
                 return Err(Error::Structure {
                     what,
                     remedy: "use the name of a free coefficient of the equations".into(),
                 });
             }
-            for rest in coarse.best_rows(&structure.with_coefficients(&values_by_name), &point, 1)? {
-                let value_of =
-                    |name: &String| values_by_name.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
-                let coefficients = free.coefficients.iter().map(value_of).collect();
-                let words = format!(
+            for other_row in coarse.best_rows(&structure.with_coefficients(&values_by_name), &point, 1)? {
+                let value_of = |name: &String| {
+                    values_by_name.get(name).or(other_row.coefficients.get(name)).copied().unwrap_or(ratio)
+                };
+                let coefficients = parameter_set.coefficients.iter().map(value_of).collect();
+                let guess_origin = format!(
                     "{origin}, by the coefficient law with its free parameters at {}",
                     format_general(ratio, 6)
                 );
-                attempts.push(new_candidate(row.values(&free.orders), coefficients, &words));
+                candidates.push(new_candidate(row.values(&parameter_set.orders), coefficients, &guess_origin));
             }
         }
     }
-    Ok(attempts)
+    Ok(candidates)
 }
 
 /// Increment of the orders in the grid of initial guesses. A fit that starts within half an increment converges.
@@ -356,28 +366,28 @@ pub(super) type Axes = Vec<(String, Vec<f64>)>;
 
 /// Return the coarse grid of the free orders within their bounds.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn start_axes(free: &ParameterSet) -> Axes {
-    let equations = &free.structure.equations;
+pub(super) fn start_axes(parameter_set: &ParameterSet) -> Axes {
+    let equations = &parameter_set.structure.equations;
     let with_single_order = equations.iter().filter(|e| e.order.is_single());
     let highest: BTreeSet<&String> = with_single_order.flat_map(|e| e.order.names()).collect();
-    let usual = free.structure.hints.highest.unwrap_or((MIN_TYPICAL_ORDER, SEARCHED_ORDER));
+    let typical_range = parameter_set.structure.hints.highest.unwrap_or((MIN_TYPICAL_ORDER, SEARCHED_ORDER));
     let axis = |(name, &bounds): (&String, &(f64, f64))| {
-        let above = highest.contains(name);
-        let (low, mut high) = if above && bounds == ALPHA_BOUNDS { usual } else { bounds };
-        if !above {
+        let is_highest = highest.contains(name);
+        let (low, mut high) = if is_highest && bounds == ALPHA_BOUNDS { typical_range } else { bounds };
+        if !is_highest {
             high = high.min(MAX_LOWER_TERM_ORDER);
         }
         if high <= low {
             return (name.clone(), vec![low]);
         }
         let count = ((high - low) / START_INCREMENT).round_ties_even() as usize;
-        let rounded = |v: &f64| (v * ROUNDING_STEPS_PER_ORDER).round_ties_even() / ROUNDING_STEPS_PER_ORDER;
-        let values = linspace(low, high, count + 1).iter().map(rounded).collect();
+        let round_value = |v: &f64| (v * ROUNDING_STEPS_PER_ORDER).round_ties_even() / ROUNDING_STEPS_PER_ORDER;
+        let values = linspace(low, high, count + 1).iter().map(round_value).collect();
         (name.clone(), values)
     };
-    let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
+    let mut axes: Axes = parameter_set.orders.iter().zip(parameter_set.bounds()).map(axis).collect();
     // The orders of input terms affect the location of the optimum less than the autoregressive orders.
-    let driving: BTreeSet<&String> = equations
+    let input_orders: BTreeSet<&String> = equations
         .iter()
         .flat_map(|e| e.input_terms().flat_map(|term| term.order.names()))
         .filter(|name| !highest.contains(name))
@@ -386,25 +396,25 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
         if equations.iter().all(|e| candidate_count(e, &axes) <= MAX_START_CANDIDATES) {
             break;
         }
-        for (_, values) in axes.iter_mut().filter(|(name, _)| driving.contains(name)) {
+        for (_, values) in axes.iter_mut().filter(|(name, _)| input_orders.contains(name)) {
             let (low, high) = (values[0], values[values.len() - 1]);
-            let inside: Vec<f64> = exponent_values.iter().copied().filter(|v| low <= *v && *v <= high).collect();
-            *values = if inside.is_empty() { vec![low] } else { inside };
+            let valid_values: Vec<f64> = exponent_values.iter().copied().filter(|v| low <= *v && *v <= high).collect();
+            *values = if valid_values.is_empty() { vec![low] } else { valid_values };
         }
     }
     axes
 }
 
 /// Return a small grid of the typical orders of a structure; None if an order has no typical value.
-pub(super) fn natural_axes(free: &ParameterSet) -> Option<Axes> {
-    let natural = &free.structure.hints.natural;
+pub(super) fn typical_order_axes(parameter_set: &ParameterSet) -> Option<Axes> {
+    let typical_orders = &parameter_set.structure.hints.typical_orders;
     let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
         let values: Vec<f64> =
-            natural.get(name).into_iter().flatten().copied().filter(|v| low <= *v && *v <= high).collect();
+            typical_orders.get(name).into_iter().flatten().copied().filter(|v| low <= *v && *v <= high).collect();
         (!values.is_empty()).then(|| (name.clone(), values))
     };
-    let axes = free.orders.iter().zip(free.bounds()).map(axis).collect::<Option<Axes>>()?;
-    (!natural.is_empty()).then_some(axes)
+    let axes = parameter_set.orders.iter().zip(parameter_set.bounds()).map(axis).collect::<Option<Axes>>()?;
+    (!typical_orders.is_empty()).then_some(axes)
 }
 
 /// Return `count` evenly spaced values including both exact ends.
@@ -432,27 +442,27 @@ fn candidate_count(equation: &ParametricEquation, axes: &Axes) -> u128 {
 /// Equations with a common order law form one group. Equations without free orders are omitted.
 pub(super) fn independent_groups(structure: &ParametricStructure) -> Vec<ParametricStructure> {
     let mut groups: Vec<(BTreeSet<&String>, Vec<&ParametricEquation>)> = Vec::new();
-    for item in &structure.equations {
-        let own: BTreeSet<&String> = item.orders().flat_map(Order::names).collect();
-        let (mut names, mut together, mut apart) = (own.clone(), vec![item], Vec::new());
-        for (others, equations) in groups {
-            if own.is_disjoint(&others) {
-                apart.push((others, equations));
+    for equation in &structure.equations {
+        let own_names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
+        let (mut names, mut group, mut separate_groups) = (own_names.clone(), vec![equation], Vec::new());
+        for (group_names, equations) in groups {
+            if own_names.is_disjoint(&group_names) {
+                separate_groups.push((group_names, equations));
             } else {
-                names.extend(others);
-                together = [equations, together].concat();
+                names.extend(group_names);
+                group = [equations, group].concat();
             }
         }
-        apart.push((names, together));
-        groups = apart;
+        separate_groups.push((names, group));
+        groups = separate_groups;
     }
-    let ordered = groups.into_iter().filter(|(names, _)| !names.is_empty());
-    let part = |(_, equations): (_, Vec<&ParametricEquation>)| ParametricStructure {
+    let groups_with_orders = groups.into_iter().filter(|(names, _)| !names.is_empty());
+    let group_structure = |(_, equations): (_, Vec<&ParametricEquation>)| ParametricStructure {
         equations: equations.into_iter().cloned().collect(),
         laws: Vec::new(),
         ..structure.clone()
     };
-    ordered.map(part).collect()
+    groups_with_orders.map(group_structure).collect()
 }
 
 #[cfg(test)]

@@ -23,10 +23,10 @@ pub(super) struct LowPassCache(Mutex<Vec<(LowPassKey, Arc<Vec<f64>>)>>);
 impl LowPassCache {
     /// Return a record whose signals and initial terms have passed a low-pass filter.
     ///
-    /// The cutoff frequency is `corner` \[rad/s\]. Without one, the result is a copy of the record.
-    pub(super) fn filter_record(&self, record: &Record, corner: Option<f64>) -> Result<Record> {
+    /// The cutoff frequency is `cutoff` \[rad/s\]. Without one, the result is a copy of the record.
+    pub(super) fn filter_record(&self, record: &Record, cutoff: Option<f64>) -> Result<Record> {
         let m = record.m();
-        let low_pass = corner.map(|corner| self.low_pass_series(corner, m, record.step())).transpose()?;
+        let low_pass = cutoff.map(|cutoff| self.low_pass_series(cutoff, m, record.step())).transpose()?;
         let signals = (0..record.len()).map(|i| record.signal(i));
         let Some(low_pass) = low_pass else {
             // Without a cutoff frequency the record is copied.
@@ -47,8 +47,8 @@ impl LowPassCache {
         let key = (omega.to_bits(), m, step.to_bits());
         {
             let mut cache = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(at) = cache.iter().position(|(k, _)| *k == key) {
-                let entry = cache.remove(at);
+            if let Some(index) = cache.iter().position(|(k, _)| *k == key) {
+                let entry = cache.remove(index);
                 let series = entry.1.clone();
                 cache.push(entry);
                 return Ok(series);
@@ -94,24 +94,24 @@ pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f
         return f64::NAN;
     }
     let samples = interpolate_gaps(samples);
-    let centre = mean(&samples);
+    let center = mean(&samples);
     let (last, plan) = (count as f64 - 1.0, plan(count));
     let window = |k: usize| match count {
         1 => 1.0,
         _ => 0.5 + 0.5 * libm::cos(PI * (2.0 * k as f64 - last) / last),
     };
-    let mut time: Vec<f64> = samples.iter().enumerate().map(|(k, v)| (v - centre) * window(k)).collect();
+    let mut time: Vec<f64> = samples.iter().enumerate().map(|(k, v)| (v - center) * window(k)).collect();
     let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
     plan.transform(&mut time, &mut spectrum, &mut Workspace::new());
     let power: Vec<f64> = spectrum.iter().map(Bin::norm_sqr).collect();
-    let (whole, mut below) = (sum(&power), 0.0);
+    let (total_power, mut power_below) = (sum(&power), 0.0);
     // A constant signal has no power; its bandwidth is the lowest frequency of the run.
-    let reached = |power: &f64| {
-        below += power;
-        below / whole >= share || (below / whole).is_nan()
+    let reaches_share = |power: &f64| {
+        power_below += power;
+        power_below / total_power >= share || (power_below / total_power).is_nan()
     };
-    let at = power.iter().position(reached).unwrap_or(power.len());
-    2.0 * PI * at.max(1) as f64 / (count as f64 * step)
+    let bin = power.iter().position(reaches_share).unwrap_or(power.len());
+    2.0 * PI * bin.max(1) as f64 / (count as f64 * step)
 }
 
 /// Return the samples with missing ones (NaN) interpolated linearly, and with the nearest value at the ends.

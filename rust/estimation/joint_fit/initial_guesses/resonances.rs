@@ -45,48 +45,49 @@ const EXPONENT_TOLERANCE: f64 = 1e-9;
 /// Return candidates from a scan over frequency and damping, at integer orders and at the best orders of the order
 /// grid.
 ///
-/// `frequencies` are the bandwidths \[rad/s\] of the output of each equation, by run. The first of `attempts` has the
+/// `frequencies` are the bandwidths \[rad/s\] of the output of each equation, by run. The first of `candidates` has the
 /// best orders of the order grid. The result is empty for a structure with an order law or a coefficient law.
 pub(super) fn scan_candidates(
-    free: &ParameterSet,
-    coarse: &GridSearch<'_>,
+    parameter_set: &ParameterSet,
+    search: &GridSearch<'_>,
     frequencies: &[Vec<f64>],
-    attempts: &[Candidate],
+    candidates: &[Candidate],
 ) -> Result<Vec<Candidate>> {
-    let structure = &free.structure;
-    if structure.has_order_law() || !free.products.is_empty() {
+    let structure = &parameter_set.structure;
+    if structure.has_order_law() || !parameter_set.products.is_empty() {
         return Ok(Vec::new());
     }
-    let best = attempts.iter().take(usize::from(!free.orders.is_empty()));
-    let points = std::iter::once(free.integer_orders()).chain(best.map(|a| a.result.iterate.point.orders.clone()));
+    let grid_best = candidates.iter().take(usize::from(!parameter_set.orders.is_empty()));
+    let points =
+        std::iter::once(parameter_set.integer_orders()).chain(grid_best.map(|a| a.result.iterate.point.orders.clone()));
     let mut out = Vec::new();
     for values in points {
-        let point: BTreeMap<String, f64> = free.orders.iter().cloned().zip(values.iter().copied()).collect();
+        let point: BTreeMap<String, f64> = parameter_set.orders.iter().cloned().zip(values.iter().copied()).collect();
         // Integer orders that coincide after they are limited to their bounds give no valid equation.
-        let Ok(fixed) = structure.with_orders(&point) else { continue };
-        if has_duplicate_offset(&fixed) {
+        let Ok(fixed_structure) = structure.with_orders(&point) else { continue };
+        if has_duplicate_offset(&fixed_structure) {
             continue;
         }
-        let scan =
-            |(item, of): (&ParametricEquation, &Vec<f64>)| scan_equation(&fixed, item, coarse, median(of.clone()));
-        let scans = fixed.equations.iter().zip(frequencies).map(scan).collect::<Result<Vec<_>>>()?;
+        let scan = |(equation, run_frequencies): (&ParametricEquation, &Vec<f64>)| {
+            scan_equation(&fixed_structure, equation, search, median(run_frequencies.clone()))
+        };
+        let scans = fixed_structure.equations.iter().zip(frequencies).map(scan).collect::<Result<Vec<_>>>()?;
         let rows = merge_tables(&scans, structure);
-        out.extend(
-            rows.iter()
-                .map(|row| new_candidate(values.clone(), free.free_from(&row.coefficients), "scan of resonances")),
-        );
+        out.extend(rows.iter().map(|row| {
+            new_candidate(values.clone(), parameter_set.free_coefficients(&row.coefficients), "scan of resonances")
+        }));
     }
     Ok(out)
 }
 
 /// Return true if an offset coincides with an initial term, so that the two are not separately identifiable.
-fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
-    let exponents = match fixed.initial.base() {
-        Initial::Powers(powers) if !fixed.history => powers,
+fn has_duplicate_offset(fixed_structure: &ParametricStructure) -> bool {
+    let exponents = match fixed_structure.initial.base() {
+        Initial::Powers(powers) if !fixed_structure.history => powers,
         _ => return false,
     };
-    let offsets = |e: &ParametricEquation| fixed.initial.offset_exponents(e.order.constant);
-    fixed
+    let offsets = |e: &ParametricEquation| fixed_structure.initial.offset_exponents(e.order.constant);
+    fixed_structure
         .equations
         .iter()
         .flat_map(offsets)
@@ -98,15 +99,15 @@ fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
 /// The equation is D^α y = −2 ζ ω^(α − ν) D^ν y − ω^α y with damping ratio ζ. Several terms D^ν y share the damping
 /// equally. Return None if a coefficient is fixed or there is no autoregressive term.
 #[allow(clippy::cast_precision_loss)]
-fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
-    let mut own: Vec<(usize, &ParametricTerm)> = item.autoregressive_terms().enumerate().collect();
-    own.sort_by(|(_, a), (_, b)| a.order.constant.total_cmp(&b.order.constant));
-    let mut out = vec![(String::new(), 0.0); own.len()];
-    let others = own.len().saturating_sub(1) as f64;
-    for (rank, (place, term)) in own.into_iter().enumerate() {
-        let share = if rank == 0 { 1.0 } else { 2.0 * damping / others };
-        let size = -share * libm::pow(omega, item.order.constant - term.order.constant);
-        out[place] = (term.coefficient.name()?.clone(), size / term.factor);
+fn resonance_coefficients(equation: &ParametricEquation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
+    let mut autoregressive_terms: Vec<(usize, &ParametricTerm)> = equation.autoregressive_terms().enumerate().collect();
+    autoregressive_terms.sort_by(|(_, a), (_, b)| a.order.constant.total_cmp(&b.order.constant));
+    let mut out = vec![(String::new(), 0.0); autoregressive_terms.len()];
+    let other_count = autoregressive_terms.len().saturating_sub(1) as f64;
+    for (rank, (index, term)) in autoregressive_terms.into_iter().enumerate() {
+        let ratio = if rank == 0 { 1.0 } else { 2.0 * damping / other_count };
+        let product = -ratio * libm::pow(omega, equation.order.constant - term.order.constant);
+        out[index] = (term.coefficient.name()?.clone(), product / term.factor);
     }
     Some(out).filter(|out| !out.is_empty())
 }
@@ -117,49 +118,58 @@ fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -
 /// `frequency` \[rad/s\].
 fn scan_equation(
     structure: &ParametricStructure,
-    item: &ParametricEquation,
-    coarse: &GridSearch<'_>,
+    equation: &ParametricEquation,
+    search: &GridSearch<'_>,
     frequency: f64,
 ) -> Result<Vec<GridRow>> {
-    let others: Vec<ParametricTerm> = item.input_terms().cloned().collect();
-    let own: Vec<&ParametricTerm> = item.autoregressive_terms().collect();
-    if others.is_empty() || own.is_empty() {
+    let input_terms: Vec<ParametricTerm> = equation.input_terms().cloned().collect();
+    let autoregressive_terms: Vec<&ParametricTerm> = equation.autoregressive_terms().collect();
+    if input_terms.is_empty() || autoregressive_terms.is_empty() {
         return Ok(Vec::new());
     }
-    let grid = FREQUENCY_RATIOS
+    let points_of_scan = FREQUENCY_RATIOS
         .iter()
-        .flat_map(|share| DAMPING_RATIOS.iter().map(move |damping| (share * frequency, *damping)));
+        .flat_map(|ratio| DAMPING_RATIOS.iter().map(move |damping| (ratio * frequency, *damping)));
     let candidates: Option<Vec<_>> =
-        grid.map(|(omega, damping)| resonance_coefficients(item, omega, damping)).collect();
+        points_of_scan.map(|(omega, damping)| resonance_coefficients(equation, omega, damping)).collect();
     let Some(candidates) = candidates else { return Ok(Vec::new()) };
-    check_linear(structure, item, "a scan of resonances by least squares")?;
-    coarse.stop.check()?;
+    check_linear(structure, equation, "a scan of resonances by least squares")?;
+    search.stop.check()?;
     // The Caputo exponents must be those of the full equation, including the autoregressive terms.
-    let rest = ParametricEquation { terms: others, ..item.clone() };
-    let bare = Bare {
-        output: rest.output,
-        order: rest.order.constant,
-        terms: rest.terms.iter().map(|t| BareTerm { signal: t.signal, order: t.order.constant }).collect(),
+    let input_equation = ParametricEquation { terms: input_terms, ..equation.clone() };
+    let input_structure = Bare {
+        output: input_equation.output,
+        order: input_equation.order.constant,
+        terms: input_equation.terms.iter().map(|t| BareTerm { signal: t.signal, order: t.order.constant }).collect(),
     };
-    bare.check(structure.signals.len(), |s| coarse.inputs.get(s).copied().unwrap_or(false))?;
-    let etas: Vec<f64> = own.iter().map(|t| item.order.constant - t.order.constant).collect();
-    let point = |values: &Vec<(String, f64)>| values.iter().zip(&own).map(|((_, v), t)| v * t.factor).collect();
+    input_structure.check(structure.signals.len(), |s| search.inputs.get(s).copied().unwrap_or(false))?;
+    let etas: Vec<f64> = autoregressive_terms.iter().map(|t| equation.order.constant - t.order.constant).collect();
+    let point = |values: &Vec<(String, f64)>| {
+        values.iter().zip(&autoregressive_terms).map(|((_, v), t)| v * t.factor).collect()
+    };
     let points: Vec<Vec<f64>> = candidates.iter().map(point).collect();
-    let evaluations =
-        fit_with_fixed_poles(coarse.records, &bare, &fixed_coefficients(&rest), coarse.initial, &etas, &points)?;
-    let mut best: Vec<(f64, GridRow)> = Vec::new();
+    let evaluations = fit_with_fixed_poles(
+        search.records,
+        &input_structure,
+        &fixed_coefficients(&input_equation),
+        search.initial,
+        &etas,
+        &points,
+    )?;
+    let mut best_rows: Vec<(f64, GridRow)> = Vec::new();
     for (evaluations, candidates) in
         evaluations.chunks(DAMPING_RATIOS.len()).zip(candidates.chunks(DAMPING_RATIOS.len()))
     {
         // A point without a result is too fast for the step, or has collinear regressors.
         let finite_evaluations =
-            evaluations.iter().zip(candidates).filter_map(|(at, values)| Some((at.as_ref()?, values)));
-        let finite_evaluations = finite_evaluations.filter(|(at, _)| at.error.is_finite());
-        if let Some((at, values)) = finite_evaluations.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
-            let coefficients = values.iter().cloned().chain(named_coefficients(&rest, &at.coefficients)).collect();
-            best.push((at.error, GridRow { orders: Vec::new(), coefficients }));
+            evaluations.iter().zip(candidates).filter_map(|(evaluation, values)| Some((evaluation.as_ref()?, values)));
+        let finite_evaluations = finite_evaluations.filter(|(evaluation, _)| evaluation.error.is_finite());
+        if let Some((evaluation, values)) = finite_evaluations.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
+            let coefficients =
+                values.iter().cloned().chain(named_coefficients(&input_equation, &evaluation.coefficients)).collect();
+            best_rows.push((evaluation.error, GridRow { orders: Vec::new(), coefficients }));
         }
     }
-    best.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-    Ok(best.into_iter().take(MAX_SCAN_CANDIDATES).map(|(_, row)| row).collect())
+    best_rows.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    Ok(best_rows.into_iter().take(MAX_SCAN_CANDIDATES).map(|(_, row)| row).collect())
 }

@@ -26,27 +26,27 @@ const MIN_DEVIATION_RATIO: f64 = 0.7;
 /// # Errors
 /// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampling> {
+pub fn coarse_sampling(parameter_set: &ParameterSet, source: &Recordings) -> Result<Sampling> {
     let intervals_and_durations = source.intervals_and_durations();
-    let each = (MAX_COARSE_SAMPLES / intervals_and_durations.len().max(1)).max(MIN_RUN_SAMPLES);
-    let outputs = output_samples(free, source)?;
-    let shortest = outputs.iter().flatten().map(|samples| samples.len().saturating_sub(1)).min().unwrap_or(0);
-    let decimation = ((shortest as f64 / each as f64).round_ties_even() as usize).max(1);
-    let all = Sampling { decimation, ..Sampling::default() };
+    let samples_per_run = (MAX_COARSE_SAMPLES / intervals_and_durations.len().max(1)).max(MIN_RUN_SAMPLES);
+    let outputs = output_samples(parameter_set, source)?;
+    let min_intervals = outputs.iter().flatten().map(|samples| samples.len().saturating_sub(1)).min().unwrap_or(0);
+    let decimation = ((min_intervals as f64 / samples_per_run as f64).round_ties_even() as usize).max(1);
+    let full_sampling = Sampling { decimation, ..Sampling::default() };
     if decimation <= MAX_UNCHECKED_DECIMATION {
-        return Ok(all);
+        return Ok(full_sampling);
     }
-    let turns = |runs: &Vec<&[f64]>| {
+    let fastest_phase_step = |runs: &Vec<&[f64]>| {
         let pairs = runs.iter().zip(&intervals_and_durations);
         pairs.map(|(samples, &(step, _))| power_frequency(samples, step) * step).fold(f64::NEG_INFINITY, f64::max)
     };
-    let fastest = outputs.iter().map(turns).fold(f64::NEG_INFINITY, f64::max);
-    let carried = ((std::f64::consts::PI / (MIN_SAMPLES_PER_HALF_PERIOD * fastest)) as usize).max(1);
-    let first = each * carried;
-    if carried >= decimation || !varies_like_whole(&outputs, first) {
-        return Ok(all);
+    let max_phase_step = outputs.iter().map(fastest_phase_step).fold(f64::NEG_INFINITY, f64::max);
+    let max_decimation = ((std::f64::consts::PI / (MIN_SAMPLES_PER_HALF_PERIOD * max_phase_step)) as usize).max(1);
+    let leading_intervals = samples_per_run * max_decimation;
+    if max_decimation >= decimation || !varies_like_whole(&outputs, leading_intervals) {
+        return Ok(full_sampling);
     }
-    Ok(Sampling { decimation: carried, leading_intervals: Some(first), ..all })
+    Ok(Sampling { decimation: max_decimation, leading_intervals: Some(leading_intervals), ..full_sampling })
 }
 
 /// Return the number of leading sampling intervals of each run that represent a long record.
@@ -56,22 +56,24 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
 ///
 /// # Errors
 /// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
-pub fn leading_part(free: &ParameterSet, source: &Recordings, count: usize) -> Result<Option<usize>> {
-    let (outputs, each) =
-        (output_samples(free, source)?, (count / source.intervals_and_durations().len().max(1)).max(MIN_RUN_SAMPLES));
-    let is_long = outputs.iter().flatten().all(|samples| samples.len() > 2 * each);
-    Ok((is_long && varies_like_whole(&outputs, each)).then_some(each))
+pub fn leading_part(parameter_set: &ParameterSet, source: &Recordings, count: usize) -> Result<Option<usize>> {
+    let (outputs, intervals_per_run) = (
+        output_samples(parameter_set, source)?,
+        (count / source.intervals_and_durations().len().max(1)).max(MIN_RUN_SAMPLES),
+    );
+    let is_long = outputs.iter().flatten().all(|samples| samples.len() > 2 * intervals_per_run);
+    Ok((is_long && varies_like_whole(&outputs, intervals_per_run)).then_some(intervals_per_run))
 }
 
 /// Samples of the output of each equation, by run.
-fn output_samples<'a>(free: &ParameterSet, source: &'a Recordings) -> Result<Vec<Vec<&'a [f64]>>> {
-    free.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
+fn output_samples<'a>(parameter_set: &ParameterSet, source: &'a Recordings) -> Result<Vec<Vec<&'a [f64]>>> {
+    parameter_set.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
 }
 
 /// Return true if every output has a similar standard deviation in the first `first` intervals as in the whole record.
-fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
+fn varies_like_whole(outputs: &[Vec<&[f64]>], leading_intervals: usize) -> bool {
     outputs.iter().flatten().all(|samples| {
-        standard_deviation(&samples[..=first.min(samples.len() - 1)])
+        standard_deviation(&samples[..=leading_intervals.min(samples.len() - 1)])
             >= MIN_DEVIATION_RATIO * standard_deviation(samples)
     })
 }
@@ -79,6 +81,6 @@ fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
 /// Standard deviation of the samples that are not missing (NaN).
 fn standard_deviation(samples: &[f64]) -> f64 {
     let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
-    let middle = mean(&finite);
-    mean(&finite.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>()).sqrt()
+    let center = mean(&finite);
+    mean(&finite.iter().map(|v| (v - center) * (v - center)).collect::<Vec<_>>()).sqrt()
 }

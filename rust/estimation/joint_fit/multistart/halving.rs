@@ -40,7 +40,7 @@ const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
 /// Executor of one rung of successive halving, with the number of starts, the threads and the progress callback.
 #[derive(Clone, Copy)]
 pub(super) struct RungExecutor<'a> {
-    pub starts: usize,
+    pub start_count: usize,
     pub threads: usize,
     pub listener: Option<&'a ProgressListener<'a>>,
 }
@@ -49,45 +49,45 @@ impl RungExecutor<'_> {
     /// Optimize candidates with a budget of evaluations each; return those with a finite simulation, best first.
     pub(super) fn run(
         &self,
-        free: &ParameterSet,
-        grid: &Objective<'_>,
+        parameter_set: &ParameterSet,
+        objective: &Objective<'_>,
         candidates: &[Candidate],
         evaluations: usize,
     ) -> Result<Vec<Candidate>> {
-        let ended = self.run_each(free, grid, candidates, evaluations)?;
-        Ok(sort_by_cost(ended.into_iter().flatten().collect()))
+        let results = self.run_each(parameter_set, objective, candidates, evaluations)?;
+        Ok(sort_by_cost(results.into_iter().flatten().collect()))
     }
 
     /// Optimize each candidate with a budget of evaluations; the result is None if its simulation is not finite.
     pub(super) fn run_each(
         &self,
-        free: &ParameterSet,
-        grid: &Objective<'_>,
+        parameter_set: &ParameterSet,
+        objective: &Objective<'_>,
         candidates: &[Candidate],
         evaluations: usize,
     ) -> Result<Vec<Option<Candidate>>> {
         let rung = Rung {
-            free,
-            experiments: grid.experiments(),
-            requires_stability: grid.requires_stability,
+            parameter_set,
+            experiments: objective.experiments(),
+            requires_stability: objective.requires_stability,
             evaluations,
-            stop: grid.stop(),
+            stop: objective.stop(),
         };
         let mut count = 0;
         let mut report_progress = || {
-            let so_far = count.min(self.starts.saturating_sub(1));
+            let finished = count.min(self.start_count.saturating_sub(1));
             count += 1;
-            self.listener.map_or(Ok(()), |listener| listener(so_far, self.starts))
+            self.listener.map_or(Ok(()), |listener| listener(finished, self.start_count))
         };
         if self.threads.min(candidates.len()) <= 1 {
-            let each = candidates.iter().map(|candidate| {
-                let ended = rung.optimize(candidate)?;
+            let results = candidates.iter().map(|candidate| {
+                let candidate_result = rung.optimize(candidate)?;
                 report_progress()?;
-                Ok(ended)
+                Ok(candidate_result)
             });
-            return each.collect();
+            return results.collect();
         }
-        let mut ended: Vec<Option<Candidate>> = vec![None; candidates.len()];
+        let mut results: Vec<Option<Candidate>> = vec![None; candidates.len()];
         let (next, stop_flag) = (AtomicUsize::new(0), Stop::default());
         let (send, receive) = channel();
         let (rung, next, stop_flag) = (&rung, &next, &stop_flag);
@@ -96,7 +96,7 @@ impl RungExecutor<'_> {
             let threads = self.threads.min(candidates.len());
             for _ in 0..threads {
                 let send = send.clone();
-                let runs = move || {
+                let optimize_candidates = move || {
                     while !stop_flag.is_set() {
                         let k = next.fetch_add(1, Ordering::Relaxed);
                         let Some(candidate) = candidates.get(k) else { return };
@@ -105,16 +105,16 @@ impl RungExecutor<'_> {
                         }
                     }
                 };
-                if let Err(error) = std::thread::Builder::new().spawn_scoped(scope, runs) {
+                if let Err(error) = std::thread::Builder::new().spawn_scoped(scope, optimize_candidates) {
                     stop_flag.set();
-                    first_error = Some(Error::Threads { threads, why: error.to_string() });
+                    first_error = Some(Error::Threads { threads, reason: error.to_string() });
                     break;
                 }
             }
             drop(send);
-            for (k, outcome) in &receive {
-                match outcome.and_then(|outcome| report_progress().map(|()| outcome)) {
-                    Ok(outcome) => ended[k] = outcome,
+            for (k, result) in &receive {
+                match result.and_then(|result| report_progress().map(|()| result)) {
+                    Ok(result) => results[k] = result,
                     Err(error) => {
                         stop_flag.set();
                         first_error.get_or_insert(error);
@@ -123,13 +123,13 @@ impl RungExecutor<'_> {
             }
             first_error.map_or(Ok(()), Err)
         })?;
-        Ok(ended)
+        Ok(results)
     }
 }
 
 /// Common settings of the optimizations of one rung.
 struct Rung<'a> {
-    free: &'a ParameterSet,
+    parameter_set: &'a ParameterSet,
     experiments: &'a [Experiment],
     requires_stability: bool,
     evaluations: usize,
@@ -140,12 +140,12 @@ impl Rung<'_> {
     /// Optimize one candidate. Return None if the optimization fails, for example because the simulation is not finite.
     fn optimize(&self, candidate: &Candidate) -> Result<Option<Candidate>> {
         let settings = MinimizationSettings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
-        let place = &candidate.result.iterate;
-        let problem = self.free.problem_at(place, false, &[]);
-        match problem.minimize(self.experiments, place, settings, self.requires_stability, self.stop) {
-            Ok(attempt) => {
-                let ended = candidate.with_result(attempt.without_residuals());
-                Ok(Some(zero_vanishing_coefficients(self.free, candidate, ended)))
+        let iterate = &candidate.result.iterate;
+        let problem = self.parameter_set.problem_at(iterate, false, &[]);
+        match problem.minimize(self.experiments, iterate, settings, self.requires_stability, self.stop) {
+            Ok(result) => {
+                let candidate_result = candidate.with_result(result.without_residuals());
+                Ok(Some(zero_vanishing_coefficients(self.parameter_set, candidate, candidate_result)))
             }
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
@@ -154,16 +154,16 @@ impl Rung<'_> {
 }
 
 /// Set coefficients that became negligible in logarithmic coordinates to 0, so that they can change their sign.
-fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended: Candidate) -> Candidate {
-    if free.products.is_empty() && !free.has_friction() {
-        let before = &start.result.iterate.point.coefficients;
-        for (value, before) in ended.result.iterate.point.coefficients.iter_mut().zip(before) {
-            if value.abs() < ZERO_COEFFICIENT_RATIO * before.abs() {
+fn zero_vanishing_coefficients(parameter_set: &ParameterSet, start: &Candidate, mut result: Candidate) -> Candidate {
+    if parameter_set.products.is_empty() && !parameter_set.has_friction() {
+        let initial_coefficients = &start.result.iterate.point.coefficients;
+        for (value, initial_value) in result.result.iterate.point.coefficients.iter_mut().zip(initial_coefficients) {
+            if value.abs() < ZERO_COEFFICIENT_RATIO * initial_value.abs() {
                 *value = 0.0;
             }
         }
     }
-    ended
+    result
 }
 
 /// Sort candidates by cost per residual; equal costs keep their sequence.
@@ -174,19 +174,23 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut candidates: Vec<Candida
 
 /// Split the candidates of a short fit into those that continue and the others.
 ///
-/// A candidate continues if its budget is exhausted. `floor` is the cost per residual of the noise alone. If some
+/// A candidate continues if its budget is exhausted. `noise_floor` is the cost per residual of the noise alone. If some
 /// candidate has converged at this noise floor, the cost of a continuing candidate must also not exceed the least
 /// converged cost.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
     candidates: Vec<Candidate>,
-    floor: f64,
+    noise_floor: f64,
 ) -> (Vec<Candidate>, Vec<Candidate>) {
     let converged = candidates.iter().filter(|candidate| candidate.result.has_converged());
-    let least = converged.map(Candidate::cost_per_residual).fold(f64::INFINITY, f64::min);
-    let limit = if least <= MAX_NOISE_COST_RATIO * floor { (1.0 + SAME_COST_TOLERANCE) * least } else { f64::INFINITY };
-    let continues =
+    let least_cost = converged.map(Candidate::cost_per_residual).fold(f64::INFINITY, f64::min);
+    let limit = if least_cost <= MAX_NOISE_COST_RATIO * noise_floor {
+        (1.0 + SAME_COST_TOLERANCE) * least_cost
+    } else {
+        f64::INFINITY
+    };
+    let does_continue =
         |candidate: &Candidate| candidate.result.status == Status::Exhausted && candidate.cost_per_residual() <= limit;
-    candidates.into_iter().partition(continues)
+    candidates.into_iter().partition(does_continue)
 }
 
 /// Split candidates into those that can reach the least cost among them within `evaluations` evaluations, and the
@@ -195,61 +199,63 @@ pub(in crate::estimation::joint_fit) fn split_unfinished(
 /// A cost is extrapolated at its mean decrease per evaluation in the last optimization of the candidate. Optimizations
 /// on a plateau above the best candidate thus end. A candidate with one evaluation has no such rate and continues.
 pub(super) fn split_by_prospect(candidates: Vec<Candidate>, evaluations: usize) -> (Vec<Candidate>, Vec<Candidate>) {
-    let least = candidates.iter().map(|candidate| candidate.result.cost).fold(f64::INFINITY, f64::min);
+    let least_cost = candidates.iter().map(|candidate| candidate.result.cost).fold(f64::INFINITY, f64::min);
     #[allow(clippy::cast_precision_loss)]
     let can_reach = |candidate: &Candidate| {
         let (cost, count) = (candidate.result.cost, candidate.result.evaluations);
         let decrease = (candidate.cost_before - cost) * evaluations as f64 / count.max(1) as f64;
-        count < 2 || cost - decrease <= least
+        count < 2 || cost - decrease <= least_cost
     };
     candidates.into_iter().partition(can_reach)
 }
 
 /// Return the survivors that continue on all samples: the best distinct optima within the cost ratio.
 #[must_use]
-pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
-    let mut first = merge_duplicates(reached, is_same_optimum);
-    first.truncate(MAX_FINAL_SURVIVORS);
-    competitive_candidates(&first)
+pub fn select_survivors(candidates: &[Candidate]) -> Vec<Candidate> {
+    let mut optima = merge_duplicates(candidates, is_same_optimum);
+    optima.truncate(MAX_FINAL_SURVIVORS);
+    competitive_candidates(&optima)
 }
 
 /// Return the candidates whose cost is at most `MAX_SURVIVOR_COST_RATIO` times that of the first, best one.
 #[must_use]
-pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
-    let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
-    reached.iter().filter(|candidate| candidate.cost_per_residual() <= limit).cloned().collect()
+pub fn competitive_candidates(candidates: &[Candidate]) -> Vec<Candidate> {
+    let limit =
+        candidates.first().map_or(0.0, |best_candidate| MAX_SURVIVOR_COST_RATIO * best_candidate.cost_per_residual());
+    candidates.iter().filter(|candidate| candidate.cost_per_residual() <= limit).cloned().collect()
 }
 
 /// Return true if two candidates agree in cost, orders and input parameters.
 #[must_use]
-pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
+pub fn is_same_optimum(first: &Candidate, second: &Candidate) -> bool {
     let orders = |candidate: &Candidate| candidate.result.iterate.point.orders.clone();
     let inputs = |candidate: &Candidate| candidate.result.iterate.point.inputs.clone();
-    (one.cost_per_residual() - other.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * one.cost_per_residual()
-        && are_all_close(&orders(other), &orders(one), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
+    (first.cost_per_residual() - second.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * first.cost_per_residual()
+        && are_all_close(&orders(second), &orders(first), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
         // Delays that differ by a period belong to different optima.
-        && are_all_close(&inputs(other), &inputs(one), SAME_PARAMETER_TOLERANCE, 0.0)
+        && are_all_close(&inputs(second), &inputs(first), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
 /// Return true if two candidates agree in all parameters.
 ///
 /// Order grids with common points yield such candidates.
 #[must_use]
-pub fn is_same_iterate(one: &Candidate, other: &Candidate) -> bool {
-    are_all_close(&other.result.values(), &one.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)
+pub fn is_same_iterate(first: &Candidate, second: &Candidate) -> bool {
+    are_all_close(&second.result.values(), &first.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// Return true if all values agree within the sum of a relative tolerance `share` and an absolute one, `distance`.
-pub(super) fn are_all_close(numbers: &[f64], others: &[f64], share: f64, distance: f64) -> bool {
-    numbers.iter().zip(others).all(|(a, b)| (a - b).abs() <= distance + share * b.abs())
+/// Return true if all values agree within the sum of `relative_tolerance` (times the second value) and
+/// `absolute_tolerance`.
+pub(super) fn are_all_close(first: &[f64], second: &[f64], relative_tolerance: f64, absolute_tolerance: f64) -> bool {
+    first.iter().zip(second).all(|(a, b)| (a - b).abs() <= absolute_tolerance + relative_tolerance * b.abs())
 }
 
 /// Merge each candidate into an earlier one that is the same, and append the origins to that candidate.
 #[must_use]
-pub fn merge_duplicates(candidates: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
+pub fn merge_duplicates(candidates: &[Candidate], is_same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
     let mut distinct: Vec<Candidate> = Vec::new();
     for candidate in candidates {
-        match distinct.iter_mut().find(|distinct| same(distinct, candidate)) {
+        match distinct.iter_mut().find(|distinct| is_same(distinct, candidate)) {
             None => distinct.push(candidate.clone()),
             Some(first) => {
                 first.duplicates.push(candidate.origin.clone());
@@ -268,9 +274,9 @@ mod tests {
 
     fn candidate_at(level: f64, order: f64) -> Candidate {
         let point = ParameterPoint { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
-        let attempt = OptimizationResult::initial_result(Iterate { point, states: Vec::new() });
+        let result = OptimizationResult::initial_result(Iterate { point, states: Vec::new() });
         Candidate {
-            result: OptimizationResult { cost: level, residual_count: 2, ..attempt },
+            result: OptimizationResult { cost: level, residual_count: 2, ..result },
             origin: String::new(),
             duplicates: Vec::new(),
             cost_before: f64::INFINITY,
@@ -279,12 +285,12 @@ mod tests {
 
     #[test]
     fn candidates_stop_only_beside_an_optimum_that_leaves_noise() {
-        let ended = |cost: f64, status| {
+        let candidate_with_status = |cost: f64, status| {
             let mut candidate = candidate_at(cost, 1.0);
             candidate.result.status = status;
             candidate
         };
-        let reached = || {
+        let candidates = || {
             [
                 (1.0, Status::Converged),
                 (1.0005, Status::Exhausted),
@@ -292,11 +298,11 @@ mod tests {
                 (0.5, Status::Exhausted),
                 (2.0, Status::Stalled),
             ]
-            .map(|(cost, status)| ended(cost, status))
+            .map(|(cost, status)| candidate_with_status(cost, status))
             .to_vec()
         };
-        let costs = |floor: f64| {
-            let (unfinished, others) = split_unfinished(reached(), floor);
+        let costs = |noise_floor: f64| {
+            let (unfinished, others) = split_unfinished(candidates(), noise_floor);
             assert_eq!(unfinished.len() + others.len(), 5);
             unfinished.iter().map(|candidate| candidate.result.cost).collect::<Vec<_>>()
         };
@@ -306,23 +312,29 @@ mod tests {
 
     #[test]
     fn candidate_on_a_plateau_does_not_continue() {
-        let fallen = |cost_before: f64, cost: f64, evaluations: usize| {
+        let candidate_with_decrease = |cost_before: f64, cost: f64, evaluations: usize| {
             let mut candidate = Candidate { cost_before, ..candidate_at(cost, 1.0) };
             candidate.result.evaluations = evaluations;
             candidate
         };
         // The best one, a plateau, two that fall fast enough, one without a rate.
-        let reached = [fallen(1.0, 1.0, 15), fallen(2.1, 2.0, 15), fallen(5.0, 3.0, 15), fallen(f64::INFINITY, 4.0, 2)];
-        let (near, ended) = split_by_prospect([&reached[..], &[fallen(5.0, 5.0, 1)]].concat(), 60);
+        let candidates = [
+            candidate_with_decrease(1.0, 1.0, 15),
+            candidate_with_decrease(2.1, 2.0, 15),
+            candidate_with_decrease(5.0, 3.0, 15),
+            candidate_with_decrease(f64::INFINITY, 4.0, 2),
+        ];
+        let (promising, others) =
+            split_by_prospect([&candidates[..], &[candidate_with_decrease(5.0, 5.0, 1)]].concat(), 60);
         let costs = |candidates: &[Candidate]| candidates.iter().map(|c| c.result.cost).collect::<Vec<_>>();
-        assert_eq!((costs(&near), costs(&ended)), (vec![1.0, 3.0, 4.0, 5.0], vec![2.0]));
+        assert_eq!((costs(&promising), costs(&others)), (vec![1.0, 3.0, 4.0, 5.0], vec![2.0]));
     }
 
     #[test]
     fn candidate_beyond_the_limit_hides_no_later_one() {
         // The sequence is that of a finer grid. The cost of the last candidate is within the ratio nevertheless.
-        let reached = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];
-        let orders: Vec<f64> = select_survivors(&reached).iter().map(|r| r.result.iterate.point.orders[0]).collect();
+        let candidates = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];
+        let orders: Vec<f64> = select_survivors(&candidates).iter().map(|r| r.result.iterate.point.orders[0]).collect();
         assert_eq!(orders, [0.5, 1.5]);
         assert!(competitive_candidates(&[candidate_at(0.0, 1.0), candidate_at(1e-9, 2.0)]).len() == 1);
     }

@@ -37,108 +37,120 @@ const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 /// # Errors
 /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
 /// if it returns one. [`crate::error::Error::Interrupted`] after a stop request.
-pub fn run_nonlinear_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    let structure = &free.structure;
+pub fn run_nonlinear_multistart(
+    parameter_set: &ParameterSet,
+    context: MultistartContext<'_>,
+) -> Result<Vec<Candidate>> {
+    let structure = &parameter_set.structure;
     let linear = ParameterSet::from_structure(ParametricStructure { derived: Vec::new(), ..structure.clone() })?;
     let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
-    let sampling = coarse_sampling(free, context.source)?;
-    let mut grid = Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)?;
-    let differentiates = structure.derived.iter().flat_map(|derived| &derived.channels).any(|channel| channel.1 > 0.0);
-    let widths = if differentiates { vec![0, SMOOTHING_HALF_WIDTH] } else { vec![0] };
+    let sampling = coarse_sampling(parameter_set, context.source)?;
+    let mut objective =
+        Objective::new((&parameter_set.problem, context.source, context.stop), weights, sampling, false)?;
+    let has_derivatives = structure.derived.iter().flat_map(|derived| &derived.channels).any(|channel| channel.1 > 0.0);
+    let widths = if has_derivatives { vec![0, SMOOTHING_HALF_WIDTH] } else { vec![0] };
     let sources = widths.into_iter().map(|width| with_derived_signals(structure, context.source, width));
     let sources = sources.collect::<Result<Vec<_>>>()?;
     let mut starts = Vec::new();
     for source in &sources {
-        let of_source = context.starts.for_recordings(source);
+        let guess_source = context.guess_source.for_recordings(source);
         if structure.has_friction() {
-            let own = MultistartContext { source, starts: of_source.as_ref(), listener: None, ..context };
-            let candidates = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
-            starts.extend(embed(free, &linear, &candidates)?);
+            let submodel_context =
+                MultistartContext { source, guess_source: guess_source.as_ref(), listener: None, ..context };
+            let submodel_candidates =
+                none_if_invalid_model(run_friction_multistart(&linear, submodel_context))?.unwrap_or_default();
+            starts.extend(embed(parameter_set, &linear, &submodel_candidates)?);
             continue;
         }
-        starts.extend(none_if_invalid_model(of_source.initial_guesses(&linear))?.unwrap_or_default());
+        starts.extend(none_if_invalid_model(guess_source.initial_guesses(&linear))?.unwrap_or_default());
     }
-    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
-    let mut ranked = merge_duplicates(&executor.run(free, &grid, &starts, 0)?, is_same_iterate);
-    while ranked.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
-        grid = grid.finer()?;
-        ranked = merge_duplicates(&executor.run(free, &grid, &starts, 0)?, is_same_iterate);
+    let executor = RungExecutor { start_count: starts.len(), threads: context.threads, listener: context.listener };
+    let mut ranked = merge_duplicates(&executor.run(parameter_set, &objective, &starts, 0)?, is_same_iterate);
+    while ranked.is_empty() && objective.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
+        objective = objective.finer()?;
+        ranked = merge_duplicates(&executor.run(parameter_set, &objective, &starts, 0)?, is_same_iterate);
     }
     let executor = RungExecutor { listener: None, ..executor };
-    let is_at_noise = |reached: &[Candidate]| {
-        reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * context.floor)
+    let is_at_noise = |candidates: &[Candidate]| {
+        candidates.first().is_some_and(|best_candidate| {
+            best_candidate.cost_per_residual() <= NOISE_FLOOR_FACTOR * context.noise_floor
+        })
     };
-    let mut reached = Vec::new();
+    let mut candidates = Vec::new();
     for selected in ranked.chunks(MAX_FINAL_SURVIVORS).take(SUBMODEL_SURVIVORS.div_ceil(MAX_FINAL_SURVIVORS)) {
-        reached.extend(executor.run(free, &grid, selected, FIRST_BUDGET_EVALUATIONS)?);
-        reached = sort_by_cost(reached);
-        if is_at_noise(&reached) {
+        candidates.extend(executor.run(parameter_set, &objective, selected, FIRST_BUDGET_EVALUATIONS)?);
+        candidates = sort_by_cost(candidates);
+        if is_at_noise(&candidates) {
             break;
         }
     }
     // With fast responses, the residuals rank the guesses only if the pulses are short enough.
-    while let Some(best) = reached.first().filter(|_| !is_at_noise(&reached))
-        && grid.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
-        && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
+    while let Some(best_candidate) = candidates.first().filter(|_| !is_at_noise(&candidates))
+        && objective.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
+        && objective.is_refinement_significant(&best_candidate.result.iterate, &objective.finer()?)?
     {
-        grid = grid.finer()?;
-        reached = executor.run(free, &grid, &reached, FIRST_BUDGET_EVALUATIONS)?;
+        objective = objective.finer()?;
+        candidates = executor.run(parameter_set, &objective, &candidates, FIRST_BUDGET_EVALUATIONS)?;
     }
-    if !is_at_noise(&reached) {
-        let mut more = Vec::new();
+    if !is_at_noise(&candidates) {
+        let mut further_guesses = Vec::new();
         // With friction, these fits are the initial guesses already.
-        let others = if structure.has_friction() { &[][..] } else { &sources };
-        for source in others {
-            let starts = context.starts.for_recordings(source);
-            let own = MultistartContext { source, starts: starts.as_ref(), listener: None, ..context };
-            let candidates = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
-            more.extend(embed(free, &linear, &candidates)?);
+        let further_sources = if structure.has_friction() { &[][..] } else { &sources };
+        for source in further_sources {
+            let guess_source = context.guess_source.for_recordings(source);
+            let submodel_context =
+                MultistartContext { source, guess_source: guess_source.as_ref(), listener: None, ..context };
+            let submodel_candidates =
+                none_if_invalid_model(run_multistart(&linear, submodel_context))?.unwrap_or_default();
+            further_guesses.extend(embed(parameter_set, &linear, &submodel_candidates)?);
         }
-        if let Some(less) = without_nonlinear_terms(structure) {
-            let own = MultistartContext { listener: None, ..context };
-            let candidates = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
-            more.extend(embed(free, &less, &candidates)?);
+        if let Some(submodel) = without_nonlinear_terms(structure) {
+            let submodel_context = MultistartContext { listener: None, ..context };
+            let submodel_candidates =
+                none_if_invalid_model(run_friction_multistart(&submodel, submodel_context))?.unwrap_or_default();
+            further_guesses.extend(embed(parameter_set, &submodel, &submodel_candidates)?);
         }
-        reached.extend(executor.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
-        reached = sort_by_cost(reached);
+        candidates.extend(executor.run(parameter_set, &objective, &further_guesses, FIRST_BUDGET_EVALUATIONS)?);
+        candidates = sort_by_cost(candidates);
     }
-    let selected = merge_duplicates(&reached, is_same_optimum);
-    let (first, rest) = selected.split_at(MAX_FINAL_SURVIVORS.min(selected.len()));
-    let mut ended = executor.run(free, &grid, first, SECOND_BUDGET_EVALUATIONS)?;
-    ended.extend(rest.iter().cloned());
-    Ok(ended)
+    let selected = merge_duplicates(&candidates, is_same_optimum);
+    let (survivors, remaining) = selected.split_at(MAX_FINAL_SURVIVORS.min(selected.len()));
+    let mut results = executor.run(parameter_set, &objective, survivors, SECOND_BUDGET_EVALUATIONS)?;
+    results.extend(remaining.iter().cloned());
+    Ok(results)
 }
 
 /// Return the best candidates of a problem with fewer parameters as initial guesses of the full problem.
 ///
 /// At most [`MAX_FINAL_SURVIVORS`] candidates are returned. Missing coefficients are 0.
-fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
-    let of = |candidate: &Candidate| {
-        let mut values = values_of(less, candidate);
-        for name in &free.coefficients {
+fn embed(parameter_set: &ParameterSet, submodel: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
+    let full_guess = |candidate: &Candidate| {
+        let mut values = values_of(submodel, candidate);
+        for name in &parameter_set.coefficients {
             values.entry(name.clone()).or_insert(0.0);
         }
-        guess_at(free, &values, format!("{}, from a linear fit", candidate.origin))
+        guess_at(parameter_set, &values, format!("{}, from a linear fit", candidate.origin))
     };
-    candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
+    candidates.iter().take(MAX_FINAL_SURVIVORS).map(full_guess).collect()
 }
 
 /// Return the parameter set without the nonlinear terms; None if the remaining structure is invalid.
 fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterSet> {
     let recorded = structure.recorded_count();
-    let of = |item: &ParametricEquation| {
-        let terms = item.terms.iter().filter(|term| term.signal < recorded).cloned().collect();
-        ParametricEquation { terms, ..item.clone() }
+    let equation_without_terms = |equation: &ParametricEquation| {
+        let terms = equation.terms.iter().filter(|term| term.signal < recorded).cloned().collect();
+        ParametricEquation { terms, ..equation.clone() }
     };
-    let less = ParametricStructure {
+    let submodel = ParametricStructure {
         signals: structure.signals[..recorded].to_vec(),
         derived: Vec::new(),
-        equations: structure.equations.iter().map(of).collect(),
+        equations: structure.equations.iter().map(equation_without_terms).collect(),
         ..structure.clone()
     };
-    let names = less.order_names();
-    let bounds = less.bounds.iter().filter(|(name, _)| names.contains(name)).map(|(n, b)| (n.clone(), *b)).collect();
-    ParameterSet::from_structure(ParametricStructure { bounds, ..less }).ok()
+    let names = submodel.order_names();
+    let bounds =
+        submodel.bounds.iter().filter(|(name, _)| names.contains(name)).map(|(n, b)| (n.clone(), *b)).collect();
+    ParameterSet::from_structure(ParametricStructure { bounds, ..submodel }).ok()
 }
 
 /// Return recordings that contain the derived signals as measured signals.
@@ -146,7 +158,7 @@ fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterS
 /// Samples are smoothed before they are differentiated. `half_width` is half the smoothing window in samples.
 /// Recordings with nonuniform samples are an error.
 fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
-    let of = |run: &Recording| {
+    let add_derived_channels = |run: &Recording| {
         if run.has_nonuniform_samples() {
             return Err(unsupported_with("samples at nonuniform times", "resample the runs"));
         }
@@ -154,19 +166,19 @@ fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, ha
         for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded_count()..]) {
             channels.push(derived_channel(run, derived, name, half_width)?);
         }
-        let mut with = run.with_channels(channels, run.outputs().to_vec())?;
-        with.free_inputs.clone_from(&run.free_inputs);
-        Ok(with)
+        let mut run_with_signals = run.with_channels(channels, run.outputs().to_vec())?;
+        run_with_signals.free_inputs.clone_from(&run.free_inputs);
+        Ok(run_with_signals)
     };
-    Recordings::new(source.runs().iter().map(of).collect::<Result<Vec<_>>>()?)
+    Recordings::new(source.runs().iter().map(add_derived_channels).collect::<Result<Vec<_>>>()?)
 }
 
 fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_width: usize) -> Result<Channel> {
     let mut rows = Vec::new();
-    let (mut is_held, mut is_filtered) = (true, false);
+    let (mut is_zero_order_hold, mut is_filtered) = (true, false);
     for &(signal, order) in &derived.channels {
         let channel = run.channel(signal)?;
-        is_held &= channel.is_held_input() && order == 0.0;
+        is_zero_order_hold &= channel.is_zero_order_hold() && order == 0.0;
         is_filtered |= channel.is_filtered;
         let mut samples = interpolate_gaps(&run.acting_samples(signal)).into_owned();
         if channel.lag() != 0.0 {
@@ -175,10 +187,10 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
         rows.push(if order > 0.0 { differentiate(samples, order, run, half_width) } else { samples });
     }
     let mut values = Values::default();
-    let mut at = vec![0.0; rows.len()];
-    let of = |k: usize| {
-        at.iter_mut().zip(&rows).for_each(|(v, row)| *v = row[k]);
-        let value = derived.expression.evaluate(&at, &mut values);
+    let mut arguments = vec![0.0; rows.len()];
+    let evaluate_at = |k: usize| {
+        arguments.iter_mut().zip(&rows).for_each(|(v, row)| *v = row[k]);
+        let value = derived.expression.evaluate(&arguments, &mut values);
         // Noise may move an argument out of the domain of a function.
         if value.is_finite() {
             value
@@ -186,8 +198,8 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
             0.0
         }
     };
-    let samples = (0..run.len()).map(of).collect();
-    let role = if is_held { Role::Input(Intersample::Hold) } else { Role::Output };
+    let samples = (0..run.len()).map(evaluate_at).collect();
+    let role = if is_zero_order_hold { Role::Input(Intersample::Hold) } else { Role::Output };
     Ok(Channel { is_filtered, ..Channel::new(name, samples, role) })
 }
 
@@ -195,8 +207,8 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
 ///
 /// It is the derivative of the deviation from the first sample, or from 0 if the run starts at rest.
 fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usize) -> Vec<f64> {
-    let first = if run.is_at_rest { 0.0 } else { samples[0] };
-    let deviations: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
+    let reference = if run.is_at_rest { 0.0 } else { samples[0] };
+    let deviations: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - reference).collect();
     let weights = grunwald_letnikov_weights(order, deviations.len());
     let scale = libm::pow(run.step(), -order);
     series::multiply(&weights, &deviations, deviations.len()).into_iter().map(|v| scale * v).collect()
@@ -205,7 +217,7 @@ fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usi
 /// Return samples smoothed by local cubic polynomials (Savitzky–Golay filter), with shorter windows near the ends.
 #[allow(clippy::cast_precision_loss)]
 fn smooth(samples: &[f64], half_width: usize) -> Vec<f64> {
-    let of = |k: usize| {
+    let smooth_at = |k: usize| {
         let n = half_width.min(k).min(samples.len() - 1 - k);
         if n < 2 {
             return samples[k];
@@ -215,7 +227,7 @@ fn smooth(samples: &[f64], half_width: usize) -> Vec<f64> {
         let weight = |j: f64| scale * (3.0 * size * size + 3.0 * size - 1.0 - 5.0 * j * j);
         (samples[k - n..=k + n].iter().enumerate()).map(|(i, v)| weight(i as f64 - size) * v).sum()
     };
-    (0..samples.len()).map(of).collect()
+    (0..samples.len()).map(smooth_at).collect()
 }
 
 #[cfg(test)]

@@ -35,16 +35,20 @@ pub trait InitialGuessSource {
     ///
     /// # Errors
     /// An error if the orders of the equations cannot be searched. [`Error::Interrupted`] after a stop request.
-    fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>>;
+    fn initial_guesses(&self, parameter_set: &ParameterSet) -> Result<Vec<Candidate>>;
 
     /// Return a source of initial guesses for other recordings.
     fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b>;
 
-    /// Return the optima of a problem of integer orders on the samples of `_grid`; None for other problems.
+    /// Return the optima of a problem of integer orders on the samples of `_objective`; None for other problems.
     ///
     /// # Errors
     /// An error if the equations cannot be searched. [`Error::Interrupted`] after a stop request.
-    fn integer_order_optima(&self, _free: &ParameterSet, _grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
+    fn integer_order_optima(
+        &self,
+        _parameter_set: &ParameterSet,
+        _objective: &Objective<'_>,
+    ) -> Result<Option<Vec<Candidate>>> {
         Ok(None)
     }
 }
@@ -55,13 +59,13 @@ pub struct MultistartContext<'a> {
     /// Runs that are fitted.
     pub source: &'a Recordings,
     /// Source of initial guesses.
-    pub starts: &'a dyn InitialGuessSource,
+    pub guess_source: &'a dyn InitialGuessSource,
     /// Cancellation flag.
     pub stop: &'a Stop,
     /// Weights of the outputs, which are equal relative to the standard deviations of the outputs.
     pub weights: &'a [f64],
     /// Cost per residual of noise alone.
-    pub floor: f64,
+    pub noise_floor: f64,
     /// Number of threads. Results do not depend on it.
     pub threads: usize,
     /// Progress callback with the numbers of finished and of all starts; None in a nested multistart.
@@ -74,8 +78,8 @@ impl<'a> MultistartContext<'a> {
         Self { listener: None, ..self }
     }
 
-    fn time_scaling(self, free: &ParameterSet) -> TimeScaling {
-        TimeScaling::from_runs(&free.problem, &self.source.intervals_and_durations())
+    fn time_scaling(self, parameter_set: &ParameterSet) -> TimeScaling {
+        TimeScaling::from_runs(&parameter_set.problem, &self.source.intervals_and_durations())
     }
 }
 
@@ -84,44 +88,49 @@ impl<'a> MultistartContext<'a> {
 /// # Errors
 /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
 /// if it returns one. [`Error::Interrupted`] after a stop request.
-pub fn run_multistart(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    if let Some(candidates) = integer_order_multistart(free, context, None)? {
+pub fn run_multistart(parameter_set: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    if let Some(candidates) = integer_order_multistart(parameter_set, context, None)? {
         return Ok(candidates);
     }
-    if free.structure.history {
-        return multistart_with_history(free, context);
+    if parameter_set.structure.history {
+        return multistart_with_history(parameter_set, context);
     }
-    Ok(multistart_without_history(free, context)?.0)
+    Ok(multistart_without_history(parameter_set, context)?.0)
 }
 
 /// Return the optima of a problem of integer orders, best first; None for other problems.
 ///
 /// The fit uses the first `leading_intervals` intervals of each run, or all samples if it is None.
 fn integer_order_multistart(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     context: MultistartContext<'_>,
     leading_intervals: Option<usize>,
 ) -> Result<Option<Vec<Candidate>>> {
-    if !free.orders.is_empty() || !free.problem.is_linear() {
+    if !parameter_set.orders.is_empty() || !parameter_set.problem.is_linear() {
         return Ok(None);
     }
-    let objective = |sampling| {
+    let objective_on = |sampling| {
         let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
-        Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)
+        Objective::new((&parameter_set.problem, context.source, context.stop), weights, sampling, false)
     };
-    let grid = objective(Sampling { leading_intervals, ..Sampling::default() })?;
+    let objective = objective_on(Sampling { leading_intervals, ..Sampling::default() })?;
     let mut starts = Vec::new();
-    for sampling in guess_samplings(free, context.source, leading_intervals)? {
-        starts.extend(context.starts.integer_order_optima(free, &objective(sampling)?)?.unwrap_or_default());
+    for sampling in guess_samplings(parameter_set, context.source, leading_intervals)? {
+        starts.extend(
+            context.guess_source.integer_order_optima(parameter_set, &objective_on(sampling)?)?.unwrap_or_default(),
+        );
     }
-    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
-    let mut starts = merge_duplicates(&executor.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    let executor = RungExecutor { start_count: starts.len(), threads: context.threads, listener: context.listener };
+    let mut starts =
+        merge_duplicates(&executor.run(parameter_set, &objective, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
     if starts.is_empty() {
-        let Some(optima) = context.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
+        let Some(optima) = context.guess_source.integer_order_optima(parameter_set, &objective)? else {
+            return Ok(None);
+        };
         starts = optima;
     }
-    let executor = RungExecutor { starts: starts.len(), ..executor };
-    let candidates = executor.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
+    let executor = RungExecutor { start_count: starts.len(), ..executor };
+    let candidates = executor.run(parameter_set, &objective, &starts, SECOND_BUDGET_EVALUATIONS)?;
     Ok((!candidates.is_empty()).then_some(candidates))
 }
 
@@ -130,18 +139,20 @@ fn integer_order_multistart(
 /// For a long record, there are two samplings: the first part of the record for fast poles and delays, and the whole
 /// record, decimated, for slow poles. For a short record, the list is empty, because all samples are used.
 fn guess_samplings(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     source: &Recordings,
     leading_intervals: Option<usize>,
 ) -> Result<Vec<Sampling>> {
-    let Some(first) = leading_part(free, source, INITIAL_GUESS_INTERVALS)? else { return Ok(Vec::new()) };
+    let Some(leading_intervals_of_guess) = leading_part(parameter_set, source, INITIAL_GUESS_INTERVALS)? else {
+        return Ok(Vec::new());
+    };
     let intervals = source.runs().iter().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
-    let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / first;
+    let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / leading_intervals_of_guess;
     if decimation < 2 {
         return Ok(Vec::new());
     }
-    let leading = Sampling { leading_intervals: Some(first), ..Sampling::default() };
-    Ok(vec![leading, Sampling { leading_intervals, decimation, ..Sampling::default() }])
+    let leading_sampling = Sampling { leading_intervals: Some(leading_intervals_of_guess), ..Sampling::default() };
+    Ok(vec![leading_sampling, Sampling { leading_intervals, decimation, ..Sampling::default() }])
 }
 
 /// Convert the error of an invalid model ([`Kind::Model`]) to None.
@@ -154,15 +165,15 @@ pub(super) fn none_if_invalid_model<T>(outcome: Result<T>) -> Result<Option<T>> 
 
 /// State of a multistart.
 struct MultistartState<'a> {
-    free: &'a ParameterSet,
+    parameter_set: &'a ParameterSet,
     context: MultistartContext<'a>,
     executor: RungExecutor<'a>,
-    coarse: Objective<'a>,
+    coarse_objective: Objective<'a>,
     /// Objective on a pulse grid with half the step; None if it was not needed.
-    half: Option<Objective<'a>>,
+    halved_objective: Option<Objective<'a>>,
     starts: Vec<Candidate>,
     /// Candidates of the full problem after the first budget.
-    first: Vec<Candidate>,
+    first_budget_candidates: Vec<Candidate>,
     /// Optima with integer orders, embedded in the full problem.
     integer_order_optima: Vec<Candidate>,
     candidates: Vec<Candidate>,
@@ -172,23 +183,33 @@ struct MultistartState<'a> {
 ///
 /// Return the candidates, best first, and the objective on which they were optimized.
 fn multistart_without_history<'a>(
-    free: &'a ParameterSet,
+    parameter_set: &'a ParameterSet,
     context: MultistartContext<'a>,
 ) -> Result<(Vec<Candidate>, Objective<'a>)> {
-    let mut starts = context.starts.initial_guesses(free)?;
+    let mut starts = context.guess_source.initial_guesses(parameter_set)?;
     let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
-    let sampling = coarse_sampling(free, context.source)?;
-    let coarse = Objective::new((&free.problem, context.source, context.stop), weights, sampling, false)?;
-    let integer_order_optima = integer_order_optima(free, context, &coarse, &starts)?;
+    let sampling = coarse_sampling(parameter_set, context.source)?;
+    let coarse_objective =
+        Objective::new((&parameter_set.problem, context.source, context.stop), weights, sampling, false)?;
+    let integer_order_optima = integer_order_optima(parameter_set, context, &coarse_objective, &starts)?;
     starts.extend(integer_order_optima.iter().cloned());
-    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: context.listener };
-    let (first, candidates, half) = (Vec::new(), Vec::new(), None);
-    let mut run =
-        MultistartState { free, context, executor, coarse, half, starts, first, integer_order_optima, candidates };
-    run.optimize_starts()?;
-    run.add_nested_models()?;
-    let total = run.executor.starts;
-    let candidates = run.promote_survivors()?;
+    let executor = RungExecutor { start_count: starts.len(), threads: context.threads, listener: context.listener };
+    let (first_budget_candidates, candidates, halved_objective) = (Vec::new(), Vec::new(), None);
+    let mut state = MultistartState {
+        parameter_set,
+        context,
+        executor,
+        coarse_objective,
+        halved_objective,
+        starts,
+        first_budget_candidates,
+        integer_order_optima,
+        candidates,
+    };
+    state.optimize_starts()?;
+    state.add_nested_models()?;
+    let total = state.executor.start_count;
+    let candidates = state.promote_survivors()?;
     if let Some(report_progress) = context.listener {
         report_progress(total, total)?;
     }
@@ -199,49 +220,54 @@ fn multistart_without_history<'a>(
 ///
 /// The submodels are those of [`integer_order_problems`] near the orders of the first initial guess.
 fn integer_order_optima(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     context: MultistartContext<'_>,
-    coarse: &Objective<'_>,
+    coarse_objective: &Objective<'_>,
     starts: &[Candidate],
 ) -> Result<Vec<Candidate>> {
-    let usual = free.integer_orders();
-    let orders = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
+    let default_orders = parameter_set.integer_orders();
+    let orders = starts.first().map_or(&default_orders, |start| &start.result.iterate.point.orders);
     let mut candidates = Vec::new();
-    for less in integer_order_problems(free, orders) {
+    for submodel in integer_order_problems(parameter_set, orders) {
         // With fixed orders, most initial guesses lead to the same optimum.
-        let ended = optimize_submodel(&less.free, context, coarse, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
-        candidates.extend(ended.iter().take(1).map(|candidate| less.embed(candidate)));
+        let results =
+            optimize_submodel(&submodel.parameter_set, context, coarse_objective, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
+        candidates.extend(results.iter().take(1).map(|candidate| submodel.embed(candidate)));
     }
     Ok(candidates)
 }
 
 /// Optimize a submodel from its initial guesses and return its optima, best first.
 ///
-/// The best `survivor_count` guesses continue after the prescreening. `level` is the cost per residual of the full
-/// problem. The best optimum, and every optimum whose cost is near `level`, get the second budget. For integer orders,
-/// the leading intervals of long records suffice. The result is empty if the submodel is invalid, such as with two
-/// equal terms.
+/// The best `survivor_count` guesses continue after the prescreening. `cost_level` is the cost per residual of the full
+/// problem. The best optimum, and every optimum whose cost is near `cost_level`, get the second budget. For integer
+/// orders, the leading intervals of long records suffice. The result is empty if the submodel is invalid, such as with
+/// two equal terms.
 fn optimize_submodel(
-    free: &ParameterSet,
+    parameter_set: &ParameterSet,
     context: MultistartContext<'_>,
-    coarse: &Objective<'_>,
+    coarse_objective: &Objective<'_>,
     survivor_count: usize,
-    level: f64,
+    cost_level: f64,
 ) -> Result<Vec<Candidate>> {
-    let part = leading_part(free, context.source, SELECTION_INTERVALS)?;
-    if let Some(candidates) = integer_order_multistart(free, context.for_submodel(), part)? {
+    let part = leading_part(parameter_set, context.source, SELECTION_INTERVALS)?;
+    if let Some(candidates) = integer_order_multistart(parameter_set, context.for_submodel(), part)? {
         return Ok(candidates);
     }
-    let Some(starts) = none_if_invalid_model(context.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
-    let executor = RungExecutor { starts: starts.len(), threads: context.threads, listener: None };
-    let mut candidates =
-        merge_duplicates(&executor.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    let Some(starts) = none_if_invalid_model(context.guess_source.initial_guesses(parameter_set))? else {
+        return Ok(Vec::new());
+    };
+    let executor = RungExecutor { start_count: starts.len(), threads: context.threads, listener: None };
+    let mut candidates = merge_duplicates(
+        &executor.run(parameter_set, coarse_objective, &starts, PRESCREEN_EVALUATIONS)?,
+        is_same_iterate,
+    );
     candidates.truncate(survivor_count);
-    let ended = executor.run(free, coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
-    let mut survivors = select_survivors(&ended);
-    let competitive = |candidate: &Candidate| candidate.cost_per_residual() <= MAX_SURVIVOR_COST_RATIO * level;
-    survivors.truncate(survivors.iter().filter(|candidate| competitive(candidate)).count().max(1));
-    executor.run(free, coarse, &survivors, SECOND_BUDGET_EVALUATIONS)
+    let results = executor.run(parameter_set, coarse_objective, &candidates, FIRST_BUDGET_EVALUATIONS)?;
+    let mut survivors = select_survivors(&results);
+    let is_competitive = |candidate: &Candidate| candidate.cost_per_residual() <= MAX_SURVIVOR_COST_RATIO * cost_level;
+    survivors.truncate(survivors.iter().filter(|candidate| is_competitive(candidate)).count().max(1));
+    executor.run(parameter_set, coarse_objective, &survivors, SECOND_BUDGET_EVALUATIONS)
 }
 
 impl<'a> MultistartState<'a> {
@@ -253,27 +279,33 @@ impl<'a> MultistartState<'a> {
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
-            let screened = self.executor.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
-            let mut screened = merge_duplicates(&screened, is_same_iterate);
-            if self.coarse.sampling.pulses_per_sample > 1 {
+            let prescreened =
+                self.executor.run(self.parameter_set, &self.coarse_objective, &starts, PRESCREEN_EVALUATIONS)?;
+            let mut prescreened = merge_duplicates(&prescreened, is_same_iterate);
+            if self.coarse_objective.sampling.pulses_per_sample > 1 {
                 // Nearly all candidates were already optimized on the coarser grid.
-                screened.truncate(competitive_candidates(&screened).len().max(SUBMODEL_SURVIVORS));
+                prescreened.truncate(competitive_candidates(&prescreened).len().max(SUBMODEL_SURVIVORS));
             }
-            self.candidates = self.executor.run(self.free, &self.coarse, &screened, FIRST_BUDGET_EVALUATIONS)?;
-            self.first.clone_from(&self.candidates);
-            if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
+            self.candidates = self.executor.run(
+                self.parameter_set,
+                &self.coarse_objective,
+                &prescreened,
+                FIRST_BUDGET_EVALUATIONS,
+            )?;
+            self.first_budget_candidates.clone_from(&self.candidates);
+            if self.coarse_objective.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
                 return Ok(());
             }
-            let finer = self.coarse.finer()?;
-            if let Some(best) = self.candidates.first() {
-                if !self.coarse.is_refinement_significant(&best.result.iterate, &finer)? {
-                    self.half = Some(finer);
+            let finer = self.coarse_objective.finer()?;
+            if let Some(best_candidate) = self.candidates.first() {
+                if !self.coarse_objective.is_refinement_significant(&best_candidate.result.iterate, &finer)? {
+                    self.halved_objective = Some(finer);
                     return Ok(());
                 }
                 starts = merge_duplicates(&self.candidates, is_same_optimum);
                 starts.extend(self.integer_order_optima.iter().cloned());
             }
-            self.coarse = finer;
+            self.coarse_objective = finer;
         }
     }
 
@@ -282,12 +314,12 @@ impl<'a> MultistartState<'a> {
         if self.candidates.is_empty() {
             return Ok(());
         }
-        for less in reduced_problems(self.free) {
-            self.add_reduced_model(&less)?;
+        for submodel in reduced_problems(self.parameter_set) {
+            self.add_reduced_model(&submodel)?;
         }
-        let unit = self.context.time_scaling(self.free);
-        for one in fixed_order_problems(self.free) {
-            self.add_fixed_order_model(&one, &unit)?;
+        let time_scaling = self.context.time_scaling(self.parameter_set);
+        for submodel in fixed_order_problems(self.parameter_set) {
+            self.add_fixed_order_model(&submodel, &time_scaling)?;
         }
         self.add_model_without_offset()
     }
@@ -300,59 +332,88 @@ impl<'a> MultistartState<'a> {
     /// Evaluate candidates with the full problem on the subsampled records, and add them to the candidates of the
     /// multistart.
     fn evaluate_and_add(&mut self, candidates: &[Candidate]) -> Result<()> {
-        let evaluated = self.executor.run(self.free, &self.coarse, candidates, 1)?;
-        self.add(evaluated);
+        let results = self.executor.run(self.parameter_set, &self.coarse_objective, candidates, 1)?;
+        self.add(results);
         Ok(())
     }
 
-    fn add_reduced_model(&mut self, less: &ReducedProblem) -> Result<()> {
-        if less.keeps_signals {
+    fn add_reduced_model(&mut self, submodel: &ReducedProblem) -> Result<()> {
+        if submodel.keeps_signals {
             // Input coefficients are eliminated at every iterate, also with one term less. Candidates therefore differ
             // in the autoregressive terms only, and those of the full problem suffice.
-            let first = merge_duplicates(&self.first, is_same_optimum);
-            let from = first.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
-            let candidates: Vec<Candidate> = from.map(|candidate| less.restrict(candidate, self.free)).collect();
-            let mut candidates = self.executor.run(&less.free, &self.coarse, &candidates, PRESCREEN_EVALUATIONS)?;
+            let first_budget_candidates = merge_duplicates(&self.first_budget_candidates, is_same_optimum);
+            let candidates_with_start = first_budget_candidates.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
+            let candidates: Vec<Candidate> =
+                candidates_with_start.map(|candidate| submodel.restrict(candidate, self.parameter_set)).collect();
+            let mut candidates = self.executor.run(
+                &submodel.parameter_set,
+                &self.coarse_objective,
+                &candidates,
+                PRESCREEN_EVALUATIONS,
+            )?;
             candidates.truncate(MAX_FINAL_SURVIVORS);
-            let ended = self.executor.run(&less.free, &self.coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
-            return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
+            let results = self.executor.run(
+                &submodel.parameter_set,
+                &self.coarse_objective,
+                &candidates,
+                FIRST_BUDGET_EVALUATIONS,
+            )?;
+            return self.evaluate_and_add(
+                &results.iter().take(1).map(|r| submodel.embed(r, self.parameter_set)).collect::<Vec<_>>(),
+            );
         }
-        let level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
-        let ended = optimize_submodel(&less.free, self.context, &self.coarse, SUBMODEL_SURVIVORS, level)?;
-        self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
+        let cost_level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
+        let results = optimize_submodel(
+            &submodel.parameter_set,
+            self.context,
+            &self.coarse_objective,
+            SUBMODEL_SURVIVORS,
+            cost_level,
+        )?;
+        self.evaluate_and_add(
+            &results.iter().take(1).map(|r| submodel.embed(r, self.parameter_set)).collect::<Vec<_>>(),
+        )
     }
 
     /// Add the optimum with one order fixed as a candidate, so that the full problem does not fit worse than this
     /// submodel.
-    fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
-        let level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
-        if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.context.floor {
+    fn add_fixed_order_model(&mut self, submodel: &FixedOrderProblem, time_scaling: &TimeScaling) -> Result<()> {
+        let cost_level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
+        if submodel.parameter_set.orders.len() == 1 && cost_level > NOISE_FLOOR_FACTOR * self.context.noise_floor {
             // Within its bounds, the submodel may have no order grid.
-            if let Some((ended, _)) =
-                none_if_invalid_model(multistart_without_history(&one.free, self.context.for_submodel()))?
+            if let Some((results, _)) =
+                none_if_invalid_model(multistart_without_history(&submodel.parameter_set, self.context.for_submodel()))?
             {
-                let embedded = competitive_candidates(&ended).into_iter().take(MAX_FINAL_SURVIVORS);
-                let embedded = embedded.map(|candidate| one.embed(&candidate, self.free));
-                return self.evaluate_and_add(&embedded.collect::<Vec<_>>());
+                let embedded_candidates = competitive_candidates(&results).into_iter().take(MAX_FINAL_SURVIVORS);
+                let embedded_candidates =
+                    embedded_candidates.map(|candidate| submodel.embed(&candidate, self.parameter_set));
+                return self.evaluate_and_add(&embedded_candidates.collect::<Vec<_>>());
             }
         }
         // Start from the optima found so far and from those with integer orders.
-        let (reached, first) =
-            (merge_duplicates(&self.candidates, is_same_optimum), merge_duplicates(&self.first, is_same_optimum));
-        let sources = reached
+        let (distinct_candidates, first) = (
+            merge_duplicates(&self.candidates, is_same_optimum),
+            merge_duplicates(&self.first_budget_candidates, is_same_optimum),
+        );
+        let sources = distinct_candidates
             .iter()
             .take(MAX_FINAL_SURVIVORS)
             .chain(first.iter().take(MAX_FINAL_SURVIVORS))
             .chain(&self.integer_order_optima);
-        let candidates: Vec<Candidate> = sources.map(|candidate| one.restrict(candidate, unit)).collect();
+        let candidates: Vec<Candidate> = sources.map(|candidate| submodel.restrict(candidate, time_scaling)).collect();
         let mut candidates = merge_duplicates(
-            &self.executor.run(&one.free, &self.coarse, &candidates, PRESCREEN_EVALUATIONS)?,
+            &self.executor.run(&submodel.parameter_set, &self.coarse_objective, &candidates, PRESCREEN_EVALUATIONS)?,
             is_same_iterate,
         );
         candidates.truncate(MAX_FINAL_SURVIVORS);
-        let ended = self.executor.run(&one.free, &self.coarse, &candidates, FIRST_BUDGET_EVALUATIONS)?;
+        let results = self.executor.run(
+            &submodel.parameter_set,
+            &self.coarse_objective,
+            &candidates,
+            FIRST_BUDGET_EVALUATIONS,
+        )?;
         self.evaluate_and_add(
-            &ended.iter().take(1).map(|candidate| one.embed(candidate, self.free)).collect::<Vec<_>>(),
+            &results.iter().take(1).map(|candidate| submodel.embed(candidate, self.parameter_set)).collect::<Vec<_>>(),
         )
     }
 
@@ -360,15 +421,16 @@ impl<'a> MultistartState<'a> {
     ///
     /// With a free offset per run, a fit may converge to an optimum that does not use the true input.
     fn add_model_without_offset(&mut self) -> Result<()> {
-        let structure = &self.free.structure;
-        let plain = structure.initial.without_offset();
-        if structure.coupled || plain == structure.initial {
+        let structure = &self.parameter_set.structure;
+        let initial_without_offset = structure.initial.without_offset();
+        if structure.coupled || initial_without_offset == structure.initial {
             return Ok(());
         }
-        let plain = ParameterSet::from_structure(ParametricStructure { initial: plain, ..structure.clone() })?;
-        let mut ended = run_multistart(&plain, self.context.for_submodel())?;
-        ended.truncate(MAX_FINAL_SURVIVORS);
-        self.add(ended);
+        let set_without_offset =
+            ParameterSet::from_structure(ParametricStructure { initial: initial_without_offset, ..structure.clone() })?;
+        let mut results = run_multistart(&set_without_offset, self.context.for_submodel())?;
+        results.truncate(MAX_FINAL_SURVIVORS);
+        self.add(results);
         Ok(())
     }
 
@@ -376,39 +438,46 @@ impl<'a> MultistartState<'a> {
     ///
     /// Return the candidates and the objective on which they were optimized.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
-        let reached = merge_duplicates(&self.candidates, is_same_optimum);
-        let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
+        let distinct_candidates = merge_duplicates(&self.candidates, is_same_optimum);
+        let (survivors, remaining) = distinct_candidates.split_at(competitive_candidates(&distinct_candidates).len());
         let budget = FIRST_BUDGET_EVALUATIONS + SECOND_BUDGET_EVALUATIONS;
         let (survivors, mut candidates) = split_by_prospect(survivors.to_vec(), budget);
-        let short = self.executor.run(self.free, &self.coarse, &survivors, FIRST_BUDGET_EVALUATIONS)?;
-        let (near, ended) = split_by_prospect(short, SECOND_BUDGET_EVALUATIONS);
-        candidates.extend(ended);
-        let (unfinished, ended) = split_unfinished(near, self.context.floor);
-        candidates.extend(ended);
-        candidates.extend(self.executor.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?);
-        let mut candidates = rank_candidates(&self.coarse, self.half, sort_by_cost(candidates))?;
-        candidates.extend_from_slice(rest);
-        Ok((candidates, self.coarse))
+        let short_fits =
+            self.executor.run(self.parameter_set, &self.coarse_objective, &survivors, FIRST_BUDGET_EVALUATIONS)?;
+        let (promising, results) = split_by_prospect(short_fits, SECOND_BUDGET_EVALUATIONS);
+        candidates.extend(results);
+        let (unfinished, results) = split_unfinished(promising, self.context.noise_floor);
+        candidates.extend(results);
+        candidates.extend(self.executor.run(
+            self.parameter_set,
+            &self.coarse_objective,
+            &unfinished,
+            SECOND_BUDGET_EVALUATIONS,
+        )?);
+        let mut candidates = rank_candidates(&self.coarse_objective, self.halved_objective, sort_by_cost(candidates))?;
+        candidates.extend_from_slice(remaining);
+        Ok((candidates, self.coarse_objective))
     }
 }
 
-/// Sort candidates by the larger of their costs at the step of `coarse` and at half that step.
+/// Sort candidates by the larger of their costs at the step of `coarse_objective` and at half that step.
 ///
-/// If they cannot be sampled at half the step, sort them by their cost on `coarse`.
+/// If they cannot be sampled at half the step, sort them by their cost on `coarse_objective`.
 fn rank_candidates(
-    coarse: &Objective<'_>,
-    half: Option<Objective<'_>>,
+    coarse_objective: &Objective<'_>,
+    halved_objective: Option<Objective<'_>>,
     candidates: Vec<Candidate>,
 ) -> Result<Vec<Candidate>> {
     if candidates.is_empty() {
         return Ok(candidates);
     }
-    let half = match half.map_or_else(|| coarse.finer(), Ok) {
+    let halved_objective = match halved_objective.map_or_else(|| coarse_objective.finer(), Ok) {
         Err(Error::Interrupted) => return Err(Error::Interrupted),
         Err(_) => return Ok(sort_by_cost(candidates)),
-        Ok(half) => half,
+        Ok(halved_objective) => halved_objective,
     };
-    let order = half.rank_results(&candidates.iter().map(|candidate| &candidate.result).collect::<Vec<_>>())?;
+    let order =
+        halved_objective.rank_results(&candidates.iter().map(|candidate| &candidate.result).collect::<Vec<_>>())?;
     let mut candidates: Vec<Option<Candidate>> = candidates.into_iter().map(Some).collect();
     Ok(order.into_iter().filter_map(|i| candidates[i].take()).collect())
 }
@@ -417,25 +486,36 @@ fn rank_candidates(
 ///
 /// The initial terms are added for the survivors only, because they shift most optima by less than the distance between
 /// two optima. The survivors are ranked again after a budget with all initial terms.
-fn multistart_with_history(free: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    let few = free.with_initial_terms(free.structure.initial.with_base(Initial::Caputo), false)?;
-    let (reached, coarse) = multistart_without_history(&few, context)?;
-    let (reached, coarse) = (merge_duplicates(&reached, is_same_optimum), coarse.with_problem(&free.problem));
-    let executor = RungExecutor { starts: reached.len(), threads: context.threads, listener: None };
-    let ends = executor.run_each(free, &coarse, &reached, 0)?;
-    let levels: Vec<f64> =
-        ends.iter().map(|end| end.as_ref().map_or(f64::INFINITY, Candidate::cost_per_residual)).collect();
-    let mut order: Vec<usize> = (0..reached.len()).collect();
-    order.sort_by(|&i, &j| levels[i].total_cmp(&levels[j]));
-    let limit = order.first().map_or(0.0, |&i| MAX_SURVIVOR_COST_RATIO * levels[i]);
-    let selected: Vec<Candidate> =
-        order.iter().take(SUBMODEL_SURVIVORS).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
-    let mut rest = order[selected.len()..].to_vec();
-    rest.sort_unstable();
-    let mut leaders =
-        rank_candidates(&coarse, None, executor.run(free, &coarse, &selected, FIRST_BUDGET_EVALUATIONS)?)?;
-    leaders.extend(rest.into_iter().map(|i| reached[i].clone()));
-    Ok(merge_duplicates(&leaders, is_same_optimum))
+fn multistart_with_history(parameter_set: &ParameterSet, context: MultistartContext<'_>) -> Result<Vec<Candidate>> {
+    let few_terms_set =
+        parameter_set.with_initial_terms(parameter_set.structure.initial.with_base(Initial::Caputo), false)?;
+    let (caputo_candidates, coarse_objective) = multistart_without_history(&few_terms_set, context)?;
+    let (caputo_candidates, coarse_objective) =
+        (merge_duplicates(&caputo_candidates, is_same_optimum), coarse_objective.with_problem(&parameter_set.problem));
+    let executor = RungExecutor { start_count: caputo_candidates.len(), threads: context.threads, listener: None };
+    let evaluations = executor.run_each(parameter_set, &coarse_objective, &caputo_candidates, 0)?;
+    let cost_levels: Vec<f64> = evaluations
+        .iter()
+        .map(|evaluation| evaluation.as_ref().map_or(f64::INFINITY, Candidate::cost_per_residual))
+        .collect();
+    let mut order: Vec<usize> = (0..caputo_candidates.len()).collect();
+    order.sort_by(|&i, &j| cost_levels[i].total_cmp(&cost_levels[j]));
+    let cost_limit = order.first().map_or(0.0, |&i| MAX_SURVIVOR_COST_RATIO * cost_levels[i]);
+    let selected: Vec<Candidate> = order
+        .iter()
+        .take(SUBMODEL_SURVIVORS)
+        .filter(|&&i| cost_levels[i] <= cost_limit)
+        .map(|&i| caputo_candidates[i].clone())
+        .collect();
+    let mut remaining = order[selected.len()..].to_vec();
+    remaining.sort_unstable();
+    let mut ranked = rank_candidates(
+        &coarse_objective,
+        None,
+        executor.run(parameter_set, &coarse_objective, &selected, FIRST_BUDGET_EVALUATIONS)?,
+    )?;
+    ranked.extend(remaining.into_iter().map(|i| caputo_candidates[i].clone()));
+    Ok(merge_duplicates(&ranked, is_same_optimum))
 }
 
 /// Optimize candidates on subsampled records and return the best ones, best first.
@@ -445,18 +525,18 @@ fn multistart_with_history(free: &ParameterSet, context: MultistartContext<'_>) 
 /// # Errors
 /// An error if the runs cannot be sampled at a shorter step. [`crate::error::Error::Interrupted`] after a stop request.
 pub(super) fn optimize_on_coarse_grids(
-    free: &ParameterSet,
-    coarse: &Objective<'_>,
+    parameter_set: &ParameterSet,
+    coarse_objective: &Objective<'_>,
     starts: &[Candidate],
     threads: usize,
 ) -> Result<Vec<Candidate>> {
-    let executor = RungExecutor { starts: starts.len(), threads, listener: None };
-    let mut coarse = coarse.clone();
-    let mut ended = executor.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
-    while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && ended.is_empty() {
-        coarse = coarse.finer()?;
-        ended = executor.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
+    let executor = RungExecutor { start_count: starts.len(), threads, listener: None };
+    let mut coarse_objective = coarse_objective.clone();
+    let mut results = executor.run(parameter_set, &coarse_objective, starts, FIRST_BUDGET_EVALUATIONS)?;
+    while coarse_objective.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && results.is_empty() {
+        coarse_objective = coarse_objective.finer()?;
+        results = executor.run(parameter_set, &coarse_objective, starts, FIRST_BUDGET_EVALUATIONS)?;
     }
-    ended.truncate(2 * MAX_FINAL_SURVIVORS);
-    executor.run(free, &coarse, &ended, SECOND_BUDGET_EVALUATIONS)
+    results.truncate(2 * MAX_FINAL_SURVIVORS);
+    executor.run(parameter_set, &coarse_objective, &results, SECOND_BUDGET_EVALUATIONS)
 }

@@ -45,38 +45,44 @@ struct RunFriction {
 /// [`Error::Interrupted`](crate::error::Error::Interrupted) after a stop request.
 pub(super) fn fit_sliding_body(
     runs: &[Recording],
-    item: &ParametricEquation,
+    equation: &ParametricEquation,
     stop: &Stop,
 ) -> Result<BTreeMap<String, f64>> {
-    let Some((factor, Coefficient::Free(strength))) = item.friction.as_ref().map(|friction| &friction.coulomb) else {
+    let Some((factor, Coefficient::Free(coulomb_name))) = equation.friction.as_ref().map(|friction| &friction.coulomb)
+    else {
         return Ok(BTreeMap::new());
     };
-    let alpha = item.order.constant;
-    if item.terms.is_empty() || item.terms.iter().any(|term| alpha < term.order.constant) {
+    let alpha = equation.order.constant;
+    if equation.terms.is_empty() || equation.terms.iter().any(|term| alpha < term.order.constant) {
         return Ok(BTreeMap::new());
     }
-    let mut parts = runs.iter().map(|run| RunFriction::of(run, item.output)).collect::<Result<Vec<_>>>()?;
-    let rest: Vec<Vec<bool>> = parts.iter().map(|part| part.sign.iter().map(|v| *v == 0.0).collect()).collect();
+    let mut run_frictions =
+        runs.iter().map(|run| RunFriction::from_run(run, equation.output)).collect::<Result<Vec<_>>>()?;
+    let is_at_rest: Vec<Vec<bool>> =
+        run_frictions.iter().map(|run_friction| run_friction.sign.iter().map(|v| *v == 0.0).collect()).collect();
     let mut estimates = BTreeMap::new();
     for _ in 0..MAX_REST_ITERATIONS {
         stop.check()?;
-        estimates = signed_least_squares(item, &parts);
-        let Some(coulomb) = estimates.get(strength).map(|value| factor * value).filter(|coulomb| *coulomb > 0.0) else {
+        estimates = signed_least_squares(equation, &run_frictions);
+        let Some(coulomb) = estimates.get(coulomb_name).map(|value| factor * value).filter(|coulomb| *coulomb > 0.0)
+        else {
             break;
         };
-        for (part, at_rest) in parts.iter_mut().zip(&rest) {
-            let mut push = vec![0.0; part.sign.len()];
-            for term in item.input_terms().filter(|term| term.order.constant == 0.0) {
-                let free = || {
+        for (run_friction, pulses_at_rest) in run_frictions.iter_mut().zip(&is_at_rest) {
+            let mut forces = vec![0.0; run_friction.sign.len()];
+            for term in equation.input_terms().filter(|term| term.order.constant == 0.0) {
+                let free_coefficient = || {
                     term.coefficient
                         .name()
                         .map_or(0.0, |name| term.factor * estimates.get(name).copied().unwrap_or(0.0))
                 };
-                let value = term.fixed_coefficient().unwrap_or_else(free);
-                push.iter_mut().zip(part.record.signal(term.signal)).for_each(|(p, v)| *p += value * v);
+                let value = term.fixed_coefficient().unwrap_or_else(free_coefficient);
+                forces.iter_mut().zip(run_friction.record.signal(term.signal)).for_each(|(p, v)| *p += value * v);
             }
-            for ((sign, push), _) in part.sign.iter_mut().zip(push).zip(at_rest).filter(|(_, at_rest)| **at_rest) {
-                *sign = (push / coulomb).clamp(-1.0, 1.0);
+            for ((sign, force), _) in
+                run_friction.sign.iter_mut().zip(forces).zip(pulses_at_rest).filter(|(_, at_rest)| **at_rest)
+            {
+                *sign = (force / coulomb).clamp(-1.0, 1.0);
             }
         }
     }
@@ -85,18 +91,18 @@ pub(super) fn fit_sliding_body(
 
 impl RunFriction {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn of(run: &Recording, output: usize) -> Result<Self> {
+    fn from_run(run: &Recording, output: usize) -> Result<Self> {
         let m = run.len() - 1;
         let record = run.pulses(m, false)?.into_record()?;
         let finite: Vec<f64> = run.channel(output)?.samples.iter().copied().filter(|v| !v.is_nan()).collect();
-        let least = VELOCITY_NOISE_RATIO * white_noise_deviation(&finite);
+        let min_displacement = VELOCITY_NOISE_RATIO * white_noise_deviation(&finite);
         let span = ((VELOCITY_SPAN_FRACTION * m as f64).round() as usize).max(1);
         let means = record.signal(output);
         let sign = (0..m).map(|i| {
-            let first = i.saturating_sub(span / 2).min(m - span - 1);
-            let change = means[first + span] - means[first];
-            if change.abs() > least {
-                change.signum()
+            let start = i.saturating_sub(span / 2).min(m - span - 1);
+            let displacement = means[start + span] - means[start];
+            if displacement.abs() > min_displacement {
+                displacement.signum()
             } else {
                 0.0
             }
@@ -107,69 +113,72 @@ impl RunFriction {
 }
 
 /// Return the least-squares coefficients by name, under the sign constraints; empty if the columns are not finite.
-fn signed_least_squares(item: &ParametricEquation, parts: &[RunFriction]) -> BTreeMap<String, f64> {
-    let (alpha, rows) = (item.order.constant, parts.iter().map(|part| part.sign.len()).sum());
-    let stacked = |of: &dyn Fn(&RunFriction) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
-    let mut target = stacked(&|part| part.record.signal(item.output).to_vec());
+fn signed_least_squares(equation: &ParametricEquation, run_frictions: &[RunFriction]) -> BTreeMap<String, f64> {
+    let (alpha, rows) =
+        (equation.order.constant, run_frictions.iter().map(|run_friction| run_friction.sign.len()).sum());
+    let stack_runs = |column_of_run: &dyn Fn(&RunFriction) -> Vec<f64>| {
+        run_frictions.iter().flat_map(column_of_run).collect::<Vec<f64>>()
+    };
+    let mut target = stack_runs(&|run_friction| run_friction.record.signal(equation.output).to_vec());
     // Columns, each with the name of its coefficient. A column occurs with both signs if its coefficient may have any
     // sign.
     let (mut names, mut columns) = (Vec::new(), Vec::new());
-    let mut add = |name: Option<&String>, sides: &[f64], column: &[f64]| {
-        for side in sides {
-            names.push((name.cloned(), *side));
-            columns.push(column.iter().map(|v| side * v).collect::<Vec<f64>>());
+    let mut add_columns = |name: Option<&String>, signs: &[f64], column: &[f64]| {
+        for sign in signs {
+            names.push((name.cloned(), *sign));
+            columns.push(column.iter().map(|v| sign * v).collect::<Vec<f64>>());
         }
     };
-    for term in &item.terms {
-        let column = stacked(&|part| part.record.integral(term.signal, alpha - term.order.constant));
+    for term in &equation.terms {
+        let column = stack_runs(&|run_friction| run_friction.record.integral(term.signal, alpha - term.order.constant));
         match term.fixed_coefficient() {
             Some(value) => target.iter_mut().zip(&column).for_each(|(t, c)| *t -= value * c),
             // The product of coefficient and factor is negative for a term of the output itself.
-            None if term.signal == item.output => {
+            None if term.signal == equation.output => {
                 let column: Vec<f64> = column.iter().map(|v| term.factor * v).collect();
-                add(term.coefficient.name(), &[-term.factor.signum()], &column);
+                add_columns(term.coefficient.name(), &[-term.factor.signum()], &column);
             }
             None => {
                 let column: Vec<f64> = column.iter().map(|v| term.factor * v).collect();
-                add(term.coefficient.name(), &[1.0, -1.0], &column);
+                add_columns(term.coefficient.name(), &[1.0, -1.0], &column);
             }
         }
     }
-    if let Some((factor, coefficient)) = item.friction.as_ref().map(|friction| &friction.coulomb) {
-        let force = |part: &RunFriction| {
-            let m = part.sign.len();
-            let integral = series::multiply(&kernel(alpha, m, part.record.step()), &part.sign, m);
+    if let Some((factor, coefficient)) = equation.friction.as_ref().map(|friction| &friction.coulomb) {
+        let friction_column = |run_friction: &RunFriction| {
+            let m = run_friction.sign.len();
+            let integral = series::multiply(&kernel(alpha, m, run_friction.record.step()), &run_friction.sign, m);
             integral.into_iter().map(|v| -factor * v).collect()
         };
-        add(coefficient.name(), &[1.0], &stacked(&force));
+        add_columns(coefficient.name(), &[1.0], &stack_runs(&friction_column));
     }
-    let mut first = 0;
-    for part in parts {
-        let m = part.sign.len();
+    let mut row_start = 0;
+    for run_friction in run_frictions {
+        let m = run_friction.sign.len();
         for exponent in [0.0, 1.0, alpha] {
             let mut column = vec![0.0; rows];
-            column[first..first + m].copy_from_slice(&power_means(exponent, m, part.record.step()));
-            add(None, &[1.0, -1.0], &column);
+            column[row_start..row_start + m].copy_from_slice(&power_means(exponent, m, run_friction.record.step()));
+            add_columns(None, &[1.0, -1.0], &column);
         }
-        first += m;
+        row_start += m;
     }
-    let sizes: Vec<f64> = columns.iter().map(|column| norm(column)).collect();
-    if !sizes.iter().all(|size| size.is_finite()) {
+    let norms: Vec<f64> = columns.iter().map(|column| norm(column)).collect();
+    if !norms.iter().all(|column_norm| column_norm.is_finite()) {
         return BTreeMap::new();
     }
-    for (column, size) in columns.iter_mut().zip(&sizes).filter(|(_, size)| **size > 0.0) {
-        column.iter_mut().for_each(|v| *v /= size);
+    for (column, column_norm) in columns.iter_mut().zip(&norms).filter(|(_, column_norm)| **column_norm > 0.0) {
+        column.iter_mut().for_each(|v| *v /= column_norm);
     }
     // The triangular factor has the same inner products as the columns, but is small.
     columns.push(target);
     let (k, factor) = (columns.len(), triangular_factor(&columns));
-    let mut small: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
-    let target_values = small.pop().unwrap_or_default();
-    let solved = nonnegative_solution(&small, &target_values);
+    let mut factor_columns: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
+    let target_values = factor_columns.pop().unwrap_or_default();
+    let solution = nonnegative_solution(&factor_columns, &target_values);
     let mut estimates = BTreeMap::new();
-    for (((name, side), size), x) in names.into_iter().zip(sizes).zip(solved) {
+    for (((name, sign), column_norm), x) in names.into_iter().zip(norms).zip(solution) {
         if let Some(name) = name {
-            *estimates.entry(name).or_insert(0.0) += if size > 0.0 { side * x / size } else { 0.0 };
+            *estimates.entry(name).or_insert(0.0) += if column_norm > 0.0 { sign * x / column_norm } else { 0.0 };
         }
     }
     estimates
@@ -207,17 +216,17 @@ mod tests {
             coefficient: free(name),
             factor: 1.0,
         };
-        let item = ParametricEquation {
+        let equation = ParametricEquation {
             output: 0,
             order: Order::number(2.0),
             terms: vec![term(0, 1.0, "v"), term(1, 0.0, "b"), term(0, 0.0, "k")],
             friction: Some(FrictionParameters {
                 coulomb: (1.0, free("fc")),
-                stribeck: (1.0, Coefficient::Known(0.0)),
-                speed: (1.0, Coefficient::Known(1.0)),
+                stribeck: (1.0, Coefficient::Fixed(0.0)),
+                speed: (1.0, Coefficient::Fixed(1.0)),
             }),
         };
-        let estimates = fit_sliding_body(&[run], &item, &Stop::default())?;
+        let estimates = fit_sliding_body(&[run], &equation, &Stop::default())?;
         for (name, truth) in [("v", -2.0), ("b", 3.0), ("fc", 0.5)] {
             assert!((estimates[name] / truth - 1.0).abs() < 0.1, "{name}: {estimates:?}");
         }

@@ -55,12 +55,12 @@ impl Interval {
         Self { low: f64::NEG_INFINITY, high: f64::INFINITY, points: Vec::new(), evaluations: 0 }
     }
 
-    /// Shift the finite bounds by `by` and limit them to the bounds of the parameter.
+    /// Shift the finite bounds by `change` and limit them to the bounds of the parameter.
     ///
-    /// `by` is the estimate, extrapolated to step 0, minus the optimum at the step of the profile.
-    pub(super) fn shift(mut self, by: f64, (low, high): (f64, f64)) -> Self {
-        for end in [&mut self.low, &mut self.high].into_iter().filter(|end| end.is_finite()) {
-            *end = (*end + by).clamp(low, high);
+    /// `change` is the estimate, extrapolated to step 0, minus the optimum at the step of the profile.
+    pub(super) fn shift(mut self, change: f64, (low, high): (f64, f64)) -> Self {
+        for bound in [&mut self.low, &mut self.high].into_iter().filter(|bound| bound.is_finite()) {
+            *bound = (*bound + change).clamp(low, high);
         }
         self
     }
@@ -97,11 +97,11 @@ pub struct BoundSearch {
     /// Half-width of the Wald interval, in standard errors.
     width: f64,
     /// Value of the parameter at the optimum.
-    start: f64,
+    optimum_value: f64,
     /// Distance of the first refit from the optimum.
-    first: f64,
+    first_distance: f64,
     /// Maximum distance of a refit from the optimum.
-    farthest: f64,
+    max_distance: f64,
     /// Distance of the next refit from the optimum.
     distance: f64,
     /// Distance between the optimum and the last refit whose cost is below the threshold.
@@ -125,24 +125,24 @@ impl BoundSearch {
     /// Return a search for the lower (`side` −1) or upper (`side` 1) bound; `width` is the half-width of the Wald
     /// interval in standard errors.
     #[must_use]
-    pub fn new(around: &ProfileLikelihood<'_>, parameter: usize, side: f64, width: f64) -> Self {
-        let (start, half) = (around.values()[parameter], around.errors[parameter] * width);
-        let (low, high) = around.bounds()[parameter];
+    pub fn new(likelihood: &ProfileLikelihood<'_>, parameter: usize, side: f64, width: f64) -> Self {
+        let (optimum_value, half_width) = (likelihood.values()[parameter], likelihood.errors[parameter] * width);
+        let (low, high) = likelihood.bounds()[parameter];
         let limit = if side < 0.0 { low } else { high };
         // In an unbounded valley, the standard error is no measure of its length.
-        let first = half.min(start.abs().max(MIN_FIRST_STEP_RATIO * half));
-        let farthest = (MAX_BOUND_DISTANCE * first).min((limit - start).abs());
+        let first_distance = half_width.min(optimum_value.abs().max(MIN_FIRST_STEP_RATIO * half_width));
+        let max_distance = (MAX_BOUND_DISTANCE * first_distance).min((limit - optimum_value).abs());
         Self {
             parameter,
             side,
             width,
-            start,
-            first,
-            farthest,
-            distance: first.min(farthest),
+            optimum_value,
+            first_distance,
+            max_distance,
+            distance: first_distance.min(max_distance),
             inner_distance: 0.0,
             outer_distance: f64::INFINITY,
-            inner_result: around.best.clone(),
+            inner_result: likelihood.optimum.clone(),
             interrupted_result: None,
             refits: 0,
             previous_rise: 0.0,
@@ -158,28 +158,30 @@ impl BoundSearch {
         self.evaluations
     }
 
-    /// Continue the search until it ends or `allowed` simulations have been performed in total.
+    /// Continue the search until it ends or `max_evaluations` simulations have been performed in total.
     ///
     /// # Errors
     /// [`Error::Interrupted`](crate::error::Error::Interrupted) after a stop request.
     pub fn advance(
         &mut self,
-        around: &ProfileLikelihood<'_>,
-        allowed: usize,
+        likelihood: &ProfileLikelihood<'_>,
+        max_evaluations: usize,
         is_cancelled: &dyn Fn() -> bool,
     ) -> Result<BoundOutcome> {
         while self.refits < MAX_REFITS_PER_BOUND
             && (self.interrupted_result.is_some() || self.distance > self.inner_distance)
         {
-            around.stop().check()?;
+            likelihood.stop().check()?;
             if is_cancelled() {
                 return Ok(BoundOutcome::Paused);
             }
             let origin = self.interrupted_result.take().unwrap_or_else(|| self.inner_result.clone());
-            let budget = MAX_REFIT_EVALUATIONS.min(allowed.saturating_sub(self.evaluations));
+            let budget = MAX_REFIT_EVALUATIONS.min(max_evaluations.saturating_sub(self.evaluations));
             let refit = match budget {
                 0 => Refit::Infeasible,
-                _ => around.refit(self.parameter, self.start + self.side * self.distance, &origin, budget)?,
+                _ => {
+                    likelihood.refit(self.parameter, self.optimum_value + self.side * self.distance, &origin, budget)?
+                }
             };
             let refit_result = match refit {
                 Refit::Lower(lower) => {
@@ -189,22 +191,23 @@ impl BoundSearch {
                 Refit::Optimum(refit_result) => Some(refit_result),
                 Refit::Infeasible => None,
             };
-            let used = refit_result.as_ref().map_or(budget, |refit_result| refit_result.evaluations);
-            self.evaluations += used;
-            if budget < MAX_REFIT_EVALUATIONS && used >= budget {
+            let used_evaluations = refit_result.as_ref().map_or(budget, |refit_result| refit_result.evaluations);
+            self.evaluations += used_evaluations;
+            if budget < MAX_REFIT_EVALUATIONS && used_evaluations >= budget {
                 // The result of an interrupted refit is not a point of the profile.
                 self.interrupted_result = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
             }
             self.refits += 1;
-            if let Some(distance) = self.step(around, refit_result) {
-                return Ok(BoundOutcome::Found(self.side_of(self.start + self.side * distance)));
+            if let Some(distance) = self.step(likelihood, refit_result) {
+                return Ok(BoundOutcome::Found(self.side_of(self.optimum_value + self.side * distance)));
             }
         }
         // The interval is bounded only if some finite cost beyond the threshold was computed.
         let is_bounded =
             self.outer_distance.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
-        let bound = if is_bounded { self.start + self.side * self.outer_distance } else { self.side * f64::INFINITY };
+        let bound =
+            if is_bounded { self.optimum_value + self.side * self.outer_distance } else { self.side * f64::INFINITY };
         Ok(BoundOutcome::Found(self.side_of(bound)))
     }
 
@@ -217,21 +220,24 @@ impl BoundSearch {
     }
 
     /// Set the distance of the next refit, or NaN to end the search. Return the distance of the bound if it is found.
-    fn step(&mut self, around: &ProfileLikelihood<'_>, refit_result: Option<OptimizationResult>) -> Option<f64> {
+    fn step(&mut self, likelihood: &ProfileLikelihood<'_>, refit_result: Option<OptimizationResult>) -> Option<f64> {
         let (i, width) = (self.parameter, self.width);
-        let (mut rise, mut following, mut near) = (f64::INFINITY, f64::INFINITY, false);
+        let (mut rise, mut newton_distance, mut is_near) = (f64::INFINITY, f64::INFINITY, false);
         if let Some(refit_result) = &refit_result {
-            rise = around.rise(i, 2.0 * refit_result.cost);
-            self.points.push((self.start + self.side * self.distance + around.shift[i], rise * rise));
-            let slope =
-                if rise > 0.0 { self.side * around.slope(refit_result, i) / (around.units[i] * rise) } else { 0.0 };
+            rise = likelihood.rise(i, 2.0 * refit_result.cost);
+            self.points.push((self.optimum_value + self.side * self.distance + likelihood.shift[i], rise * rise));
+            let slope = if rise > 0.0 {
+                self.side * likelihood.slope(refit_result, i) / (likelihood.units[i] * rise)
+            } else {
+                0.0
+            };
             if slope > 0.0 {
-                following = self.distance + (width - rise) / slope;
+                newton_distance = self.distance + (width - rise) / slope;
             }
-            near = (rise / width - 1.0).abs() <= RISE_TOLERANCE;
-            let short = (following - self.distance).abs() <= BOUND_TOLERANCE * self.distance;
-            if near && short && self.inner_distance < following && following <= self.farthest {
-                return Some(following);
+            is_near = (rise / width - 1.0).abs() <= RISE_TOLERANCE;
+            let is_short = (newton_distance - self.distance).abs() <= BOUND_TOLERANCE * self.distance;
+            if is_near && is_short && self.inner_distance < newton_distance && newton_distance <= self.max_distance {
+                return Some(newton_distance);
             }
         }
         match refit_result {
@@ -241,7 +247,7 @@ impl BoundSearch {
                     // The earlier refit at the outer point did not find the optimum.
                     self.outer_distance = f64::INFINITY;
                 }
-                if self.distance >= self.farthest {
+                if self.distance >= self.max_distance {
                     self.distance = f64::NAN;
                     return None;
                 }
@@ -256,32 +262,32 @@ impl BoundSearch {
                 self.outer_distance = self.distance;
             }
         }
-        let (inside, outside) = (self.inner_distance, self.outer_distance);
-        let closed = outside.is_finite();
-        let scale = outside.min((self.start + self.side * inside).abs()).max(BRACKET_SCALE_RATIO * outside);
-        let narrow = closed && outside - inside <= BOUND_TOLERANCE * scale;
-        if near && !narrow && inside < following && following < outside.min(self.farthest) {
+        let (inner, outer) = (self.inner_distance, self.outer_distance);
+        let is_bracketed = outer.is_finite();
+        let scale = outer.min((self.optimum_value + self.side * inner).abs()).max(BRACKET_SCALE_RATIO * outer);
+        let is_narrow = is_bracketed && outer - inner <= BOUND_TOLERANCE * scale;
+        if is_near && !is_narrow && inner < newton_distance && newton_distance < outer.min(self.max_distance) {
             // Close to the bound, Newton's step is more accurate than a step of fixed ratio.
-            self.distance = following;
-        } else if !closed {
-            let gain = rise - self.previous_rise;
+            self.distance = newton_distance;
+        } else if !is_bracketed {
+            let rise_increment = rise - self.previous_rise;
             self.previous_rise = rise;
-            let levels =
-                gain <= LEVELING_RATIO * self.previous_rise_increment && rise + gain < (1.0 - LEVELING_MARGIN) * width;
-            if levels && self.distance > MAX_STEP_FACTOR * self.first {
+            let is_leveling_off = rise_increment <= LEVELING_RATIO * self.previous_rise_increment
+                && rise + rise_increment < (1.0 - LEVELING_MARGIN) * width;
+            if is_leveling_off && self.distance > MAX_STEP_FACTOR * self.first_distance {
                 self.distance = f64::NAN;
                 return None;
             }
-            self.previous_rise_increment = gain;
-            let longest = (MAX_STEP_FACTOR * self.distance).min(self.farthest);
-            self.distance = following.max(MIN_STEP_FACTOR * self.distance).min(longest);
-        } else if narrow {
-            self.distance = outside;
+            self.previous_rise_increment = rise_increment;
+            let longest_distance = (MAX_STEP_FACTOR * self.distance).min(self.max_distance);
+            self.distance = newton_distance.max(MIN_STEP_FACTOR * self.distance).min(longest_distance);
+        } else if is_narrow {
+            self.distance = outer;
         } else {
-            let margin = BRACKET_MARGIN * (outside - inside);
-            let within = inside < following && following < outside;
-            let next = if within { following } else { self.bracket_midpoint() };
-            self.distance = next.max(inside + margin).min(outside - margin);
+            let margin = BRACKET_MARGIN * (outer - inner);
+            let is_within = inner < newton_distance && newton_distance < outer;
+            let next_distance = if is_within { newton_distance } else { self.bracket_midpoint() };
+            self.distance = next_distance.max(inner + margin).min(outer - margin);
         }
         None
     }
@@ -289,10 +295,12 @@ impl BoundSearch {
     /// Distance from the optimum to the midpoint of the bracket. The midpoint is a geometric mean if the parameter has
     /// the same sign at both ends.
     fn bracket_midpoint(&self) -> f64 {
-        let (inner, outer) =
-            (self.start + self.side * self.inner_distance, self.start + self.side * self.outer_distance);
+        let (inner, outer) = (
+            self.optimum_value + self.side * self.inner_distance,
+            self.optimum_value + self.side * self.outer_distance,
+        );
         if inner * outer > 0.0 {
-            self.side * ((inner * outer).sqrt().copysign(inner) - self.start)
+            self.side * ((inner * outer).sqrt().copysign(inner) - self.optimum_value)
         } else {
             0.5 * (self.inner_distance + self.outer_distance)
         }

@@ -36,7 +36,7 @@ pub struct FitState {
     /// Estimates of all free parameters, extrapolated to step 0.
     pub estimate: Vec<f64>,
     /// Values of all free parameters at the optimum of the finest pulse grid.
-    pub on_grid: Vec<f64>,
+    pub grid_optimum: Vec<f64>,
     /// Weights of outputs and samples.
     pub weights: Weights,
     /// Number of block pulses per sampling interval of the finest pulse grid.
@@ -51,13 +51,13 @@ impl FitState {
     /// Return the objective of the fit with the given number of block pulses per sampling interval.
     fn objective<'a>(
         &self,
-        (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
+        (parameter_set, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
         pulses_per_sample: usize,
     ) -> Result<Objective<'a>> {
-        check_length("values of the free parameters", free.problem.size(), self.estimate.len())?;
-        check_length("values on the grid", free.problem.size(), self.on_grid.len())?;
+        check_length("values of the free parameters", parameter_set.problem.size(), self.estimate.len())?;
+        check_length("values on the grid", parameter_set.problem.size(), self.grid_optimum.len())?;
         let sampling = Sampling { pulses_per_sample, ..Sampling::default() };
-        Objective::new((&free.problem, source, stop), self.weights.clone(), sampling, self.requires_stability)
+        Objective::new((&parameter_set.problem, source, stop), self.weights.clone(), sampling, self.requires_stability)
     }
 }
 
@@ -73,10 +73,10 @@ pub enum Refit {
 
 /// Cost of a joint fit around its optimum.
 pub struct ProfileLikelihood<'a> {
-    free: &'a ParameterSet,
-    grid: Objective<'a>,
+    parameter_set: &'a ParameterSet,
+    objective: Objective<'a>,
     /// Optimum at the step of the profile.
-    pub best: OptimizationResult,
+    pub optimum: OptimizationResult,
     /// Estimate, extrapolated to step 0, minus the optimum at the step of the profile, per parameter.
     pub shift: Vec<f64>,
     /// Inverse of the Gauss–Newton Hessian of the cost, row-major.
@@ -88,7 +88,7 @@ pub struct ProfileLikelihood<'a> {
     /// This is the noise variance, widened for colored residuals.
     pub units: Vec<f64>,
     /// Values of all free parameters of the fit on its finest pulse grid.
-    on_grid: Vec<f64>,
+    grid_optimum: Vec<f64>,
 }
 
 impl<'a> ProfileLikelihood<'a> {
@@ -103,39 +103,47 @@ impl<'a> ProfileLikelihood<'a> {
         fit: &FitState,
         evaluations: usize,
     ) -> Result<Self> {
-        let difference = |best: &[f64]| fit.estimate.iter().zip(best).map(|(a, b)| a - b).collect();
+        let difference = |optimum: &[f64]| fit.estimate.iter().zip(optimum).map(|(a, b)| a - b).collect();
         if fit.step_converged && fit.pulses_per_sample > 1 {
             // Halving the step no longer changes the optimum. A grid half as fine changes it by less than its errors,
             // and its curvature by even less.
             let coarse = fit.objective(sources, fit.pulses_per_sample / 2);
-            match coarse.and_then(|grid| Self::at(sources.0, grid, &fit.on_grid, evaluations)) {
+            match coarse
+                .and_then(|objective| Self::around_optimum(sources.0, objective, &fit.grid_optimum, evaluations))
+            {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
-                Ok(likelihood) if likelihood.best.has_converged() && likelihood.is_near(&fit.on_grid) => {
+                Ok(likelihood) if likelihood.optimum.has_converged() && likelihood.is_near(&fit.grid_optimum) => {
                     return Ok(Self { shift: difference(&likelihood.values()), ..likelihood });
                 }
                 _ => {}
             }
         }
-        let grid = fit.objective(sources, fit.pulses_per_sample)?;
-        let likelihood = Self::at(sources.0, grid, &fit.on_grid, evaluations)?;
-        Ok(Self { shift: difference(&fit.on_grid), ..likelihood })
+        let objective = fit.objective(sources, fit.pulses_per_sample)?;
+        let likelihood = Self::around_optimum(sources.0, objective, &fit.grid_optimum, evaluations)?;
+        Ok(Self { shift: difference(&fit.grid_optimum), ..likelihood })
     }
 
-    fn at(free: &'a ParameterSet, grid: Objective<'a>, values: &[f64], evaluations: usize) -> Result<Self> {
-        let best = minimize(free, &grid, values, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let inverse_hessian = covariance_of_residuals(&best.jacobian, &[], 1.0, grid.problem.model.priors.len())?;
-        let (spread, size) = (covariance(&best, &grid)?, values.len());
-        let diagonal = |of: &[f64]| (0..size).map(|i| of[i * size + i]).collect::<Vec<f64>>();
-        let (variances, curvatures) = (diagonal(&spread), diagonal(&inverse_hessian));
+    fn around_optimum(
+        parameter_set: &'a ParameterSet,
+        objective: Objective<'a>,
+        values: &[f64],
+        evaluations: usize,
+    ) -> Result<Self> {
+        let optimum = minimize(parameter_set, &objective, values, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
+        let inverse_hessian =
+            covariance_of_residuals(&optimum.jacobian, &[], 1.0, objective.problem.model.priors.len())?;
+        let (covariance_matrix, size) = (covariance(&optimum, &objective)?, values.len());
+        let diagonal = |matrix: &[f64]| (0..size).map(|i| matrix[i * size + i]).collect::<Vec<f64>>();
+        let (variances, curvatures) = (diagonal(&covariance_matrix), diagonal(&inverse_hessian));
         Ok(Self {
-            free,
-            grid,
-            best,
+            parameter_set,
+            objective,
+            optimum,
             shift: vec![0.0; size],
             inverse_hessian,
             errors: variances.iter().map(|v| v.sqrt()).collect(),
             units: variances.iter().zip(&curvatures).map(|(v, c)| v / c).collect(),
-            on_grid: values.to_vec(),
+            grid_optimum: values.to_vec(),
         })
     }
 
@@ -143,9 +151,10 @@ impl<'a> ProfileLikelihood<'a> {
     ///
     /// # Errors
     /// The error of the simulation at `values` if it fails. [`Error::Interrupted`] after a stop request.
-    pub fn moved_to(&self, values: &[f64]) -> Result<Self> {
-        let likelihood = Self::at(self.free, self.grid.clone(), values, MAX_REFIT_EVALUATIONS)?;
-        Ok(Self { on_grid: self.on_grid.clone(), ..likelihood })
+    pub fn recenter(&self, values: &[f64]) -> Result<Self> {
+        let likelihood =
+            Self::around_optimum(self.parameter_set, self.objective.clone(), values, MAX_REFIT_EVALUATIONS)?;
+        Ok(Self { grid_optimum: self.grid_optimum.clone(), ..likelihood })
     }
 
     fn is_near(&self, values: &[f64]) -> bool {
@@ -164,25 +173,25 @@ impl<'a> ProfileLikelihood<'a> {
     /// Values of all free parameters at the optimum.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
-        self.best.values()
+        self.optimum.values()
     }
 
     /// Half the sum of squared residuals at the optimum.
     #[must_use]
     pub fn cost(&self) -> f64 {
-        self.best.cost
+        self.optimum.cost
     }
 
     /// Lower and upper bound of each free parameter.
     #[must_use]
     pub fn bounds(&self) -> Vec<(f64, f64)> {
-        self.free.problem.bounds()
+        self.parameter_set.problem.bounds()
     }
 
     /// Cancellation flag.
     #[must_use]
     pub fn stop(&self) -> &'a Stop {
-        self.grid.stop()
+        self.objective.stop()
     }
 
     /// Return true if the data determine parameter `i`.
@@ -206,12 +215,14 @@ impl<'a> ProfileLikelihood<'a> {
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
     pub fn is_lower_on_finer_grid(&self) -> Result<bool> {
-        let cost = |grid: &Objective<'a>, values: &[f64]| -> Result<f64> {
-            Ok(minimize(self.free, grid, values, &[], (0, RELATIVE_COST_TOLERANCE))?.cost)
+        let cost = |objective: &Objective<'a>, values: &[f64]| -> Result<f64> {
+            Ok(minimize(self.parameter_set, objective, values, &[], (0, RELATIVE_COST_TOLERANCE))?.cost)
         };
-        let costs =
-            self.grid.finer().and_then(|finer| Ok((cost(&finer, &self.values())?, cost(&finer, &self.on_grid)?)));
-        Ok(finite(costs)?.is_some_and(|(after, before)| after < before))
+        let costs = self
+            .objective
+            .finer()
+            .and_then(|finer| Ok((cost(&finer, &self.values())?, cost(&finer, &self.grid_optimum)?)));
+        Ok(none_if_failed(costs)?.is_some_and(|(after, before)| after < before))
     }
 
     /// Relative error of the Wald interval of parameter `i` with half-width `width` in standard errors.
@@ -235,12 +246,12 @@ impl<'a> ProfileLikelihood<'a> {
                 return Ok(f64::INFINITY);
             }
             let point = self.point_along(i, &values, &direction, end)?;
-            let Some(refit_result) = finite(self.minimize_others(i, &point, 1, REFIT_TOLERANCE))? else {
+            let Some(refit_result) = none_if_failed(self.minimize_others(i, &point, 1, REFIT_TOLERANCE))? else {
                 return Ok(f64::INFINITY);
             };
             let (sensitivities, _) = other_sensitivities(&refit_result, &[i])?;
-            let rest = projected_residuals(&refit_result, &sensitivities);
-            worst = worst.max((self.rise(i, inner(&rest, &rest)) / width - 1.0).abs());
+            let remaining = projected_residuals(&refit_result, &sensitivities);
+            worst = worst.max((self.rise(i, inner(&remaining, &remaining)) / width - 1.0).abs());
         }
         Ok(worst)
     }
@@ -249,12 +260,14 @@ impl<'a> ProfileLikelihood<'a> {
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
-    pub fn refit(&self, i: usize, value: f64, near: &OptimizationResult, evaluations: usize) -> Result<Refit> {
-        let (rise, least) = (self.units[i], 2.0 * self.cost());
-        let tolerance = REFIT_TOLERANCE * rise / least.max(rise);
-        for point in self.refit_starts(i, value, near)? {
-            let Some(refit_result) = finite(self.minimize_others(i, &point, evaluations, tolerance))? else { continue };
-            let is_lower = 2.0 * refit_result.cost < least - LOWER_OPTIMUM_MARGIN * rise;
+    pub fn refit(&self, i: usize, value: f64, nearby: &OptimizationResult, evaluations: usize) -> Result<Refit> {
+        let (rise, minimum) = (self.units[i], 2.0 * self.cost());
+        let tolerance = REFIT_TOLERANCE * rise / minimum.max(rise);
+        for point in self.refit_starts(i, value, nearby)? {
+            let Some(refit_result) = none_if_failed(self.minimize_others(i, &point, evaluations, tolerance))? else {
+                continue;
+            };
+            let is_lower = 2.0 * refit_result.cost < minimum - LOWER_OPTIMUM_MARGIN * rise;
             return Ok(if is_lower { Refit::Lower(refit_result) } else { Refit::Optimum(refit_result) });
         }
         Ok(Refit::Infeasible)
@@ -277,13 +290,13 @@ impl<'a> ProfileLikelihood<'a> {
     /// The other parameters follow the tangent of the profile, or they are unchanged. If the tangent changes them
     /// strongly, they also follow power laws of parameter `i`, either all of them or only the orders. The reason is
     /// that unbounded valleys often have the form d·μ = const and d + a = const, for parameters d, μ and a.
-    fn refit_starts(&self, i: usize, value: f64, near: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
-        let (values, tangent) = (near.values(), tangent(near, i)?);
-        let (orders, by) = (self.free.orders.len(), value - values[i]);
+    fn refit_starts(&self, i: usize, value: f64, nearby: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
+        let (values, tangent) = (nearby.values(), tangent(nearby, i)?);
+        let (orders, change) = (self.parameter_set.orders.len(), value - values[i]);
         let no_change = vec![0.0; values.len()];
         let mut points =
             vec![self.point_along(i, &values, &tangent, value)?, self.point_along(i, &values, &no_change, value)?];
-        let is_strong = |(t, v): (&f64, &f64)| (t * by).abs() > POWER_LAW_MOVE_RATIO * v.abs();
+        let is_strong = |(t, v): (&f64, &f64)| (t * change).abs() > POWER_LAW_MOVE_RATIO * v.abs();
         if value * values[i] <= 0.0 || !tangent.iter().zip(&values).any(is_strong) {
             return Ok(points);
         }
@@ -292,15 +305,15 @@ impl<'a> ProfileLikelihood<'a> {
             v * (value / values[i]).powf(exponent.clamp(-MAX_POWER_LAW_EXPONENT, MAX_POWER_LAW_EXPONENT))
         };
         let powers: Vec<f64> = tangent.iter().zip(&values).map(power).collect();
-        let mixed = |k: usize| if k < orders { powers[k] } else { values[k] + tangent[k] * by };
-        for mut towards in [powers.clone(), (0..values.len()).map(mixed).collect()] {
-            towards[i] = value;
-            let direction: Vec<f64> = towards.iter().zip(&values).map(|(t, v)| t - v).collect();
+        let mixed_value = |k: usize| if k < orders { powers[k] } else { values[k] + tangent[k] * change };
+        for mut target in [powers.clone(), (0..values.len()).map(mixed_value).collect()] {
+            target[i] = value;
+            let direction: Vec<f64> = target.iter().zip(&values).map(|(t, v)| t - v).collect();
             points.push(self.point_along(i, &values, &direction, value)?);
         }
         let mut ranked = Vec::with_capacity(points.len());
         for point in points {
-            let refit_result = finite(self.minimize_others(i, &point, 0, REFIT_TOLERANCE))?;
+            let refit_result = none_if_failed(self.minimize_others(i, &point, 0, REFIT_TOLERANCE))?;
             ranked.push((refit_result.map_or(f64::INFINITY, |refit_result| refit_result.cost), point));
         }
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -309,15 +322,15 @@ impl<'a> ProfileLikelihood<'a> {
 
     /// Return the point with parameter `i` at `value`, and the others moved along `direction` as far as feasible.
     fn point_along(&self, i: usize, values: &[f64], direction: &[f64], value: f64) -> Result<Vec<f64>> {
-        let mut at = values.to_vec();
-        at[i] = value;
+        let mut start = values.to_vec();
+        start[i] = value;
         if direction[i] == 0.0 {
-            return Ok(at);
+            return Ok(start);
         }
-        let by = value - values[i];
-        let mut towards: Vec<f64> = values.iter().zip(direction).map(|(v, d)| v + d / direction[i] * by).collect();
-        towards[i] = value;
-        let mut point = self.free.problem.last_feasible_point(&at, &towards)?;
+        let change = value - values[i];
+        let mut target: Vec<f64> = values.iter().zip(direction).map(|(v, d)| v + d / direction[i] * change).collect();
+        target[i] = value;
+        let mut point = self.parameter_set.problem.last_feasible_point(&start, &target)?;
         point[i] = value;
         Ok(point)
     }
@@ -329,15 +342,15 @@ impl<'a> ProfileLikelihood<'a> {
         evaluations: usize,
         tolerance: f64,
     ) -> Result<OptimizationResult> {
-        minimize(self.free, &self.grid, values, &[i], (evaluations, tolerance))
+        minimize(self.parameter_set, &self.objective, values, &[i], (evaluations, tolerance))
     }
 }
 
 /// Cost of a joint fit as a function of two of its parameters.
 pub struct CostSurface<'a> {
-    free: &'a ParameterSet,
-    grid: Objective<'a>,
-    best: OptimizationResult,
+    parameter_set: &'a ParameterSet,
+    objective: Objective<'a>,
+    optimum: OptimizationResult,
     pair: [usize; 2],
     /// Orthonormal basis of the sensitivities of the other parameters; None if these are fixed.
     sensitivities: Option<Sensitivities>,
@@ -352,42 +365,43 @@ impl<'a> CostSurface<'a> {
     /// # Errors
     /// The error of the simulation of the fit if it fails. [`Error::Interrupted`] after a stop request.
     pub fn new(
-        (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
+        (parameter_set, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
         fit: &FitState,
         pair: [usize; 2],
         refit: bool,
         evaluations: usize,
     ) -> Result<Self> {
-        let grid = fit.objective((free, source, stop), fit.pulses_per_sample)?;
-        let best = minimize(free, &grid, &fit.estimate, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let sensitivities = if refit { Some(other_sensitivities(&best, &pair)?.0) } else { None };
-        Ok(Self { free, grid, best, pair, sensitivities })
+        let objective = fit.objective((parameter_set, source, stop), fit.pulses_per_sample)?;
+        let optimum = minimize(parameter_set, &objective, &fit.estimate, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
+        let sensitivities = if refit { Some(other_sensitivities(&optimum, &pair)?.0) } else { None };
+        Ok(Self { parameter_set, objective, optimum, pair, sensitivities })
     }
 
     /// Return `points` evenly spaced values of one of the two parameters, `of` = 0 or 1.
     ///
-    /// They are within bounds and differ from the optimum by at most `half`, which has the unit of the parameter.
+    /// They are within bounds and differ from the optimum by at most `half_width`, which has the unit of the parameter.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn axis(&self, of: usize, half: f64, points: usize) -> Vec<f64> {
-        let (at, (low, high)) = (self.best.values()[self.pair[of]], self.free.problem.bounds()[self.pair[of]]);
-        let (low, high) = (low.max(at - half), high.min(at + half));
-        let step = (high - low) / points.saturating_sub(1).max(1) as f64;
-        (0..points).map(|k| if k + 1 == points { high } else { low + k as f64 * step }).collect()
+    pub fn axis(&self, axis: usize, half_width: f64, point_count: usize) -> Vec<f64> {
+        let (center, (low, high)) =
+            (self.optimum.values()[self.pair[axis]], self.parameter_set.problem.bounds()[self.pair[axis]]);
+        let (low, high) = (low.max(center - half_width), high.min(center + half_width));
+        let step = (high - low) / point_count.saturating_sub(1).max(1) as f64;
+        (0..point_count).map(|k| if k + 1 == point_count { high } else { low + k as f64 * step }).collect()
     }
 
     /// Sum of squared residuals at the optimum.
     #[must_use]
-    pub fn least(&self) -> f64 {
-        self.squares(&self.best)
+    pub fn minimum(&self) -> f64 {
+        self.squares(&self.optimum)
     }
 
     fn squares(&self, result: &OptimizationResult) -> f64 {
-        let rest = match &self.sensitivities {
+        let remaining = match &self.sensitivities {
             Some(sensitivities) => projected_residuals(result, sensitivities),
             None => result.residuals.clone(),
         };
-        inner(&rest, &rest)
+        inner(&remaining, &remaining)
     }
 
     /// Return the sum of squares at each pair of parameter values, with one row per value in `second`.
@@ -400,9 +414,15 @@ impl<'a> CostSurface<'a> {
         let mut scores = Vec::with_capacity(first.len() * second.len());
         for y in second {
             for x in first {
-                let mut values = self.best.values();
+                let mut values = self.optimum.values();
                 (values[self.pair[0]], values[self.pair[1]]) = (*x, *y);
-                let result = finite(minimize(self.free, &self.grid, &values, &[], (0, RELATIVE_COST_TOLERANCE)))?;
+                let result = none_if_failed(minimize(
+                    self.parameter_set,
+                    &self.objective,
+                    &values,
+                    &[],
+                    (0, RELATIVE_COST_TOLERANCE),
+                ))?;
                 scores.push(result.map_or(f64::INFINITY, |result| self.squares(&result)));
             }
         }
@@ -412,19 +432,20 @@ impl<'a> CostSurface<'a> {
 
 /// Minimize the cost in plain coordinates, with the parameters `fixed` fixed.
 fn minimize(
-    free: &ParameterSet,
-    grid: &Objective<'_>,
+    parameter_set: &ParameterSet,
+    objective: &Objective<'_>,
     values: &[f64],
     fixed: &[usize],
     (evaluations, tolerance): (usize, f64),
 ) -> Result<OptimizationResult> {
-    let start = Iterate { point: free.problem.point(values)?, states: Vec::new() };
-    let (problem, settings) = (free.problem_at(&start, true, fixed), MinimizationSettings { evaluations, tolerance });
-    problem.minimize(grid.experiments(), &start, settings, grid.requires_stability, grid.stop())
+    let start = Iterate { point: parameter_set.problem.point(values)?, states: Vec::new() };
+    let (problem, settings) =
+        (parameter_set.problem_at(&start, true, fixed), MinimizationSettings { evaluations, tolerance });
+    problem.minimize(objective.experiments(), &start, settings, objective.requires_stability, objective.stop())
 }
 
 /// Convert the error of a failed simulation to None. [`Error::Interrupted`] remains an error.
-fn finite<T>(outcome: Result<T>) -> Result<Option<T>> {
+fn none_if_failed<T>(outcome: Result<T>) -> Result<Option<T>> {
     match outcome {
         Ok(outcome) => Ok(Some(outcome)),
         Err(Error::Interrupted) => Err(Error::Interrupted),
@@ -437,51 +458,51 @@ type Sensitivities = SingularValues;
 
 /// Return the significant singular values and vectors of the sensitivities, and the norms of the rows.
 ///
-/// The parameters `without` are omitted. Rows are first scaled to norm 1.
-fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
-    let others = result.jacobian.iter().enumerate().filter(|(j, _)| !without.contains(j)).map(|(_, row)| row);
-    let (mut scaled, mut lengths) = (Vec::new(), Vec::new());
-    for row in others {
+/// The parameters with the indices `omitted` are left out. Rows are first scaled to norm 1.
+fn other_sensitivities(result: &OptimizationResult, omitted: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
+    let other_rows = result.jacobian.iter().enumerate().filter(|(j, _)| !omitted.contains(j)).map(|(_, row)| row);
+    let (mut scaled, mut norms) = (Vec::new(), Vec::new());
+    for row in other_rows {
         // Far from the optimum, sensitivities may be so large that their squares overflow.
         let peak = row.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
         let unit: Vec<f64> = row.iter().map(|v| v / if peak > 0.0 { peak } else { 1.0 }).collect();
-        let length = norm(&unit).max(1.0);
-        scaled.push(unit.iter().map(|v| v / length).collect());
-        lengths.push(if peak > 0.0 { peak * length } else { 1.0 });
+        let row_norm = norm(&unit).max(1.0);
+        scaled.push(unit.iter().map(|v| v / row_norm).collect());
+        norms.push(if peak > 0.0 { peak * row_norm } else { 1.0 });
     }
-    let failed = || Error::Internal { what: "sensitivities without singular values".into() };
+    let singular_value_error = || Error::Internal { what: "sensitivities without singular values".into() };
     let mut factors = if scaled.is_empty() {
         SingularValues { left: Vec::new(), values: Vec::new(), right: Vec::new() }
     } else {
-        dense::singular_values(&scaled).ok_or_else(failed)?
+        dense::singular_values(&scaled).ok_or_else(singular_value_error)?
     };
-    let largest = factors.values.iter().copied().fold(0.0, f64::max);
-    let rank = factors.values.iter().filter(|size| **size > SINGULAR_VALUE_TOLERANCE * largest).count();
+    let largest_value = factors.values.iter().copied().fold(0.0, f64::max);
+    let rank = factors.values.iter().filter(|size| **size > SINGULAR_VALUE_TOLERANCE * largest_value).count();
     factors.left.truncate(rank);
     factors.values.truncate(rank);
     factors.right.truncate(rank);
-    Ok((factors, lengths))
+    Ok((factors, norms))
 }
 
 /// Return the residuals after one least-squares step of the linearized parameters.
 ///
 /// This is the projection of the residuals orthogonal to `sensitivities`.
 fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
-    let mut rest = result.residuals.clone();
+    let mut remaining = result.residuals.clone();
     for direction in &sensitivities.left {
-        let along = inner(direction, &result.residuals);
-        rest.iter_mut().zip(direction).for_each(|(v, d)| *v -= along * d);
+        let component = inner(direction, &result.residuals);
+        remaining.iter_mut().zip(direction).for_each(|(v, d)| *v -= component * d);
     }
-    rest
+    remaining
 }
 
 /// Derivative of all parameters with respect to parameter `i` along the profile. The derivative of parameter `i` is 1.
 fn tangent(result: &OptimizationResult, i: usize) -> Result<Vec<f64>> {
-    let (SingularValues { left, values, right }, lengths) = other_sensitivities(result, &[i])?;
+    let (SingularValues { left, values, right }, norms) = other_sensitivities(result, &[i])?;
     let weights: Vec<f64> =
         left.iter().zip(&values).map(|(direction, size)| inner(direction, &result.jacobian[i]) / size).collect();
-    let change = |j: usize| right.iter().zip(&weights).map(|(v, w)| v[j] * w).sum::<f64>();
-    let mut tangent: Vec<f64> = lengths.iter().enumerate().map(|(j, length)| -change(j) / length).collect();
+    let parameter_slope = |j: usize| right.iter().zip(&weights).map(|(v, w)| v[j] * w).sum::<f64>();
+    let mut tangent: Vec<f64> = norms.iter().enumerate().map(|(j, row_norm)| -parameter_slope(j) / row_norm).collect();
     tangent.insert(i, 1.0);
     Ok(tangent)
 }

@@ -90,35 +90,37 @@ pub fn profile_intervals(
             inaccurate
         }
     };
-    if settings.budget.is_some_and(|(most, least)| least.saturating_mul(2 * parameters.len()) > most) {
+    if settings.budget.is_some_and(|(max_evaluations, min_per_bound)| {
+        min_per_bound.saturating_mul(2 * parameters.len()) > max_evaluations
+    }) {
         return Ok(ProfileResult { incomplete: parameters, ..ProfileResult::default() });
     }
-    let (cost, mut around, mut spent) = (start.cost(), start, 0);
+    let (cost, mut likelihood, mut evaluations) = (start.cost(), start, 0);
     let mut bounds = Vec::new();
     for _ in 0..MAX_LOWER_OPTIMA {
-        let budget = settings.budget.map(|(most, _)| most.saturating_sub(spent));
-        let bounds_result = search_bounds(&around, &parameters, settings, budget, report)?;
-        (bounds, spent) = (bounds_result.bounds, spent + bounds_result.evaluations);
+        let budget = settings.budget.map(|(max_evaluations, _)| max_evaluations.saturating_sub(evaluations));
+        let bounds_result = search_bounds(&likelihood, &parameters, settings, budget, report)?;
+        (bounds, evaluations) = (bounds_result.bounds, evaluations + bounds_result.evaluations);
         let Some(lower) = bounds_result.lower else { break };
         // For another optimum, the extrapolation to step 0 is not known.
-        around = around.moved_to(&lower)?;
+        likelihood = likelihood.recenter(&lower)?;
     }
-    let units: Vec<f64> = around.units.iter().copied().filter(|unit| unit.is_finite()).collect();
-    let is_lower = !units.is_empty() && 2.0 * (cost - around.cost()) > MIN_COST_REDUCTION * median(units);
-    let mut result = ProfileResult { evaluations: spent, ..ProfileResult::default() };
+    let units: Vec<f64> = likelihood.units.iter().copied().filter(|unit| unit.is_finite()).collect();
+    let is_lower = !units.is_empty() && 2.0 * (cost - likelihood.cost()) > MIN_COST_REDUCTION * median(units);
+    let mut result = ProfileResult { evaluations, ..ProfileResult::default() };
     if is_lower {
-        result.lower_optimum = Some(around.values());
-        result.lower_on_finer_grid = around.is_lower_on_finer_grid()?;
+        result.lower_optimum = Some(likelihood.values());
+        result.lower_on_finer_grid = likelihood.is_lower_on_finer_grid()?;
     }
     for i in parameters {
-        let own: Vec<&(usize, Option<Interval>)> = bounds.iter().filter(|(of, _)| *of == i).collect();
-        if own.iter().any(|(_, bounds_result)| bounds_result.is_none()) {
+        let bounds_of_parameter: Vec<&(usize, Option<Interval>)> = bounds.iter().filter(|(of, _)| *of == i).collect();
+        if bounds_of_parameter.iter().any(|(_, bounds_result)| bounds_result.is_none()) {
             result.incomplete.push(i);
             continue;
         }
-        let sides = own.into_iter().filter_map(|(_, bounds_result)| bounds_result.clone());
-        let whole = sides.reduce(Interval::intersect).unwrap_or_else(Interval::whole_line);
-        result.intervals.push((i, whole.shift(around.shift[i], around.bounds()[i])));
+        let sides = bounds_of_parameter.into_iter().filter_map(|(_, bounds_result)| bounds_result.clone());
+        let interval = sides.reduce(Interval::intersect).unwrap_or_else(Interval::whole_line);
+        result.intervals.push((i, interval.shift(likelihood.shift[i], likelihood.bounds()[i])));
     }
     Ok(result)
 }
@@ -126,7 +128,7 @@ pub fn profile_intervals(
 /// Result of the search for all bounds: one interval per parameter and side, or None if it is not found.
 ///
 /// `lower` is a lower optimum that ended the search, and `evaluations` the number of simulations.
-struct FoundBounds {
+struct BoundsResult {
     bounds: Vec<(usize, Option<Interval>)>,
     lower: Option<Vec<f64>>,
     evaluations: usize,
@@ -136,49 +138,49 @@ struct FoundBounds {
 ///
 /// The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
 fn search_bounds(
-    around: &ProfileLikelihood<'_>,
+    likelihood: &ProfileLikelihood<'_>,
     parameters: &[usize],
     settings: &ProfileSettings,
     budget: Option<usize>,
     report: &ProgressListener<'_>,
-) -> Result<FoundBounds> {
-    let sides = parameters.iter().filter(|&&i| around.is_identifiable(i)).flat_map(|&i| [(i, -1.0), (i, 1.0)]);
+) -> Result<BoundsResult> {
+    let sides = parameters.iter().filter(|&&i| likelihood.is_identifiable(i)).flat_map(|&i| [(i, -1.0), (i, 1.0)]);
     let mut searches: Vec<BoundSearch> =
-        sides.map(|(i, side)| BoundSearch::new(around, i, side, settings.width)).collect();
+        sides.map(|(i, side)| BoundSearch::new(likelihood, i, side, settings.width)).collect();
     let total = searches.len();
     let mut bounds: Vec<(usize, Option<Interval>)> = searches.iter().map(|search| (search.parameter, None)).collect();
     let (workers, first_lower) = (pool(settings.threads.max(1))?, AtomicUsize::new(usize::MAX));
     let mut evaluations = vec![0; total];
-    let mut lower = None;
+    let mut lower_optimum = None;
     while bounds.iter().any(|(_, bound)| bound.is_none()) {
-        let open = bounds.iter().filter(|(_, bound)| bound.is_none()).count();
+        let open_count = bounds.iter().filter(|(_, bound)| bound.is_none()).count();
         // Budgets are assigned in whole rounds, so that they do not depend on the number of threads.
-        let share = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |most| {
-            most.saturating_sub(evaluations.iter().sum()) / open
+        let budget_per_search = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |max_evaluations| {
+            max_evaluations.saturating_sub(evaluations.iter().sum()) / open_count
         });
-        if share < MIN_BUDGET_PER_BOUND {
+        if budget_per_search < MIN_BUDGET_PER_BOUND {
             break;
         }
-        let (send, receive) = channel();
+        let (sender, receiver) = channel();
         let mut outcomes: Vec<Option<BoundOutcome>> = (0..total).map(|_| None).collect();
         workers.in_place_scope(|scope| {
             for (k, search) in searches.iter_mut().enumerate().filter(|(k, _)| bounds[*k].1.is_none()) {
-                let (send, allowed, first_lower) = (send.clone(), evaluations[k] + share, &first_lower);
+                let (sender, allowed, first_lower) = (sender.clone(), evaluations[k] + budget_per_search, &first_lower);
                 scope.spawn(move |_| {
-                    let bound = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
+                    let bound = search.advance(likelihood, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
                     if matches!(bound, Ok(BoundOutcome::Lower(_))) {
                         first_lower.fetch_min(k, Ordering::Relaxed);
                     }
-                    drop(send.send((k, bound)));
+                    drop(sender.send((k, bound)));
                 });
             }
-            drop(send);
-            let mut count = total - open;
-            for (k, bound) in receive {
-                let bound = bound.inspect_err(|_| around.stop().set())?;
+            drop(sender);
+            let mut count = total - open_count;
+            for (k, bound) in receiver {
+                let bound = bound.inspect_err(|_| likelihood.stop().set())?;
                 if let BoundOutcome::Found(_) = bound {
                     count += 1;
-                    report(count, total).inspect_err(|_| around.stop().set())?;
+                    report(count, total).inspect_err(|_| likelihood.stop().set())?;
                 }
                 outcomes[k] = Some(bound);
             }
@@ -191,14 +193,14 @@ fn search_bounds(
                 BoundOutcome::Found(interval) => bounds[k].1 = Some(interval),
                 BoundOutcome::Paused => {}
                 BoundOutcome::Lower(values) => {
-                    lower = Some(values);
+                    lower_optimum = Some(values);
                     break;
                 }
             }
         }
-        if lower.is_some() {
+        if lower_optimum.is_some() {
             break;
         }
     }
-    Ok(FoundBounds { bounds, lower, evaluations: evaluations.iter().sum() })
+    Ok(BoundsResult { bounds, lower: lower_optimum, evaluations: evaluations.iter().sum() })
 }
