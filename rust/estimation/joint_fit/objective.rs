@@ -210,7 +210,7 @@ impl<'a> Objective<'a> {
             && runs
                 .flat_map(|(run, (step, _))| run.channels().iter().map(move |c| (c.delay, step)))
                 .all(|(delay, step)| delay.is_none_or(|delay| is_whole(delay, step)))
-            && (IntegerOrders::of(&self.problem.model, &self.experiments, &iterate.point).is_some()
+            && (IntegerOrders::new(&self.problem.model, &self.experiments, &iterate.point).is_some()
                 || FractionalOrders::accepts(&self.problem.model, &self.experiments, &iterate.point))
     }
 

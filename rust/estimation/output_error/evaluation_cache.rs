@@ -50,16 +50,16 @@ impl GridCache {
     /// Return true if an experiment can share the cache of a longer one.
     fn accepts(&self, experiment: &Experiment) -> bool {
         let record = &experiment.record;
-        let filters = match (self.zero_record.filter(), record.filter()) {
+        let filters_match = match (self.zero_record.filter(), record.filter()) {
             (None, None) => true,
-            (Some(long), Some(short)) => long.starts_with(short),
+            (Some(long_filter), Some(short_filter)) => long_filter.starts_with(short_filter),
             _ => false,
         };
-        let long = self.zero_record.m();
-        filters
+        let longest_pulses = self.zero_record.m();
+        filters_match
             && self.zero_record.step().to_bits() == record.step().to_bits()
-            && record.m() <= long
-            && record.m() as f64 >= MIN_LENGTH_RATIO * long as f64
+            && record.m() <= longest_pulses
+            && record.m() as f64 >= MIN_LENGTH_RATIO * longest_pulses as f64
     }
 }
 
@@ -67,7 +67,7 @@ impl GridCache {
 pub(crate) struct EvaluationCache {
     /// Cancellation flag, checked within an evaluation.
     pub(crate) stop: Stop,
-    grid: Rc<RefCell<GridCache>>,
+    grid_cache: Rc<RefCell<GridCache>>,
     /// Length to which series are padded for their spectra.
     pub(crate) total: usize,
     /// Spectra of inputs without a free parameter, by signal and by a flag that is true for a negative integration
@@ -82,13 +82,13 @@ impl EvaluationCache {
     ///
     /// # Errors
     /// An error if a record of zeros cannot be built ([`Record::new`]).
-    pub(crate) fn of(experiments: &[Experiment], stop: &Stop) -> Result<Vec<Self>> {
-        let mut longest: Vec<usize> = (0..experiments.len()).collect();
-        longest.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
-        let mut grids: Vec<Rc<RefCell<GridCache>>> = Vec::new();
-        let mut places: Vec<(usize, Rc<RefCell<GridCache>>)> = Vec::with_capacity(experiments.len());
-        for k in longest {
-            let grid = match grids.iter().find(|grid| grid.borrow().accepts(&experiments[k])) {
+    pub(crate) fn for_experiments(experiments: &[Experiment], stop: &Stop) -> Result<Vec<Self>> {
+        let mut indices_by_length: Vec<usize> = (0..experiments.len()).collect();
+        indices_by_length.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
+        let mut grid_caches: Vec<Rc<RefCell<GridCache>>> = Vec::new();
+        let mut indexed_caches: Vec<(usize, Rc<RefCell<GridCache>>)> = Vec::with_capacity(experiments.len());
+        for k in indices_by_length {
+            let grid_cache = match grid_caches.iter().find(|grid_cache| grid_cache.borrow().accepts(&experiments[k])) {
                 Some(cached) => cached.clone(),
                 None => {
                     let record = &experiments[k].record;
@@ -99,7 +99,7 @@ impl EvaluationCache {
                     )?;
                     let filter = record.filter().map(|series| Rc::new(SeriesFilter::new(series)));
                     let (operators, powers) = (HashMap::new(), HashMap::new());
-                    let grid = Rc::new(RefCell::new(GridCache {
+                    let grid_cache = Rc::new(RefCell::new(GridCache {
                         zero_record,
                         filter,
                         runs: 0,
@@ -107,19 +107,19 @@ impl EvaluationCache {
                         powers,
                         system_inverse: None,
                     }));
-                    grids.push(grid.clone());
-                    grid
+                    grid_caches.push(grid_cache.clone());
+                    grid_cache
                 }
             };
-            grid.borrow_mut().runs += 1;
-            places.push((k, grid));
+            grid_cache.borrow_mut().runs += 1;
+            indexed_caches.push((k, grid_cache));
         }
-        places.sort_by_key(|(k, _)| *k);
-        let cache = |(_, grid): (usize, Rc<RefCell<GridCache>>)| {
-            let total = SPECTRUM_FACTORS * grid.borrow().zero_record.m();
-            Self { stop: stop.clone(), grid, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
+        indexed_caches.sort_by_key(|(k, _)| *k);
+        let cache = |(_, grid_cache): (usize, Rc<RefCell<GridCache>>)| {
+            let total = SPECTRUM_FACTORS * grid_cache.borrow().zero_record.m();
+            Self { stop: stop.clone(), grid_cache, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
         };
-        Ok(places.into_iter().map(cache).collect())
+        Ok(indexed_caches.into_iter().map(cache).collect())
     }
 
     /// Return the responses of `n` outputs to initial terms t^e over at least `m` pulses.
@@ -131,39 +131,41 @@ impl EvaluationCache {
     /// ([`SystemInverse::initial_term_responses`]).
     pub(crate) fn initial_term_responses(
         &self,
-        solved: &SystemInverse,
+        inverse: &SystemInverse,
         (n, m): (usize, usize),
         terms: &[(usize, f64)],
     ) -> Result<Vec<Rc<PulseMeans>>> {
-        let shared = self.is_shared();
-        solved.initial_term_responses((n, if shared { self.pulses() } else { m }), terms, shared, |exponent| {
+        let is_shared = self.is_shared();
+        inverse.initial_term_responses((n, if is_shared { self.pulses() } else { m }), terms, is_shared, |exponent| {
             self.initial_term(exponent)
         })
     }
 
     /// Number of pulses of the longest run that shares the cache.
     pub(crate) fn pulses(&self) -> usize {
-        self.grid.borrow().zero_record.m()
+        self.grid_cache.borrow().zero_record.m()
     }
 
     /// Return true if several runs share the cache.
     fn is_shared(&self) -> bool {
-        self.grid.borrow().runs > 1
+        self.grid_cache.borrow().runs > 1
     }
 
     /// Return the operator of a term of integration order `eta`, from the cache if the order is unchanged.
     ///
-    /// `place` contains the indices of equation and term. `free` is true for a free order.
-    pub(crate) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
-        let mut grid = self.grid.borrow_mut();
-        if let Some(cached) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
-            return cached.clone();
+    /// `term_index` contains the indices of equation and term. `is_free` is true for a free order.
+    pub(crate) fn operator(&self, term_index: (usize, usize), eta: f64, is_free: bool) -> Rc<Operator> {
+        let mut grid_cache = self.grid_cache.borrow_mut();
+        if let Some(operator_from_cache) =
+            grid_cache.operators.get(&term_index).filter(|o| o.eta().to_bits() == eta.to_bits())
+        {
+            return operator_from_cache.clone();
         }
-        let (m, step) = (grid.zero_record.m(), grid.zero_record.step());
+        let (m, step) = (grid_cache.zero_record.m(), grid_cache.zero_record.step());
         // Terms of the same order share an operator.
-        let same_order = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
-        let new_operator = same_order.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
-        grid.operators.insert(place, new_operator.clone());
+        let same_order = grid_cache.operators.values().find(|o| o.matches_order(eta, is_free)).cloned();
+        let new_operator = same_order.unwrap_or_else(|| Rc::new(Operator::new(eta, is_free, m, step)));
+        grid_cache.operators.insert(term_index, new_operator.clone());
         new_operator
     }
 
@@ -178,18 +180,23 @@ impl EvaluationCache {
         bits: Vec<u64>,
         compute: impl FnOnce() -> Result<SystemInverse>,
     ) -> Result<Rc<SystemInverse>> {
-        let cached =
-            self.grid.borrow().system_inverse.as_ref().filter(|(cached, _)| *cached == bits).map(|(_, s)| s.clone());
+        let cached = self
+            .grid_cache
+            .borrow()
+            .system_inverse
+            .as_ref()
+            .filter(|(cached, _)| *cached == bits)
+            .map(|(_, s)| s.clone());
         match cached {
-            Some(solved) => Ok(solved),
+            Some(inverse) => Ok(inverse),
             None => {
                 // Free the memory of the old inverse before computing the new one.
-                self.grid.borrow_mut().system_inverse = None;
-                let solved = Rc::new(compute()?);
+                self.grid_cache.borrow_mut().system_inverse = None;
+                let inverse = Rc::new(compute()?);
                 if self.is_shared() {
-                    self.grid.borrow_mut().system_inverse = Some((bits, solved.clone()));
+                    self.grid_cache.borrow_mut().system_inverse = Some((bits, inverse.clone()));
                 }
-                Ok(solved)
+                Ok(inverse)
             }
         }
     }
@@ -224,30 +231,38 @@ impl EvaluationCache {
 
     /// Return the initial term t^e with e = `exponent` over the length of the longest run.
     pub(crate) fn initial_term(&self, exponent: f64) -> Rc<InitialTerm> {
-        let mut grid = self.grid.borrow_mut();
+        let mut grid_cache = self.grid_cache.borrow_mut();
         // Exponents that change with free orders would fill the cache.
-        if grid.powers.len()
-            > if grid.zero_record.m() > MAX_CACHED_PULSES { MAX_POWERS_LONG_RECORD } else { MAX_POWERS_SHORT_RECORD }
+        if grid_cache.powers.len()
+            > if grid_cache.zero_record.m() > MAX_CACHED_PULSES {
+                MAX_POWERS_LONG_RECORD
+            } else {
+                MAX_POWERS_SHORT_RECORD
+            }
         {
-            grid.powers.clear();
+            grid_cache.powers.clear();
         }
-        if let Some(cached) = grid.powers.get(&exponent.to_bits()) {
-            return cached.clone();
+        if let Some(term_from_cache) = grid_cache.powers.get(&exponent.to_bits()) {
+            return term_from_cache.clone();
         }
-        let term =
-            Rc::new(InitialTerm::new(exponent, grid.zero_record.m(), grid.zero_record.step(), grid.filter.clone()));
-        grid.powers.insert(exponent.to_bits(), term.clone());
+        let term = Rc::new(InitialTerm::new(
+            exponent,
+            grid_cache.zero_record.m(),
+            grid_cache.zero_record.step(),
+            grid_cache.filter.clone(),
+        ));
+        grid_cache.powers.insert(exponent.to_bits(), term.clone());
         term
     }
 
     /// Apply the sensor filter to a series that is not a signal of the record; without a filter, return it unchanged.
     pub(crate) fn filter_series(&self, series: &[f64]) -> Vec<f64> {
-        self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
+        self.grid_cache.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
     }
 
     /// Return the spectrum of the filtered series, padded for a product with one more series.
     pub(crate) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
-        Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
+        Rc::new(filtered_spectrum(series, self.grid_cache.borrow().filter.as_deref(), self.total))
     }
 
     /// Return the weighted samples of the response of the sensor filter to an impulse or to its derivative.

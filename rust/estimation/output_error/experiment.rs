@@ -52,13 +52,13 @@ pub struct PointValues {
 }
 
 impl Experiment {
-    /// Return an experiment with uniform samples, `every` pulses per sampling interval, and no filter.
+    /// Return an experiment with uniform samples, `pulses_per_sample` pulses per sampling interval, and no filter.
     ///
     /// # Errors
-    /// [`Error::Structure`] if the number of pulses is not a multiple of `every`. [`Error::Length`] if the data do not
-    /// match the record. [`Error::NotFinite`] if a value is not finite.
-    pub fn new(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
-        let experiment = Self::new_unchecked(record, every, samples, weights);
+    /// [`Error::Structure`] if the number of pulses is not a multiple of `pulses_per_sample`. [`Error::Length`] if the
+    /// data do not match the record. [`Error::NotFinite`] if a value is not finite.
+    pub fn new(record: Record, pulses_per_sample: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
+        let experiment = Self::new_unchecked(record, pulses_per_sample, samples, weights);
         experiment.check()?;
         Ok(experiment)
     }
@@ -71,9 +71,9 @@ impl Experiment {
         record: Record,
         samples: Vec<Vec<f64>>,
         weights: Vec<f64>,
-        own: NonuniformSamples,
+        nonuniform: NonuniformSamples,
     ) -> Result<Self> {
-        let experiment = Self { nonuniform: Some(own), ..Self::new_unchecked(record, 1, samples, weights) };
+        let experiment = Self { nonuniform: Some(nonuniform), ..Self::new_unchecked(record, 1, samples, weights) };
         experiment.check()?;
         Ok(experiment)
     }
@@ -98,27 +98,27 @@ impl Experiment {
     /// # Errors
     /// [`Error::Length`] if there is not one weight per compared sample of each output. [`Error::NotFinite`] if a
     /// weight is not finite.
-    pub fn with_sample_weights(mut self, shares: Vec<Vec<f64>>) -> Result<Self> {
-        self.sample_weights = shares;
+    pub fn with_sample_weights(mut self, sample_weights: Vec<Vec<f64>>) -> Result<Self> {
+        self.sample_weights = sample_weights;
         self.check()?;
         Ok(self)
     }
 
-    /// Set the weights of the outputs, and multiply the relative weights of the compared samples by `shares`.
+    /// Set the weights of the outputs, and multiply the relative weights of the compared samples by `robust_weights`.
     ///
     /// # Errors
-    /// [`Error::Length`] if `shares` does not match the outputs or the compared samples.
-    pub fn with_weights(mut self, outputs: &[f64], shares: Option<&[Vec<f64>]>) -> Result<Self> {
+    /// [`Error::Length`] if `robust_weights` does not match the outputs or the compared samples.
+    pub fn with_weights(mut self, outputs: &[f64], robust_weights: Option<&[Vec<f64>]>) -> Result<Self> {
         self.weights = outputs.to_vec();
-        let Some(shares) = shares else { return Ok(self) };
-        check_length("outputs with robust weights", self.samples.len(), shares.len())?;
+        let Some(robust_weights) = robust_weights else { return Ok(self) };
+        check_length("outputs with robust weights", self.samples.len(), robust_weights.len())?;
         if self.sample_weights.is_empty() {
-            self.sample_weights = shares.to_vec();
+            self.sample_weights = robust_weights.to_vec();
             return Ok(self);
         }
-        for (row, by) in self.sample_weights.iter_mut().zip(shares) {
-            check_length("robust weights of samples", row.len(), by.len())?;
-            row.iter_mut().zip(by).for_each(|(share, by)| *share *= by);
+        for (row, factors) in self.sample_weights.iter_mut().zip(robust_weights) {
+            check_length("robust weights of samples", row.len(), factors.len())?;
+            row.iter_mut().zip(factors).for_each(|(weight, factor)| *weight *= factor);
         }
         Ok(self)
     }
@@ -128,8 +128,8 @@ impl Experiment {
     /// # Errors
     /// [`Error::Length`] if there is not one value per pulse and one flag per output. [`Error::NotFinite`] if a value
     /// is not finite.
-    pub fn with_filter(mut self, series: Vec<f64>, applies: Vec<bool>) -> Result<Self> {
-        self.filter = Some((series, applies));
+    pub fn with_filter(mut self, series: Vec<f64>, filtered_outputs: Vec<bool>) -> Result<Self> {
+        self.filter = Some((series, filtered_outputs));
         self.check()?;
         Ok(self)
     }
@@ -139,8 +139,8 @@ impl Experiment {
     /// # Errors
     /// [`Error::Length`] if the values do not match the signals or samples. [`Error::NotFinite`] if a value is not
     /// finite.
-    pub fn with_point_values(mut self, instants: Vec<PointValues>) -> Result<Self> {
-        self.point_values = instants;
+    pub fn with_point_values(mut self, point_values: Vec<PointValues>) -> Result<Self> {
+        self.point_values = point_values;
         self.check()?;
         Ok(self)
     }
@@ -151,9 +151,9 @@ impl Experiment {
     /// [`Error::Structure`] if the number of pulses is not a multiple of `pulses_per_sample`. [`Error::Length`] if data
     /// do not match the record, the outputs or the samples. [`Error::NotFinite`] if a value is not finite.
     pub fn check(&self) -> Result<()> {
-        let (m, every) = (self.record.m(), self.pulses_per_sample);
-        if every == 0 || m % every != 0 {
-            let what = format!("{m} pulses are not a multiple of {every} pulses per sample interval");
+        let (m, pulses_per_sample) = (self.record.m(), self.pulses_per_sample);
+        if pulses_per_sample == 0 || m % pulses_per_sample != 0 {
+            let what = format!("{m} pulses are not a multiple of {pulses_per_sample} pulses per sample interval");
             return Err(Error::Structure {
                 what,
                 remedy: "use the same number of pulses in every sample interval".into(),
@@ -163,31 +163,35 @@ impl Experiment {
             check_finite(&format!("samples of output {i}"), samples)?;
             check_length(
                 "samples",
-                self.nonuniform.as_ref().map_or(m / every + 1, |own| own.interpolation.len()),
+                self.nonuniform.as_ref().map_or(m / pulses_per_sample + 1, |nonuniform| nonuniform.interpolation.len()),
                 samples.len(),
             )?;
         }
-        if let Some((series, applies)) = &self.filter {
+        if let Some((series, filtered_outputs)) = &self.filter {
             check_finite("filter", series)?;
             check_length("filter", m, series.len())?;
-            check_length("filtered outputs", self.samples.len(), applies.len())?;
+            check_length("filtered outputs", self.samples.len(), filtered_outputs.len())?;
         }
         if !self.point_values.is_empty() {
             check_length("signals at the samples", self.record.len(), self.point_values.len())?;
         }
-        for values in self.point_values.iter().filter_map(|instant| instant.values.as_ref()) {
+        for values in self.point_values.iter().filter_map(|point| point.values.as_ref()) {
             check_finite("signal at the samples", values)?;
-            check_length("signal at the samples", self.samples.first().map_or(m / every + 1, Vec::len), values.len())?;
+            check_length(
+                "signal at the samples",
+                self.samples.first().map_or(m / pulses_per_sample + 1, Vec::len),
+                values.len(),
+            )?;
         }
-        if let Some(own) = &self.nonuniform {
-            check_length("jumps of signals", self.record.len(), own.jumps.len())?;
+        if let Some(nonuniform) = &self.nonuniform {
+            check_length("jumps of signals", self.record.len(), nonuniform.jumps.len())?;
         }
         if !self.sample_weights.is_empty() {
             check_length("outputs with robust weights", self.samples.len(), self.sample_weights.len())?;
         }
-        for shares in &self.sample_weights {
-            check_finite("robust weights of samples", shares)?;
-            check_length("robust weights of samples", self.compared_count(), shares.len())?;
+        for sample_weights in &self.sample_weights {
+            check_finite("robust weights of samples", sample_weights)?;
+            check_length("robust weights of samples", self.compared_count(), sample_weights.len())?;
         }
         check_finite("weights", &self.weights)?;
         check_length("weights", self.samples.len(), self.weights.len())
@@ -202,8 +206,8 @@ impl Experiment {
     /// [`Error::NotFinite`] if a filtered signal overflows ([`Record::with_filter`]).
     pub(crate) fn prefilter_signals(&self) -> Result<Option<Self>> {
         match &self.filter {
-            Some((series, applies))
-                if applies.iter().all(|&a| a) && self.nonuniform.is_none() && !self.record.is_filtered() =>
+            Some((series, filtered_outputs))
+                if filtered_outputs.iter().all(|&a| a) && self.nonuniform.is_none() && !self.record.is_filtered() =>
             {
                 Ok(Some(Self {
                     record: Arc::new(self.record.with_filter(series)?),
@@ -224,14 +228,14 @@ impl Experiment {
 
     /// Return true if an output passes a sensor filter, either alone or with all signals of its equation.
     pub(crate) fn is_filtered(&self, output: usize) -> bool {
-        self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
+        self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, filtered_outputs)| filtered_outputs[output])
     }
 
     /// Number of compared samples of each output: all nonuniform samples, or the uniform samples between two pulses.
     #[must_use]
     pub fn compared_count(&self) -> usize {
         match &self.nonuniform {
-            Some(own) => own.interpolation.len(),
+            Some(nonuniform) => nonuniform.interpolation.len(),
             None => (self.record.m() / self.pulses_per_sample).saturating_sub(1),
         }
     }
@@ -253,20 +257,20 @@ impl Experiment {
 
     /// Weights of the compared samples of an output, 1/σ times the relative weight.
     pub(crate) fn weights_of(&self, output: usize) -> impl Iterator<Item = f64> + '_ {
-        let (weight, shares) = (self.weights[output], self.sample_weights.get(output));
-        (0..self.compared_count()).map(move |k| weight * shares.map_or(1.0, |shares| shares[k]))
+        let (weight, sample_weights) = (self.weights[output], self.sample_weights.get(output));
+        (0..self.compared_count()).map(move |k| weight * sample_weights.map_or(1.0, |sample_weights| sample_weights[k]))
     }
 
     /// The weighted measured values of the compared samples, with all outputs concatenated.
     pub(crate) fn measured_samples(&self) -> Vec<f64> {
-        let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
+        let weight_samples = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
             self.weights_of(i).zip(self.compared_values(values)).map(|(w, v)| w * v).collect()
         };
-        self.samples.iter().enumerate().flat_map(weighted).collect()
+        self.samples.iter().enumerate().flat_map(weight_samples).collect()
     }
 
     /// Pulse means just before and just after each compared sample of a uniform run.
-    fn sides<'a>(&'a self, means: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
+    fn adjacent_means<'a>(&'a self, means: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
         (1..=self.compared_count())
             .map(move |k| (means[k * self.pulses_per_sample - 1], means[k * self.pulses_per_sample]))
     }
@@ -274,8 +278,8 @@ impl Experiment {
     /// Values of a signal at the compared samples, computed from its pulse means.
     fn samples_of_pulses(&self, means: &[f64]) -> Vec<f64> {
         match &self.nonuniform {
-            Some(own) => own.interpolation.interpolate(means),
-            None => self.sides(means).map(|(a, b)| 0.5 * (a + b)).collect(),
+            Some(nonuniform) => nonuniform.interpolation.interpolate(means),
+            None => self.adjacent_means(means).map(|(a, b)| 0.5 * (a + b)).collect(),
         }
     }
 
@@ -283,7 +287,7 @@ impl Experiment {
     ///
     /// They are 0 if only pulse means are known.
     pub(crate) fn point_deviation(&self, signal: usize) -> Vec<f64> {
-        match self.point_values.get(signal).and_then(|instant| instant.values.as_ref()) {
+        match self.point_values.get(signal).and_then(|point| point.values.as_ref()) {
             Some(values) => self
                 .compared_values(values)
                 .iter()
@@ -304,9 +308,9 @@ impl Experiment {
         signal: usize,
         nonlinearity_output: &(Vec<f64>, Vec<f64>),
     ) -> (Vec<f64>, Vec<f64>) {
-        let half =
-            if self.point_values.get(signal).is_some_and(|instant| instant.is_zero_order_hold) { 0.5 } else { 0.0 };
-        let jump = |means: &[f64]| self.sides(means).map(|(a, b)| half * (b - a)).collect();
+        let jump_factor =
+            if self.point_values.get(signal).is_some_and(|point| point.is_zero_order_hold) { 0.5 } else { 0.0 };
+        let jump = |means: &[f64]| self.adjacent_means(means).map(|(a, b)| jump_factor * (b - a)).collect();
         (jump(&nonlinearity_output.0), jump(&nonlinearity_output.1))
     }
 
@@ -316,11 +320,11 @@ impl Experiment {
     pub(crate) fn weighted_samples(&self, response: &[Vec<f64>]) -> Vec<f64> {
         let mut samples = Vec::with_capacity(response.len() * self.compared_count());
         for (i, means) in response.iter().enumerate() {
-            let filtered;
+            let filtered_means;
             let means = match &self.filter {
-                Some((filter, applies)) if applies[i] && !self.is_prefiltered => {
-                    filtered = series::multiply(filter, means, means.len());
-                    &filtered
+                Some((filter, filtered_outputs)) if filtered_outputs[i] && !self.is_prefiltered => {
+                    filtered_means = series::multiply(filter, means, means.len());
+                    &filtered_means
                 }
                 _ => means,
             };
@@ -334,8 +338,8 @@ impl Experiment {
     pub(crate) fn weighted_corrections(&self, values: &[Vec<f64>]) -> Vec<f64> {
         let mut out = Vec::with_capacity(values.len() * self.compared_count());
         for (i, row) in values.iter().enumerate() {
-            let behind = self.filter.as_ref().is_some_and(|(_, applies)| applies[i]);
-            out.extend(self.weights_of(i).zip(row).map(|(w, v)| if behind { 0.0 } else { w * v }));
+            let is_filtered = self.filter.as_ref().is_some_and(|(_, filtered_outputs)| filtered_outputs[i]);
+            out.extend(self.weights_of(i).zip(row).map(|(w, v)| if is_filtered { 0.0 } else { w * v }));
         }
         out
     }

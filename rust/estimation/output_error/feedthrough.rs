@@ -38,7 +38,7 @@ impl Feedthrough {
     ///
     /// # Errors
     /// [`crate::error::Error::LeadingZero`] if the algebraic loop between the outputs is singular.
-    pub(crate) fn of(
+    pub(crate) fn new(
         model: &FreeModel,
         experiment: &Experiment,
         structures: &[Structure],
@@ -49,72 +49,77 @@ impl Feedthrough {
             .iter()
             .map(|s| s.terms.iter().map(|term| (s.order - term.order).abs() < FEEDTHROUGH_ORDER_TOLERANCE).collect())
             .collect();
-        if !terms.iter().flatten().any(|&at_once| at_once) {
+        if !terms.iter().flatten().any(|&has_feedthrough| has_feedthrough) {
             return Ok(None);
         }
         let n = structures.len();
-        let mut lacking: Vec<Option<(Vec<f64>, Vec<f64>)>> = vec![None; experiment.record.len()];
-        let mut between = vec![0.0; n * n];
-        (0..n).for_each(|i| between[i * n + i] = 1.0);
+        let mut deviations: Vec<Option<(Vec<f64>, Vec<f64>)>> = vec![None; experiment.record.len()];
+        let mut coupling = vec![0.0; n * n];
+        (0..n).for_each(|i| coupling[i * n + i] = 1.0);
         for (i, (structure, row)) in structures.iter().zip(&terms).enumerate() {
             for (k, term) in structure.terms.iter().enumerate().filter(|(k, _)| row[*k]) {
                 if let Some(j) = model.output_index(i, term.signal) {
-                    between[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
-                } else if lacking[term.signal].is_none() {
-                    lacking[term.signal] = Some(match model.law_of(term.signal) {
+                    coupling[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
+                } else if deviations[term.signal].is_none() {
+                    deviations[term.signal] = Some(match model.law_of(term.signal) {
                         Some(d) => experiment.input_point_deviation(term.signal, &nonlinearity_outputs[d]),
                         None => (experiment.point_deviation(term.signal), Vec::new()),
                     });
                 }
             }
         }
-        let coupled = (0..n * n).any(|at| at % (n + 1) != 0 && between[at] != 0.0);
-        let between = if coupled { Some(small::inverse(&between, n)?) } else { None };
-        let mut direct = Self { coupling_inverse: between, deviations: lacking, terms, values: Vec::new() };
-        let mut driven = vec![vec![0.0; experiment.compared_count()]; n];
-        direct.add_inputs(model, &mut driven, |i, k| model.equations[i].terms[k].2.at(&point.coefficients), |l| &l.0);
-        direct.values = direct.apply_coupling(driven);
+        let is_coupled = (0..n * n).any(|at| at % (n + 1) != 0 && coupling[at] != 0.0);
+        let coupling_inverse = if is_coupled { Some(small::inverse(&coupling, n)?) } else { None };
+        let mut direct = Self { coupling_inverse, deviations, terms, values: Vec::new() };
+        let mut corrections = vec![vec![0.0; experiment.compared_count()]; n];
+        direct.add_inputs(
+            model,
+            &mut corrections,
+            |i, k| model.equations[i].terms[k].2.at(&point.coefficients),
+            |l| &l.0,
+        );
+        direct.values = direct.apply_coupling(corrections);
         Ok(Some(direct))
     }
 
-    /// Add the deviations δ of the inputs with feedthrough to `driven`, which has one row of samples per equation.
+    /// Add the deviations δ of the inputs with feedthrough to `corrections`, which has one row of samples per equation.
     ///
     /// The function `weight` returns the factor of a term, given the indices of equation and term.
     fn add_inputs<'a>(
         &'a self,
         model: &FreeModel,
-        driven: &mut [Vec<f64>],
+        corrections: &mut [Vec<f64>],
         weight: impl Fn(usize, usize) -> f64,
-        which: impl Fn(&'a (Vec<f64>, Vec<f64>)) -> &'a [f64],
+        select: impl Fn(&'a (Vec<f64>, Vec<f64>)) -> &'a [f64],
     ) {
         for (i, row) in self.terms.iter().enumerate() {
-            for (k, _) in row.iter().enumerate().filter(|&(_, &at_once)| at_once) {
+            for (k, _) in row.iter().enumerate().filter(|&(_, &has_feedthrough)| has_feedthrough) {
                 let signal = model.equations[i].terms[k].0;
-                let (c, unknown) = (weight(i, k), model.output_index(i, signal));
-                let series = match (unknown, &self.deviations[signal]) {
+                let (c, output) = (weight(i, k), model.output_index(i, signal));
+                let series = match (output, &self.deviations[signal]) {
                     (Some(j), _) if !self.values.is_empty() => &self.values[j],
-                    (None, Some(lacking)) => which(lacking),
+                    (None, Some(deviation)) => select(deviation),
                     _ => continue,
                 };
                 if c != 0.0 {
-                    driven[i].iter_mut().zip(series).for_each(|(v, s)| *v += c * s);
+                    corrections[i].iter_mut().zip(series).for_each(|(v, s)| *v += c * s);
                 }
             }
         }
     }
 
-    /// Multiply `driven`, which has one row of samples per equation, by (I − C)⁻¹.
-    pub(crate) fn apply_coupling(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
-        let Some(between) = &self.coupling_inverse else { return driven };
-        let gains = between.chunks_exact(driven.len());
-        let mixed = |gains: &[f64]| {
-            let mut out = vec![0.0; driven.first().map_or(0, Vec::len)];
-            for (gain, row) in gains.iter().zip(&driven) {
+    /// Multiply `corrections`, which has one row of samples per equation, by (I − C)⁻¹.
+    pub(crate) fn apply_coupling(&self, corrections: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+        let Some(coupling_inverse) = &self.coupling_inverse else { return corrections };
+        let gains = coupling_inverse.chunks_exact(corrections.len());
+        let coupled_row = |gains: &[f64]| {
+            let mut out = vec![0.0; corrections.first().map_or(0, Vec::len)];
+            for (gain, row) in gains.iter().zip(&corrections) {
                 out.iter_mut().zip(row).for_each(|(v, d)| *v += gain * d);
             }
             out
         };
-        gains.map(mixed).collect()
+        gains.map(coupled_row).collect()
     }
 
     /// The weighted correction of the compared samples, with all outputs concatenated.
@@ -134,27 +139,30 @@ pub(crate) fn add_feedthrough_derivative(
     parameter: usize,
     column: &mut [f64],
 ) {
-    let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
+    let (orders, first_input) = (point.orders.len(), point.orders.len() + point.coefficients.len());
     if parameter < orders {
         return;
     }
-    let mut driven = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
-    if parameter < numbers {
+    let mut corrections = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
+    if parameter < first_input {
         let slope = |i: usize, k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, parameter - orders);
-        direct.add_inputs(model, &mut driven, slope, |l| &l.0);
+        direct.add_inputs(model, &mut corrections, slope, |l| &l.0);
     } else {
-        let acting = model.inputs[parameter - numbers].signal;
+        let input_signal = model.inputs[parameter - first_input].signal;
         let weight = |i: usize, k: usize| {
             let (signal, _, c) = &model.equations[i].terms[k];
-            if *signal == acting {
+            if *signal == input_signal {
                 c.at(&point.coefficients)
             } else {
                 0.0
             }
         };
-        direct.add_inputs(model, &mut driven, weight, |l| &l.1);
+        direct.add_inputs(model, &mut corrections, weight, |l| &l.1);
     }
-    column.iter_mut().zip(experiment.weighted_corrections(&direct.apply_coupling(driven))).for_each(|(v, s)| *v += s);
+    column
+        .iter_mut()
+        .zip(experiment.weighted_corrections(&direct.apply_coupling(corrections)))
+        .for_each(|(v, s)| *v += s);
 }
 
 /// Correction of the simulated samples for jumps and slope discontinuities of the inputs.
@@ -175,7 +183,7 @@ const RELATIVE_DIFFERENCE_STEP: f64 = 1e-5;
 
 impl JumpCorrection {
     /// Return the jumps of zero-order-hold signals, and the kinks of linearly interpolated ones.
-    pub(crate) fn of(
+    pub(crate) fn new(
         model: &FreeModel,
         experiment: &Experiment,
         nonlinearity_outputs: &[(Vec<f64>, Vec<f64>)],
@@ -183,18 +191,20 @@ impl JumpCorrection {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
                 // Nonuniform samples have an exact kink correction instead.
-                let instant = experiment.point_values.get(signal).filter(|_| experiment.nonuniform.is_none())?;
-                if !instant.is_zero_order_hold {
+                let point_values = experiment.point_values.get(signal).filter(|_| experiment.nonuniform.is_none())?;
+                if !point_values.is_zero_order_hold {
                     // The kinks of an input after a nonlinearity with a free parameter are unknown.
-                    instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
+                    point_values.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
                     return Some((experiment.point_deviation(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }
-                let unchanged = (experiment.record.signal(signal).to_vec(), Vec::new());
+                let means_and_slope = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.law_of(signal) {
                     Some(d) => experiment.input_point_deviation(signal, &nonlinearity_outputs[d]),
                     None => (
-                        experiment.input_point_deviation(signal, &(unchanged.0, vec![0.0; experiment.record.m()])).0,
-                        unchanged.1,
+                        experiment
+                            .input_point_deviation(signal, &(means_and_slope.0, vec![0.0; experiment.record.m()]))
+                            .0,
+                        means_and_slope.1,
                     ),
                 })
             })
@@ -205,35 +215,37 @@ impl JumpCorrection {
     /// Gain from each signal to each output within one pulse, minus the direct gain, as a row-major matrix (outputs ×
     /// signals).
     ///
-    /// `at_once` flags the terms with direct feedthrough.
+    /// `feedthrough_terms` flags the terms with direct feedthrough.
     fn gains(
         model: &FreeModel,
         step: f64,
         signals: usize,
-        at_once: &[Vec<bool>],
+        feedthrough_terms: &[Vec<bool>],
         point: &ParameterPoint,
     ) -> Result<Vec<f64>> {
         let structures = model.structures(&point.orders);
         let n = structures.len();
-        let solved = |leading: &dyn Fn(usize, usize) -> f64| -> Result<Vec<f64>> {
-            let (mut between, mut driving) = (vec![0.0; n * n], vec![0.0; n * signals]);
+        let solve_gains = |leading_gain: &dyn Fn(usize, usize) -> f64| -> Result<Vec<f64>> {
+            let (mut coupling, mut input_gains) = (vec![0.0; n * n], vec![0.0; n * signals]);
             for i in 0..n {
-                between[i * n + i] += 1.0;
+                coupling[i * n + i] += 1.0;
                 for (k, (signal, _, c)) in model.equations[i].terms.iter().enumerate() {
-                    let gain = c.at(&point.coefficients) * leading(i, k);
+                    let gain = c.at(&point.coefficients) * leading_gain(i, k);
                     match model.output_index(i, *signal) {
-                        Some(j) => between[i * n + j] -= gain,
-                        None => driving[i * signals + signal] += gain,
+                        Some(j) => coupling[i * n + j] -= gain,
+                        None => input_gains[i * signals + signal] += gain,
                     }
                 }
             }
-            let inverse = small::inverse(&between, n)?;
-            let entry = |i: usize, s: usize| (0..n).map(|j| inverse[i * n + j] * driving[j * signals + s]).sum::<f64>();
+            let inverse = small::inverse(&coupling, n)?;
+            let entry =
+                |i: usize, s: usize| (0..n).map(|j| inverse[i * n + j] * input_gains[j * signals + s]).sum::<f64>();
             Ok((0..n * signals).map(|at| entry(at / signals, at % signals)).collect())
         };
-        let first_gains = solved(&|i, k| first_coefficient(structures[i].order - structures[i].terms[k].order, step))?;
-        let direct = solved(&|i, k| f64::from(u8::from(at_once[i][k])))?;
-        Ok(first_gains.iter().zip(direct).map(|(first, direct)| first - direct).collect())
+        let first_gains =
+            solve_gains(&|i, k| first_coefficient(structures[i].order - structures[i].terms[k].order, step))?;
+        let direct = solve_gains(&|i, k| f64::from(u8::from(feedthrough_terms[i][k])))?;
+        Ok(first_gains.iter().zip(direct).map(|(first_gain, direct)| first_gain - direct).collect())
     }
 
     fn feedthrough_terms(model: &FreeModel, point: &ParameterPoint) -> Vec<Vec<bool>> {
@@ -248,17 +260,17 @@ impl JumpCorrection {
     ///
     /// If `slopes` is true, the derivatives of these entries are used instead.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {
-        let (signals, compared) = (self.jumps.len(), experiment.compared_count());
-        for (i, row) in samples.chunks_exact_mut(compared.max(1)).enumerate() {
+        let (signals, compared_count) = (self.jumps.len(), experiment.compared_count());
+        for (i, row) in samples.chunks_exact_mut(compared_count.max(1)).enumerate() {
             if experiment.filter.as_ref().is_some_and(|(_, applies)| applies[i]) {
                 continue;
             }
             for (signal, jump) in self.jumps.iter().enumerate() {
                 let gain = gains[i * signals + signal];
                 let Some(jump) = jump.as_ref().filter(|_| gain != 0.0) else { continue };
-                let half = if slopes { &jump.1 } else { &jump.0 };
+                let values = if slopes { &jump.1 } else { &jump.0 };
                 let weights = experiment.weights_of(i);
-                row.iter_mut().zip(half).zip(weights).for_each(|((v, j), w)| *v -= w * gain * j);
+                row.iter_mut().zip(values).zip(weights).for_each(|((v, j), w)| *v -= w * gain * j);
             }
         }
     }
@@ -277,8 +289,8 @@ impl JumpCorrection {
         if self.jumps.iter().all(Option::is_none) {
             return Ok(());
         }
-        let at_once = Self::feedthrough_terms(model, point);
-        let gains = Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point)?;
+        let feedthrough_terms = Self::feedthrough_terms(model, point);
+        let gains = Self::gains(model, experiment.record.step(), self.jumps.len(), &feedthrough_terms, point)?;
         self.add(experiment, &gains, false, samples);
         Ok(())
     }
@@ -298,31 +310,36 @@ impl JumpCorrection {
         if self.jumps.iter().all(Option::is_none) {
             return Ok(());
         }
-        let at_once = Self::feedthrough_terms(model, point);
-        let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
-        let gains =
-            |point: &ParameterPoint| Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point);
-        if parameter >= numbers {
-            let acting = model.inputs[parameter - numbers].signal;
+        let feedthrough_terms = Self::feedthrough_terms(model, point);
+        let (orders, first_input) = (point.orders.len(), point.orders.len() + point.coefficients.len());
+        let gains = |point: &ParameterPoint| {
+            Self::gains(model, experiment.record.step(), self.jumps.len(), &feedthrough_terms, point)
+        };
+        if parameter >= first_input {
+            let input_signal = model.inputs[parameter - first_input].signal;
             let mut gains = gains(point)?;
-            gains.iter_mut().enumerate().filter(|(at, _)| at % self.jumps.len() != acting).for_each(|(_, g)| *g = 0.0);
+            gains
+                .iter_mut()
+                .enumerate()
+                .filter(|(at, _)| at % self.jumps.len() != input_signal)
+                .for_each(|(_, g)| *g = 0.0);
             self.add(experiment, &gains, true, column);
             return Ok(());
         }
-        let (mut up, mut down) = (point.clone(), point.clone());
+        let (mut upper, mut lower) = (point.clone(), point.clone());
         let shift = |point: &mut ParameterPoint, sign: f64| {
             let value = match parameter.checked_sub(orders) {
                 None => &mut point.orders[parameter],
                 Some(c) => &mut point.coefficients[c],
             };
-            let by = sign
+            let difference = sign
                 * RELATIVE_DIFFERENCE_STEP
                 * if parameter < orders { 1.0 } else { value.abs().max(RELATIVE_DIFFERENCE_STEP) };
-            *value += by;
-            by
+            *value += difference;
+            difference
         };
-        let width = shift(&mut up, 1.0) - shift(&mut down, -1.0);
-        let slopes: Vec<f64> = gains(&up)?.iter().zip(gains(&down)?).map(|(u, d)| (u - d) / width).collect();
+        let width = shift(&mut upper, 1.0) - shift(&mut lower, -1.0);
+        let slopes: Vec<f64> = gains(&upper)?.iter().zip(gains(&lower)?).map(|(u, d)| (u - d) / width).collect();
         self.add(experiment, &slopes, false, column);
         Ok(())
     }

@@ -59,11 +59,11 @@ impl Simulation<'_> {
         }
     }
 
-    fn size(&self) -> f64 {
+    fn measured_norm(&self) -> f64 {
         match self {
-            Self::Pulses(evaluation) => evaluation.size,
-            Self::Exact(evaluation) => evaluation.size,
-            Self::Sampled(evaluation) => evaluation.size,
+            Self::Pulses(evaluation) => evaluation.measured_norm,
+            Self::Exact(evaluation) => evaluation.measured_norm,
+            Self::Sampled(evaluation) => evaluation.measured_norm,
         }
     }
 
@@ -188,15 +188,15 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
 
     /// Distance of a parameter from its bounds. A coefficient is bounded only if it must keep its sign.
     fn distance_to_bounds(&self, point: &ParameterPoint, parameter: usize) -> (f64, f64) {
-        let behind = point.orders.len() + point.coefficients.len();
-        let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
+        let first_input = point.orders.len() + point.coefficients.len();
+        let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(first_input)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
             (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
             (None, None) => {
                 let j = parameter - point.orders.len();
                 let value = self.time_unit.factor(j, &point.orders) * point.coefficients[j];
-                let down = self.model.coordinates[j].distance_to_bound(value, self.start[j]);
-                return (down, f64::INFINITY);
+                let lower_distance = self.model.coordinates[j].distance_to_bound(value, self.start[j]);
+                return (lower_distance, f64::INFINITY);
             }
         };
         (value - low, high - value)
@@ -209,7 +209,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
     }
 
     fn signal_norm(&self, evaluation: &Simulation<'a>) -> f64 {
-        evaluation.size()
+        evaluation.measured_norm()
     }
 
     /// Return true if the pulses or samples resolve the dynamics of each equation and, if required, the model is
@@ -243,28 +243,29 @@ fn step_within_bounds(
     point: &ParameterPoint,
     deltas: &[f64],
 ) -> (ParameterPoint, f64) {
-    let mut next = point.clone();
+    let mut next_point = point.clone();
     let mut change: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
     let (coefficients, inputs) = rest.split_at(point.coefficients.len());
-    for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
-        let before = *order;
-        *order = (before + delta).clamp(low, high);
-        change = change.max((*order - before).abs());
+    for ((order, &(low, high)), delta) in next_point.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
+        let previous = *order;
+        *order = (previous + delta).clamp(low, high);
+        change = change.max((*order - previous).abs());
     }
     for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
-        let before = time_unit.factor(j, &point.orders) * point.coefficients[j];
-        let value = coordinate.shift(before, delta);
-        next.coefficients[j] = value / time_unit.factor(j, &next.orders);
-        change = change.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+        let previous = time_unit.factor(j, &point.orders) * point.coefficients[j];
+        let value = coordinate.shift(previous, delta);
+        next_point.coefficients[j] = value / time_unit.factor(j, &next_point.orders);
+        change = change.max((value - previous).abs() / previous.abs().max(f64::MIN_POSITIVE));
     }
-    for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
+    for ((value, FreeInput { bounds: (low, high), .. }), delta) in
+        next_point.inputs.iter_mut().zip(&model.inputs).zip(inputs)
     {
-        let before = *value;
-        *value = (before + delta).clamp(*low, *high);
-        change = change.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+        let previous = *value;
+        *value = (previous + delta).clamp(*low, *high);
+        change = change.max((*value - previous).abs() / (high - low).max(f64::MIN_POSITIVE));
     }
-    (next, change)
+    (next_point, change)
 }
 
 /// Fit a model to experiments by output error from an initial guess, by Levenberg–Marquardt.
@@ -363,21 +364,23 @@ pub fn fit_until(
     let mut linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
     // Variable projection would ignore a prior.
     linear.retain(|&coefficient| !model.has_prior(coefficient));
-    let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
+    let allows_extrapolation =
+        !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
     // Logarithmic coordinates are not needed for eliminated coefficients.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
     // With free input parameters, the inputs of the equations are not signals of the record and cannot be filtered
     // before.
-    let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
+    let prefiltered: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
         true => experiments.iter().map(Experiment::prefilter_signals).collect::<Result<_>>()?,
         false => None,
     };
-    let experiments = passed.as_deref().unwrap_or(experiments);
-    let exact = IntegerOrders::of(&model, experiments, &point);
-    let sampled = if exact.is_some() { None } else { FractionalOrders::of(&model, experiments, &point) };
+    let experiments = prefiltered.as_deref().unwrap_or(experiments);
+    let exact = IntegerOrders::new(&model, experiments, &point);
+    let sampled = if exact.is_some() { None } else { FractionalOrders::new(&model, experiments, &point) };
     let needs_pulses = exact.is_none() && sampled.is_none();
-    let caches = RefCell::new(if needs_pulses { EvaluationCache::of(experiments, stop)? } else { Vec::new() });
+    let caches =
+        RefCell::new(if needs_pulses { EvaluationCache::for_experiments(experiments, stop)? } else { Vec::new() });
     let time_unit = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| time_unit.factor(j, &point.orders) * c).collect();
     let problem = OutputErrorProblem {
@@ -386,7 +389,7 @@ pub fn fit_until(
         start,
         time_unit,
         requires_stability,
-        allows_extrapolation: plain,
+        allows_extrapolation,
         linear,
         exact,
         sampled,

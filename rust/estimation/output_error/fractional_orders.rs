@@ -66,29 +66,30 @@ impl IntegrationOrders {
         if let Some(index) = self.etas.iter().position(|e| e.to_bits() == eta.to_bits()) {
             return index;
         }
-        let near = |a: f64, b: f64| (a - b).abs() < WHOLE_ORDER_TOLERANCE;
-        let (whole, fraction) = if near(eta, eta.round()) { (eta.round(), 0.0) } else { (eta.floor(), eta.fract()) };
-        let known = self.fractions.iter().position(|&f| near(f, fraction));
-        let place = (fraction > 0.0).then(|| {
-            known.unwrap_or_else(|| {
+        let is_close = |a: f64, b: f64| (a - b).abs() < WHOLE_ORDER_TOLERANCE;
+        let (whole, fraction) =
+            if is_close(eta, eta.round()) { (eta.round(), 0.0) } else { (eta.floor(), eta.fract()) };
+        let existing = self.fractions.iter().position(|&f| is_close(f, fraction));
+        let fraction_index = (fraction > 0.0).then(|| {
+            existing.unwrap_or_else(|| {
                 self.fractions.push(fraction);
                 self.fractions.len() - 1
             })
         });
         self.etas.push(eta);
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-        self.parts.push((whole as u32, place));
+        self.parts.push((whole as u32, fraction_index));
         self.etas.len() - 1
     }
 
     /// Write s^−η of each order to `powers`.
-    fn powers(&self, at: LaplacePoint, powers: &mut Vec<Bin>) {
+    fn powers(&self, point: LaplacePoint, powers: &mut Vec<Bin>) {
         powers.clear();
         // The powers of the fractions come first and are removed at the end.
-        powers.extend(self.fractions.iter().map(|&fraction| at.integration(fraction)));
-        let reciprocal = at.s.inv();
+        powers.extend(self.fractions.iter().map(|&fraction| point.integration(fraction)));
+        let reciprocal = point.s.inv();
         for &(whole, fraction) in &self.parts {
-            let mut power = fraction.map_or(Bin::from(1.0), |place| powers[place]);
+            let mut power = fraction.map_or(Bin::from(1.0), |fraction_index| powers[fraction_index]);
             (0..whole).for_each(|_| power *= reciprocal);
             powers.push(power);
         }
@@ -120,15 +121,15 @@ struct PowerSum {
 
 impl PowerSum {
     /// Return the sum at a point. `powers` contains s^−η of each integration order.
-    fn at(&self, logarithm: Bin, powers: &[Bin]) -> Bin {
+    fn value_at(&self, logarithm: Bin, powers: &[Bin]) -> Bin {
         let sum = |terms: &[(usize, f64)]| {
             terms.iter().fold(Bin::default(), |sum, &(index, weight)| sum + powers[index] * weight)
         };
-        let plain = sum(&self.terms);
+        let power_sum = sum(&self.terms);
         if self.logarithmic.is_empty() {
-            plain
+            power_sum
         } else {
-            plain - logarithm * sum(&self.logarithmic)
+            power_sum - logarithm * sum(&self.logarithmic)
         }
     }
 
@@ -138,7 +139,7 @@ impl PowerSum {
 }
 
 impl Terms {
-    fn of(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
+    fn new(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
         let structure = &model.structures(&point.orders)[i];
         let mut terms = Self {
             orders: IntegrationOrders::default(),
@@ -148,15 +149,15 @@ impl Terms {
         };
         for (k, term) in structure.terms.iter().enumerate() {
             let eta = structure.order - term.order;
-            let own = model.output_index(i, term.signal).is_some();
-            if eta < if own { MIN_INTEGRATION_ORDER } else { 0.0 } {
+            let is_autoregressive = model.output_index(i, term.signal).is_some();
+            if eta < if is_autoregressive { MIN_INTEGRATION_ORDER } else { 0.0 } {
                 // This is reported as divergence, so that the optimization shortens its step.
                 return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
             }
             let index = terms.orders.index(eta);
             terms.eta_indices.push(index);
             terms.coefficients.push(model.equations[i].terms[k].2.at(&point.coefficients));
-            terms.inputs.push((!own).then_some(term.signal));
+            terms.inputs.push((!is_autoregressive).then_some(term.signal));
         }
         Ok(terms)
     }
@@ -173,9 +174,12 @@ impl Terms {
     ///
     /// `weights` returns the pair (w, v) of a term.
     fn sum(&self, input: Option<usize>, weights: impl Fn(usize) -> (f64, f64)) -> PowerSum {
-        let own = || (0..self.eta_indices.len()).filter(|&k| self.inputs[k] == input);
-        let nonzero = |part: &dyn Fn(usize) -> f64| {
-            own().map(|k| (self.eta_indices[k], part(k))).filter(|(_, weight)| *weight != 0.0).collect()
+        let terms_of_input = || (0..self.eta_indices.len()).filter(|&k| self.inputs[k] == input);
+        let nonzero = |weight_of_term: &dyn Fn(usize) -> f64| {
+            terms_of_input()
+                .map(|k| (self.eta_indices[k], weight_of_term(k)))
+                .filter(|(_, weight)| *weight != 0.0)
+                .collect()
         };
         PowerSum { terms: nonzero(&|k| weights(k).0), logarithmic: nonzero(&|k| weights(k).1) }
     }
@@ -186,11 +190,11 @@ impl Terms {
     }
 
     /// Return half of the jump of the step response at t = 0. `weights` returns the weight of a term of the input.
-    fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
-        let at_once = |k: &usize| {
+    fn initial_jump(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
+        let has_feedthrough = |k: &usize| {
             self.inputs[*k] == Some(input) && self.orders.etas[self.eta_indices[*k]] < FEEDTHROUGH_ORDER_TOLERANCE
         };
-        0.5 * (0..self.eta_indices.len()).filter(at_once).map(weights).sum::<f64>()
+        0.5 * (0..self.eta_indices.len()).filter(has_feedthrough).map(weights).sum::<f64>()
     }
 }
 
@@ -202,21 +206,21 @@ struct InitialTerms {
 
 impl InitialTerms {
     fn new(exponents: &[f64], values: &[f64]) -> Self {
-        let of = |(e, c): (&f64, &f64)| (e + 1.0, c * libm::tgamma(e + 1.0), digamma(e + 1.0));
-        Self { terms: exponents.iter().zip(values).map(of).collect() }
+        let term_constants = |(e, c): (&f64, &f64)| (e + 1.0, c * libm::tgamma(e + 1.0), digamma(e + 1.0));
+        Self { terms: exponents.iter().zip(values).map(term_constants).collect() }
     }
 
     /// Write the Laplace transform of each term to `out`, and return the sum of the transforms.
-    fn transforms(&self, at: LaplacePoint, out: &mut Vec<Bin>) -> Bin {
+    fn transforms(&self, point: LaplacePoint, out: &mut Vec<Bin>) -> Bin {
         out.clear();
-        out.extend(self.terms.iter().map(|&(power, weight, _)| at.integration(power) * weight));
+        out.extend(self.terms.iter().map(|&(power, weight, _)| point.integration(power) * weight));
         out.iter().sum()
     }
 
     /// Return the derivative of the sum of the transforms. `slopes` contains the derivatives of the exponents.
     fn slope(&self, logarithm: Bin, transforms: &[Bin], slopes: &[f64]) -> Bin {
-        let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, by)| **by != 0.0);
-        parts.map(|((term, transform), by)| transform * (Bin::from(term.2) - logarithm) * by).sum()
+        let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, slope)| **slope != 0.0);
+        parts.map(|((term, transform), slope)| transform * (Bin::from(term.2) - logarithm) * slope).sum()
     }
 }
 
@@ -247,7 +251,7 @@ impl FractionalOrders {
     }
 
     /// Return the transforms of the experiments; None if the model has no exact samples on them.
-    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
+    pub(crate) fn new(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         if !Self::accepts(model, experiments, point) {
             return None;
         }
@@ -261,7 +265,7 @@ impl FractionalOrders {
             let inputs = terms.filter(|&(i, signal)| model.output_index(i, signal).is_none());
             let spectrum = |signal: usize| {
                 let means = record.signal(signal);
-                let jumps = means.iter().zip(std::iter::once(&0.0).chain(means)).map(|(now, before)| now - before);
+                let jumps = means.iter().zip(std::iter::once(&0.0).chain(means)).map(|(mean, before)| mean - before);
                 transform.transform(jumps)
             };
             let mut jumps = HashMap::new();
@@ -293,14 +297,14 @@ impl FractionalOrders {
         for (run, experiment) in self.runs.iter().zip(experiments) {
             out.exponents = structures.iter().enumerate().map(|(i, s)| model.exponents(experiment, i, s)).collect();
             let mut remainders = experiment.measured_samples();
-            out.size = out.size.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
-            let direct = Feedthrough::of(model, experiment, &structures, point, &[])?;
+            out.measured_norm = out.measured_norm.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let feedthrough = Feedthrough::new(model, experiment, &structures, point, &[])?;
             let mut simulation = SampledSimulation { basis: Vec::new(), effects: Vec::new() };
             let mut initial = Vec::new();
-            let size = remainders.len();
-            simulation.effects.resize(linear.len(), vec![0.0; size]);
+            let sample_count = remainders.len();
+            simulation.effects.resize(linear.len(), vec![0.0; sample_count]);
             for i in 0..structures.len() {
-                let terms = Terms::of(model, i, point)?;
+                let terms = Terms::new(model, i, point)?;
                 let mut weight_sets = vec![terms.coefficients.clone()];
                 weight_sets.extend(linear.iter().map(|&j| {
                     let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
@@ -308,28 +312,28 @@ impl FractionalOrders {
                 }));
                 let (sums, units) = run.responses(experiment, &terms, &weight_sets, &out.exponents[i]);
                 let targets = std::iter::once(&mut remainders).chain(&mut simulation.effects);
-                for (place, (target, samples)) in targets.zip(sums).enumerate() {
-                    let sign = if place == 0 { -1.0 } else { 1.0 };
+                for (index, (target, samples)) in targets.zip(sums).enumerate() {
+                    let sign = if index == 0 { -1.0 } else { 1.0 };
                     add_weighted(experiment, i, sign, &samples, target);
                 }
                 for samples in units {
-                    let mut column = vec![0.0; size];
+                    let mut column = vec![0.0; sample_count];
                     add_weighted(experiment, i, 1.0, &samples, &mut column);
                     extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
                     initial.push((Some(i), column));
                 }
             }
-            if let Some(direct) = &direct {
-                remainders.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
+            if let Some(feedthrough) = &feedthrough {
+                remainders.iter_mut().zip(feedthrough.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
                 for (&j, effect) in linear.iter().zip(&mut simulation.effects) {
-                    add_feedthrough_derivative(model, experiment, direct, point, point.orders.len() + j, effect);
+                    add_feedthrough_derivative(model, experiment, feedthrough, point, point.orders.len() + j, effect);
                 }
             }
             if let Some(index) = remainders.iter().position(|e| !e.is_finite()) {
                 return Err(Error::Diverged { what: "simulation".into(), index });
             }
             for i in 0..if model.initial.has_level() { structures.len() } else { 0 } {
-                let mut column = vec![0.0; size];
+                let mut column = vec![0.0; sample_count];
                 add_weighted(experiment, i, 1.0, &vec![1.0; experiment.compared_count()], &mut column);
                 extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
                 initial.push((None, column));
@@ -348,25 +352,25 @@ impl FractionalOrders {
         model: &FreeModel,
         experiments: &[Experiment],
         linear: &[usize],
-        at: &Evaluation<SampledSimulation>,
+        evaluation: &Evaluation<SampledSimulation>,
     ) -> Result<Vec<Vec<f64>>> {
-        let point = &at.point;
+        let point = &evaluation.point;
         let orders = point.orders.len();
         let count = orders + point.coefficients.len();
         let structures = model.structures(&point.orders);
-        let open: Vec<usize> =
+        let parameters: Vec<usize> =
             (0..count).filter(|p| !p.checked_sub(orders).is_some_and(|j| linear.contains(&j))).collect();
-        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
+        let mut jacobian = vec![Vec::with_capacity(evaluation.residuals.len()); count];
         for (index, (run, experiment)) in self.runs.iter().zip(experiments).enumerate() {
             let mut columns = vec![vec![0.0; structures.len() * experiment.compared_count()]; count];
-            for (&j, effect) in linear.iter().zip(&at.parts[index].effects) {
+            for (&j, effect) in linear.iter().zip(&evaluation.parts[index].effects) {
                 columns[orders + j].clone_from(effect);
             }
             for (i, structure) in structures.iter().enumerate() {
-                let terms = Terms::of(model, i, point)?;
+                let terms = Terms::new(model, i, point)?;
                 let exponents = model.exponents(experiment, i, structure);
-                let initial = InitialTerms::new(&exponents, &at.initial[index][i]);
-                let requests: Vec<(Slopes, Vec<f64>)> = open
+                let initial = InitialTerms::new(&exponents, &evaluation.initial[index][i]);
+                let requests: Vec<(Slopes, Vec<f64>)> = parameters
                     .iter()
                     .map(|&p| {
                         let initial_slopes = if p < orders {
@@ -377,18 +381,26 @@ impl FractionalOrders {
                         (term_slopes(model, i, point, p), initial_slopes.unwrap_or_default())
                     })
                     .collect();
-                for (&parameter, samples) in open.iter().zip(run.sensitivities(experiment, &terms, &initial, &requests))
+                for (&parameter, samples) in
+                    parameters.iter().zip(run.sensitivities(experiment, &terms, &initial, &requests))
                 {
                     add_weighted(experiment, i, 1.0, &samples, &mut columns[parameter]);
                 }
             }
-            if let Some(direct) = Feedthrough::of(model, experiment, &structures, point, &[])? {
-                for &parameter in &open {
-                    add_feedthrough_derivative(model, experiment, &direct, point, parameter, &mut columns[parameter]);
+            if let Some(feedthrough) = Feedthrough::new(model, experiment, &structures, point, &[])? {
+                for &parameter in &parameters {
+                    add_feedthrough_derivative(
+                        model,
+                        experiment,
+                        &feedthrough,
+                        point,
+                        parameter,
+                        &mut columns[parameter],
+                    );
                 }
             }
             for (mut column, out) in columns.into_iter().zip(&mut jacobian) {
-                project_out(&at.parts[index].basis, &mut column);
+                project_out(&evaluation.parts[index].basis, &mut column);
                 if column.iter().any(|v| !v.is_finite()) {
                     return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
                 }
@@ -403,8 +415,8 @@ impl FractionalOrders {
 /// Add `sign` times the weighted `samples` of equation `i` to `sum`, the weighted samples of all equations.
 fn add_weighted(experiment: &Experiment, i: usize, sign: f64, samples: &[f64], sum: &mut [f64]) {
     let count = experiment.compared_count();
-    let own = sum[i * count..(i + 1) * count].iter_mut();
-    own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v += sign * w * y);
+    let equation_samples = sum[i * count..(i + 1) * count].iter_mut();
+    equation_samples.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v += sign * w * y);
 }
 
 /// Return the derivatives of the coefficient and the integration order of each term of equation `i`.
@@ -412,11 +424,11 @@ fn add_weighted(experiment: &Experiment, i: usize, sign: f64, samples: &[f64], s
 /// They are derivatives with respect to `parameter`.
 fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: usize) -> Slopes {
     let equation = &model.equations[i];
-    let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
+    let order_weight = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
     let slope = |(_, order, monomial): &(usize, AffineOrder, Monomial)| match parameter.checked_sub(point.orders.len())
     {
         Some(j) => (monomial.slope(&point.coefficients, j), 0.0),
-        None => (0.0, of(&equation.order) - of(order)),
+        None => (0.0, order_weight(&equation.order) - order_weight(order)),
     };
     equation.terms.iter().map(slope).collect()
 }
@@ -435,37 +447,37 @@ impl Run {
     ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         // The place of a set of weights, the input, and the weighted sum of powers for this input.
         let mut functions: Vec<(usize, usize, PowerSum)> = Vec::new();
-        let mut starts = Vec::new();
-        for (place, weights) in weight_sets.iter().enumerate() {
+        let mut initial_jumps = Vec::new();
+        for (set_index, weights) in weight_sets.iter().enumerate() {
             for input in terms.signals() {
                 let sum = terms.sum(Some(input), |k| (weights[k], 0.0));
                 if !sum.is_zero() {
-                    functions.push((place, input, sum));
-                    starts.push(terms.start(input, |k| weights[k]));
+                    functions.push((set_index, input, sum));
+                    initial_jumps.push(terms.initial_jump(input, |k| weights[k]));
                 }
             }
         }
-        starts.resize(functions.len() + exponents.len(), 0.0);
-        let own = terms.sum_of_coefficients(None);
+        initial_jumps.resize(functions.len() + exponents.len(), 0.0);
+        let denominator_terms = terms.sum_of_coefficients(None);
         let mut powers = Vec::new();
         let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
-        let spectra = self.transform.spectra(&starts, |at, values| {
-            terms.orders.powers(at, &mut powers);
-            let response = (Bin::from(1.0) - own.at(at.logarithm, &powers)).inv();
-            let hold_response = response / at.s;
-            let (driven, free) = values.split_at_mut(functions.len());
-            for (value, (_, _, sum)) in driven.iter_mut().zip(&functions) {
-                *value = sum.at(at.logarithm, &powers) * hold_response;
+        let spectra = self.transform.spectra(&initial_jumps, |point, values| {
+            terms.orders.powers(point, &mut powers);
+            let response = (Bin::from(1.0) - denominator_terms.value_at(point.logarithm, &powers)).inv();
+            let hold_response = response / point.s;
+            let (input_values, initial_values) = values.split_at_mut(functions.len());
+            for (value, (_, _, sum)) in input_values.iter_mut().zip(&functions) {
+                *value = sum.value_at(point.logarithm, &powers) * hold_response;
             }
-            for ((value, unit), e) in free.iter_mut().zip(&units).zip(exponents) {
-                *value = response * at.integration(e + 1.0) * unit;
+            for ((value, unit), e) in initial_values.iter_mut().zip(&units).zip(exponents) {
+                *value = response * point.integration(e + 1.0) * unit;
             }
         });
         let mut spectra = spectra.into_iter();
-        let sources = functions.iter().map(|(place, input, _)| (*place, Some(*input)));
-        let driven = self.columns(experiment, weight_sets.len(), sources.zip(spectra.by_ref()));
-        let free = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
-        (driven, free)
+        let sources = functions.iter().map(|(set_index, input, _)| (*set_index, Some(*input)));
+        let responses = self.columns(experiment, weight_sets.len(), sources.zip(spectra.by_ref()));
+        let initial_responses = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
+        (responses, initial_responses)
     }
 
     /// Return the derivatives of the compared samples of an equation, one list of samples per request.
@@ -478,57 +490,61 @@ impl Run {
         initial: &InitialTerms,
         requests: &[(Slopes, Vec<f64>)],
     ) -> Vec<Vec<f64>> {
-        let derivative = |place: usize, input: Option<usize>| {
-            let slopes: &Slopes = &requests[place].0;
+        let derivative = |request: usize, input: Option<usize>| {
+            let slopes: &Slopes = &requests[request].0;
             terms.sum(input, |k| (slopes[k].0, terms.coefficients[k] * slopes[k].1))
         };
         let signals = terms.signals();
-        let denominators: Vec<PowerSum> = (0..requests.len()).map(|place| derivative(place, None)).collect();
+        let denominators: Vec<PowerSum> = (0..requests.len()).map(|request| derivative(request, None)).collect();
         // The place of a request, the place of an input in `signals`, and the derivative of the numerator for it.
         let mut functions: Vec<(usize, Option<usize>, PowerSum)> = Vec::new();
-        for (place, (_, initial_slopes)) in requests.iter().enumerate() {
+        for (request, (_, initial_slopes)) in requests.iter().enumerate() {
             for (index, &signal) in signals.iter().enumerate() {
-                let numerator = derivative(place, Some(signal));
-                if !(denominators[place].is_zero() && numerator.is_zero()) {
-                    functions.push((place, Some(index), numerator));
+                let numerator = derivative(request, Some(signal));
+                if !(denominators[request].is_zero() && numerator.is_zero()) {
+                    functions.push((request, Some(index), numerator));
                 }
             }
-            let acts = !denominators[place].is_zero() || initial_slopes.iter().any(|v| *v != 0.0);
-            if !initial.terms.is_empty() && acts {
-                functions.push((place, None, PowerSum { terms: Vec::new(), logarithmic: Vec::new() }));
+            let has_effect = !denominators[request].is_zero() || initial_slopes.iter().any(|v| *v != 0.0);
+            if !initial.terms.is_empty() && has_effect {
+                functions.push((request, None, PowerSum { terms: Vec::new(), logarithmic: Vec::new() }));
             }
         }
-        let start = |(place, index, _): &(usize, Option<usize>, PowerSum)| {
-            index.map_or(0.0, |index| terms.start(signals[index], |k| requests[*place].0[k].0))
+        let start = |(request, index, _): &(usize, Option<usize>, PowerSum)| {
+            index.map_or(0.0, |index| terms.initial_jump(signals[index], |k| requests[*request].0[k].0))
         };
-        let starts: Vec<f64> = functions.iter().map(start).collect();
-        let own = terms.sum_of_coefficients(None);
+        let initial_jumps: Vec<f64> = functions.iter().map(start).collect();
+        let denominator_terms = terms.sum_of_coefficients(None);
         let numerators: Vec<PowerSum> = signals.iter().map(|&signal| terms.sum_of_coefficients(Some(signal))).collect();
         let (mut powers, mut transforms) = (Vec::new(), Vec::new());
-        let (mut driven, mut changes) = (vec![Bin::default(); numerators.len()], vec![Bin::default(); requests.len()]);
-        let spectra = self.transform.spectra(&starts, |at, values| {
-            let logarithm = at.logarithm;
-            terms.orders.powers(at, &mut powers);
-            let response = (Bin::from(1.0) - own.at(logarithm, &powers)).inv();
-            let hold_response = response / at.s;
-            let undriven = initial.transforms(at, &mut transforms) * response;
-            for (value, sum) in driven.iter_mut().zip(&numerators) {
-                *value = sum.at(logarithm, &powers) * hold_response;
+        let (mut input_responses, mut denominator_changes) =
+            (vec![Bin::default(); numerators.len()], vec![Bin::default(); requests.len()]);
+        let spectra = self.transform.spectra(&initial_jumps, |point, values| {
+            let logarithm = point.logarithm;
+            terms.orders.powers(point, &mut powers);
+            let response = (Bin::from(1.0) - denominator_terms.value_at(logarithm, &powers)).inv();
+            let hold_response = response / point.s;
+            let initial_response = initial.transforms(point, &mut transforms) * response;
+            for (value, sum) in input_responses.iter_mut().zip(&numerators) {
+                *value = sum.value_at(logarithm, &powers) * hold_response;
             }
-            for (value, sum) in changes.iter_mut().zip(&denominators) {
-                *value = sum.at(logarithm, &powers) * response;
+            for (value, sum) in denominator_changes.iter_mut().zip(&denominators) {
+                *value = sum.value_at(logarithm, &powers) * response;
             }
-            for (value, (place, index, numerator)) in values.iter_mut().zip(&functions) {
+            for (value, (request, index, numerator)) in values.iter_mut().zip(&functions) {
                 *value = match index {
-                    Some(index) => driven[*index] * changes[*place] + numerator.at(logarithm, &powers) * hold_response,
+                    Some(index) => {
+                        input_responses[*index] * denominator_changes[*request]
+                            + numerator.value_at(logarithm, &powers) * hold_response
+                    }
                     None => {
-                        let changed = initial.slope(logarithm, &transforms, &requests[*place].1);
-                        undriven * changes[*place] + changed * response
+                        let initial_slope = initial.slope(logarithm, &transforms, &requests[*request].1);
+                        initial_response * denominator_changes[*request] + initial_slope * response
                     }
                 };
             }
         });
-        let functions = functions.iter().map(|(place, index, _)| (*place, index.map(|index| signals[index])));
+        let functions = functions.iter().map(|(request, index, _)| (*request, index.map(|index| signals[index])));
         self.columns(experiment, requests.len(), functions.zip(spectra))
     }
 
@@ -544,12 +560,12 @@ impl Run {
         functions: impl Iterator<Item = ((usize, Option<usize>), Vec<Bin>)>,
     ) -> Vec<Vec<f64>> {
         let mut sums: Vec<Option<Vec<Bin>>> = vec![None; count];
-        for ((place, input), mut spectrum) in functions {
+        for ((column, input), mut spectrum) in functions {
             if let Some(jumps) = input.and_then(|input| self.jumps.get(&input)) {
                 spectrum.iter_mut().zip(jumps).for_each(|(v, jump)| *v *= jump);
             }
-            match &mut sums[place] {
-                None => sums[place] = Some(spectrum),
+            match &mut sums[column] {
+                None => sums[column] = Some(spectrum),
                 Some(sum) => sum.iter_mut().zip(spectrum).for_each(|(sum, v)| *sum += v),
             }
         }
@@ -561,9 +577,14 @@ impl Run {
 
     /// Return the compared samples of the function whose transform is `spectrum`.
     fn compared_samples(&self, experiment: &Experiment, spectrum: Vec<Bin>) -> Vec<f64> {
-        let every = experiment.pulses_per_sample;
+        let pulses_per_sample = experiment.pulses_per_sample;
         let samples = self.transform.samples(spectrum);
-        samples.into_iter().skip(every).step_by(every).take(experiment.compared_count()).collect()
+        samples
+            .into_iter()
+            .skip(pulses_per_sample)
+            .step_by(pulses_per_sample)
+            .take(experiment.compared_count())
+            .collect()
     }
 }
 
@@ -582,11 +603,18 @@ mod tests {
 
     /// Model D^α y = a1 D^ν y + a0 y + b1 D^ν u + b0 u + c D^α v with free α between `bounds`, and ν = `order`.
     fn model(bounds: (f64, f64), order: f64, initial: Initial) -> FreeModel {
-        let own = |constant: f64| AffineOrder { constant, weights: vec![0.0] };
+        let fixed_order = |constant: f64| AffineOrder { constant, weights: vec![0.0] };
         let highest = || AffineOrder { constant: 0.0, weights: vec![1.0] };
-        let orders = [(0, own(order)), (0, own(0.0)), (1, own(order)), (1, own(0.0)), (2, highest())];
-        let alone = |k: usize| Monomial { factor: 1.0, powers: vec![(k, 1)] };
-        let terms = orders.into_iter().enumerate().map(|(k, (signal, order))| (signal, order, alone(k))).collect();
+        let orders = [
+            (0, fixed_order(order)),
+            (0, fixed_order(0.0)),
+            (1, fixed_order(order)),
+            (1, fixed_order(0.0)),
+            (2, highest()),
+        ];
+        let single_coefficient = |k: usize| Monomial { factor: 1.0, powers: vec![(k, 1)] };
+        let terms =
+            orders.into_iter().enumerate().map(|(k, (signal, order))| (signal, order, single_coefficient(k))).collect();
         FreeModel {
             equations: vec![FreeEquation { output: 0, order: highest(), terms }],
             order_bounds: vec![bounds],
@@ -601,8 +629,8 @@ mod tests {
     #[allow(clippy::cast_precision_loss)]
     fn experiment(pulses_per_sample: usize) -> Result<Experiment> {
         let rows = MIN_EXACT_PULSES + 2;
-        let hold_samples = |every: usize, seed: usize| -> Vec<f64> {
-            (0..rows).map(|k| ((k / every * 7919 + seed) % 11) as f64 / 5.0 - 1.0).collect()
+        let hold_samples = |interval: usize, seed: usize| -> Vec<f64> {
+            (0..rows).map(|k| ((k / interval * 7919 + seed) % 11) as f64 / 5.0 - 1.0).collect()
         };
         let y = (0..rows).map(|k| (0.1 * k as f64).cos()).collect();
         let input = |name: &str, samples| Channel::new(name, samples, Role::Input(Intersample::Hold));
@@ -624,7 +652,7 @@ mod tests {
     /// Return the largest difference, divided by the largest magnitude in `exact`.
     fn distance(actual: &[f64], exact: &[f64]) -> f64 {
         assert_eq!(actual.len(), exact.len());
-        let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+        let peak = exact.iter().fold(0.0, |peak: f64, v| peak.max(v.abs()));
         actual.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / peak
     }
 
@@ -635,25 +663,25 @@ mod tests {
         let indices: Vec<usize> = etas.iter().map(|&eta| orders.index(eta)).collect();
         assert_eq!(indices, [0, 1, 2, 3, 4, 5, 6, 1]);
         assert_eq!(orders.fractions.len(), 3);
-        let at = LaplacePoint::new(Bin::new(0.3, 40.0));
+        let laplace_point = LaplacePoint::new(Bin::new(0.3, 40.0));
         let mut powers = Vec::new();
-        orders.powers(at, &mut powers);
+        orders.powers(laplace_point, &mut powers);
         assert_eq!(powers.len(), 7);
         for (power, eta) in powers.iter().zip(etas) {
-            let direct = at.integration(eta);
-            assert!((power - direct).norm() < 1e-13 * direct.norm(), "{eta}: {power} and {direct}");
+            let expected = laplace_point.integration(eta);
+            assert!((power - expected).norm() < 1e-13 * expected.norm(), "{eta}: {power} and {expected}");
         }
     }
 
     #[test]
     fn integer_orders_have_the_samples_and_derivatives_of_their_states() -> Result<()> {
-        let (experiments, at) = ([experiment(1)?], point(2.0));
+        let (experiments, point) = ([experiment(1)?], point(2.0));
         for initial in [Initial::Rest, Initial::Caputo] {
             let model = model((2.0, 2.0), 1.0, initial);
-            let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
-            let states = require(IntegerOrders::of(&model, &experiments, &at))?;
-            let samples = orders.evaluate(&model, &experiments, &at, &[2, 3])?;
-            let state_samples = states.evaluate(&model, &experiments, &at, &[2, 3])?;
+            let orders = require(FractionalOrders::new(&model, &experiments, &point))?;
+            let states = require(IntegerOrders::new(&model, &experiments, &point))?;
+            let samples = orders.evaluate(&model, &experiments, &point, &[2, 3])?;
+            let state_samples = states.evaluate(&model, &experiments, &point, &[2, 3])?;
             assert!(distance(&samples.residuals, &state_samples.residuals) < 1e-8);
             assert!(distance(&samples.point.coefficients, &state_samples.point.coefficients) < 1e-8);
             let slopes = orders.jacobian(&model, &experiments, &[2, 3], &samples)?;
@@ -666,21 +694,21 @@ mod tests {
 
     #[test]
     fn derivatives_are_limits_of_differences() -> Result<()> {
-        let (experiments, at, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
-        let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
-        let evaluation = orders.evaluate(&model, &experiments, &at, &[])?;
+        let (experiments, point, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
+        let orders = require(FractionalOrders::new(&model, &experiments, &point))?;
+        let evaluation = orders.evaluate(&model, &experiments, &point, &[])?;
         let slopes = orders.jacobian(&model, &experiments, &[], &evaluation)?;
         for (parameter, slope) in slopes.iter().enumerate() {
-            let shifted = |by: f64| -> Result<Vec<f64>> {
-                let mut at = at.clone();
+            let shifted_residuals = |shift: f64| -> Result<Vec<f64>> {
+                let mut point = point.clone();
                 match parameter.checked_sub(1) {
-                    None => at.orders[0] += by,
-                    Some(j) => at.coefficients[j] += by,
+                    None => point.orders[0] += shift,
+                    Some(j) => point.coefficients[j] += shift,
                 }
-                Ok(orders.evaluate(&model, &experiments, &at, &[])?.residuals)
+                Ok(orders.evaluate(&model, &experiments, &point, &[])?.residuals)
             };
             let differences: Vec<f64> =
-                shifted(1e-4)?.iter().zip(shifted(-1e-4)?).map(|(a, b)| (a - b) / 2e-4).collect();
+                shifted_residuals(1e-4)?.iter().zip(shifted_residuals(-1e-4)?).map(|(a, b)| (a - b) / 2e-4).collect();
             assert!(distance(slope, &differences) < 1e-5, "parameter {parameter}");
         }
         Ok(())
@@ -688,17 +716,17 @@ mod tests {
 
     #[test]
     fn pulses_have_the_same_limit() -> Result<()> {
-        let (at, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
-        let (experiments, fine) = ([experiment(1)?], [experiment(8)?]);
-        let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
-        let evaluation = orders.evaluate(&model, &experiments, &at, &[2, 3])?;
-        let mut caches = EvaluationCache::of(&fine, &Stop::default())?;
-        let pulse_evaluation = model.evaluate(&fine, &mut caches, &at, &[2, 3])?;
+        let (point, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
+        let (experiments, fine_experiments) = ([experiment(1)?], [experiment(8)?]);
+        let orders = require(FractionalOrders::new(&model, &experiments, &point))?;
+        let evaluation = orders.evaluate(&model, &experiments, &point, &[2, 3])?;
+        let mut caches = EvaluationCache::for_experiments(&fine_experiments, &Stop::default())?;
+        let pulse_evaluation = model.evaluate(&fine_experiments, &mut caches, &point, &[2, 3])?;
         assert!(distance(&evaluation.residuals, &pulse_evaluation.residuals) < 1e-4);
         assert!(distance(&evaluation.point.coefficients, &pulse_evaluation.point.coefficients) < 1e-4);
         assert!(distance(&evaluation.initial[0][0], &pulse_evaluation.initial[0][0]) < 1e-2);
         let slopes = orders.jacobian(&model, &experiments, &[2, 3], &evaluation)?;
-        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &pulse_evaluation)?;
+        let pulses = model.jacobian(&fine_experiments, &mut caches, &[2, 3], &pulse_evaluation)?;
         slopes.iter().zip(&pulses).for_each(|(a, b)| assert!(distance(a, b) < 1e-3));
         Ok(())
     }

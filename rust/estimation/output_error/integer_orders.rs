@@ -40,7 +40,7 @@ pub(crate) struct IntegerOrders {
 struct EquationOrders {
     order: usize,
     /// Term index and order of each autoregressive term.
-    own: Vec<(usize, usize)>,
+    autoregressive_terms: Vec<(usize, usize)>,
     /// Input signals, each with the term index and the order of its terms.
     inputs: Vec<(usize, Vec<(usize, usize)>)>,
 }
@@ -83,7 +83,7 @@ pub(crate) struct Companion {
     /// Unit of frequency \[rad/s\], the inverse of the scaled unit of time.
     scale: f64,
     /// Autoregressive coefficients in scaled time, a_i scale^(i − n).
-    own: Vec<f64>,
+    coefficients: Vec<f64>,
     /// Pulse width in scaled time.
     step: f64,
     /// Pulse width in seconds.
@@ -106,26 +106,27 @@ struct Discretization {
 }
 
 /// Number of pulses per sample, and number of compared samples.
-type Grid = (usize, usize);
+type SampleGrid = (usize, usize);
 
 impl Companion {
     /// Return the companion form of s^n − Σ own_i s^i for pulses of width `step` \[s\].
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
-    pub(crate) fn new(own: &[f64], step: f64) -> Self {
-        let order = own.len();
-        let root = |(i, a): (usize, &f64)| libm::pow(a.abs(), 1.0 / (order - i) as f64);
-        let scale = own.iter().enumerate().map(root).fold(0.0, f64::max);
+    pub(crate) fn new(coefficients: &[f64], step: f64) -> Self {
+        let order = coefficients.len();
+        let scale_of_term = |(i, a): (usize, &f64)| libm::pow(a.abs(), 1.0 / (order - i) as f64);
+        let scale = coefficients.iter().enumerate().map(scale_of_term).fold(0.0, f64::max);
         let scale = if scale > 0.0 && scale.is_finite() { scale } else { 1.0 / step };
-        let own = own.iter().enumerate().map(|(i, a)| a * scale.powi(i as i32 - order as i32)).collect();
-        Self { order, scale, own, step: step * scale, width: step, discretizations: RefCell::default() }
+        let coefficients =
+            coefficients.iter().enumerate().map(|(i, a)| a * scale.powi(i as i32 - order as i32)).collect();
+        Self { order, scale, coefficients, step: step * scale, width: step, discretizations: RefCell::default() }
     }
 
     /// Return the companion form for the pulse width `step` from the cache, to which it is added if necessary.
-    pub(crate) fn of_width(cache: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
-        if let Some(cached) = cache.iter().find(|c| c.width.to_bits() == step.to_bits()) {
-            return cached.clone();
+    pub(crate) fn of_width(cache: &mut Vec<Rc<Self>>, coefficients: &[f64], step: f64) -> Rc<Self> {
+        if let Some(entry_from_cache) = cache.iter().find(|c| c.width.to_bits() == step.to_bits()) {
+            return entry_from_cache.clone();
         }
-        cache.push(Rc::new(Self::new(own, step)));
+        cache.push(Rc::new(Self::new(coefficients, step)));
         cache[cache.len() - 1].clone()
     }
 
@@ -144,7 +145,7 @@ impl Companion {
                 row[j] += c * self.power(j as isize - n as isize);
             } else if j == n {
                 direct += c;
-                row.iter_mut().zip(&self.own).for_each(|(r, a)| *r += c * a);
+                row.iter_mut().zip(&self.coefficients).for_each(|(r, a)| *r += c * a);
             }
         }
         (row, direct)
@@ -155,77 +156,79 @@ impl Companion {
     ///
     /// `j` is at most the order.
     pub(crate) fn derivative(&self, (states, values): &(Vec<f64>, Vec<f64>), j: usize) -> Vec<f64> {
-        let (read, direct) = self.output(std::iter::once((j, 1.0)));
-        let of = |(row, u): (&[f64], &f64)| row.iter().zip(&read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
-        states.chunks_exact(self.order.max(1)).zip(values).map(of).collect()
+        let (output_row, direct) = self.output(std::iter::once((j, 1.0)));
+        let sample =
+            |(row, u): (&[f64], &f64)| row.iter().zip(&output_row).map(|(x, c)| x * c).sum::<f64>() + direct * u;
+        states.chunks_exact(self.order.max(1)).zip(values).map(sample).collect()
     }
 
     /// Return the response of 1/A to an input, or to an impulse if `input` is None.
     ///
-    /// `behind` is an output row with a direct gain. The output that they define is the input of a second system 1/A in
-    /// series. The response consists of the states at the compared samples, and the input just after each. None on
-    /// overflow.
+    /// `series_output` is an output row with a direct gain. The output that they define is the input of a second system
+    /// 1/A in series. The response consists of the states at the compared samples, and the input just after each. None
+    /// on overflow.
     pub(crate) fn respond(
         &self,
         input: Option<&SourceInput<'_>>,
-        behind: Option<(&[f64], f64)>,
-        grid: Grid,
+        series_output: Option<(&[f64], f64)>,
+        sampling: SampleGrid,
     ) -> Option<(Vec<f64>, Vec<f64>)> {
         let n = self.order;
-        let total = if behind.is_some() { 2 * n } else { n };
+        let total = if series_output.is_some() { 2 * n } else { n };
         let fraction = input.map_or(0.0, |input| input.delay - input.delay.floor());
-        let discretization = self.discretization(input.map(|input| input.intersample), fraction, behind)?;
+        let discretization = self.discretization(input.map(|input| input.intersample), fraction, series_output)?;
         let mut start = vec![0.0; total];
         if input.is_none() {
             start[n - 1] = 1.0;
         }
-        discretization.advance(start, input, grid)
+        discretization.advance(start, input, sampling)
     }
 
     /// Return the discretization of 1/A, or of two systems 1/A in series; None on overflow.
     ///
-    /// `behind` is the output row and direct gain that connect the first system to the second. `fraction` is the
+    /// `series_output` is the output row and direct gain that connect the first system to the second. `fraction` is the
     /// fractional part of the delay in pulses.
     fn discretization(
         &self,
         intersample: Option<Intersample>,
         fraction: f64,
-        behind: Option<(&[f64], f64)>,
+        series_output: Option<(&[f64], f64)>,
     ) -> Option<Rc<Discretization>> {
-        let key = (intersample, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
-        if let Some(cached) = self.discretizations.borrow().iter().find(|d| d.key == key) {
-            return Some(cached.clone());
+        let key =
+            (intersample, fraction.to_bits(), series_output.map(|(output_row, direct)| (output_row.to_vec(), direct)));
+        if let Some(entry_from_cache) = self.discretizations.borrow().iter().find(|d| d.key == key) {
+            return Some(entry_from_cache.clone());
         }
         let n = self.order;
-        let total = if behind.is_some() { 2 * n } else { n };
-        let (mut system, mut drive) = (vec![0.0; total * total], vec![0.0; total]);
+        let total = if series_output.is_some() { 2 * n } else { n };
+        let (mut system, mut input_vector) = (vec![0.0; total * total], vec![0.0; total]);
         for first in (0..total).step_by(n.max(1)) {
             for i in 0..n {
                 let row = (first + i) * total + first;
                 if i + 1 < n {
                     system[row + i + 1] = self.step;
                 } else {
-                    system[row..row + n].iter_mut().zip(&self.own).for_each(|(s, a)| *s = self.step * a);
+                    system[row..row + n].iter_mut().zip(&self.coefficients).for_each(|(s, a)| *s = self.step * a);
                 }
             }
         }
-        drive[n - 1] = self.step;
-        if let Some((read, direct)) = behind {
+        input_vector[n - 1] = self.step;
+        if let Some((output_row, direct)) = series_output {
             let last = (total - 1) * total;
-            system[last..last + n].iter_mut().zip(read).for_each(|(s, c)| *s = self.step * c);
-            drive[total - 1] = self.step * direct;
+            system[last..last + n].iter_mut().zip(output_row).for_each(|(s, c)| *s = self.step * c);
+            input_vector[total - 1] = self.step * direct;
         }
         let interval = Transition::new(&system, total, 1.0)?;
         let gains = match intersample {
             None => None,
-            Some(intersample) => Some(InputGains::new(&interval, &system, &drive, intersample, fraction)?),
+            Some(intersample) => Some(InputGains::new(&interval, &system, &input_vector, intersample, fraction)?),
         };
         // Columns are contiguous, so that the states of a step are independent sums.
         let transition_increment =
             (0..total * total).map(|k| interval.transition_increment[k % total * total + k / total]).collect();
-        let gain_matrices = Rc::new(Discretization { key, transition_increment, gains });
-        self.discretizations.borrow_mut().push(gain_matrices.clone());
-        Some(gain_matrices)
+        let discretization = Rc::new(Discretization { key, transition_increment, gains });
+        self.discretizations.borrow_mut().push(discretization.clone());
+        Some(discretization)
     }
 }
 
@@ -238,7 +241,7 @@ impl Discretization {
         &self,
         mut state: Vec<f64>,
         input: Option<&SourceInput<'_>>,
-        (every, count): Grid,
+        (pulses_per_sample, count): SampleGrid,
     ) -> Option<(Vec<f64>, Vec<f64>)> {
         let n = state.len();
         let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
@@ -246,28 +249,28 @@ impl Discretization {
             let is_fractional_delay = input.intersample == Intersample::Hold && input.delay > input.delay.floor();
             input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(is_fractional_delay)
         });
-        let at = |k: usize| match (input, delayed_row(k, lag)) {
+        let input_value = |k: usize| match (input, delayed_row(k, lag)) {
             (None, _) => 0.0,
             (Some(input), None) => input.before,
             (Some(input), Some(k)) => input.samples[k.min(input.samples.len() - 1)],
         };
-        let mut next = vec![0.0; n];
-        for k in 0..=count * every {
-            let (current_value, next_value) = (at(k), at(k + 1));
-            if k > 0 && k % every == 0 {
+        let mut next_state = vec![0.0; n];
+        for k in 0..=count * pulses_per_sample {
+            let (current_value, next_value) = (input_value(k), input_value(k + 1));
+            if k > 0 && k % pulses_per_sample == 0 {
                 states.extend_from_slice(&state);
                 values.push(current_value);
             }
-            next.copy_from_slice(&state);
+            next_state.copy_from_slice(&state);
             if let Some(gains) = &self.gains {
-                for ((v, a), b) in next.iter_mut().zip(&gains.current_gains).zip(&gains.next_gains) {
+                for ((v, a), b) in next_state.iter_mut().zip(&gains.current_gains).zip(&gains.next_gains) {
                     *v += a * current_value + b * next_value;
                 }
             }
             for (column, x) in self.transition_increment.chunks_exact(n).zip(&state) {
-                next.iter_mut().zip(column).for_each(|(v, g)| *v += g * x);
+                next_state.iter_mut().zip(column).for_each(|(v, g)| *v += g * x);
             }
-            std::mem::swap(&mut state, &mut next);
+            std::mem::swap(&mut state, &mut next_state);
         }
         states.iter().all(|v| v.is_finite()).then_some((states, values))
     }
@@ -306,22 +309,24 @@ impl IntegerOrders {
     ///
     /// This is the case if an order is free or fractional, or if equations are coupled. It is also the case if an
     /// experiment has a sensor filter, nonuniform samples, or an input that is neither held nor linear.
-    pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
+    pub(crate) fn new(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         let structures = model.structures(&point.orders);
-        let fixed = |weights: &[f64]| {
+        let is_fixed = |weights: &[f64]| {
             weights.iter().zip(&model.order_bounds).all(|(w, (low, high))| *w == 0.0 || low.to_bits() == high.to_bits())
         };
         let mut equations = Vec::with_capacity(structures.len());
         for (i, (structure, equation)) in structures.iter().zip(&model.equations).enumerate() {
-            if !fixed(&equation.order.weights) || !equation.terms.iter().all(|(_, order, _)| fixed(&order.weights)) {
+            if !is_fixed(&equation.order.weights)
+                || !equation.terms.iter().all(|(_, order, _)| is_fixed(&order.weights))
+            {
                 return None;
             }
             let order = integer(structure.order).filter(|n| (1..=MAX_ORDER).contains(n))?;
-            let (mut own, mut inputs) = (Vec::new(), Vec::<(usize, Vec<(usize, usize)>)>::new());
+            let (mut autoregressive_terms, mut inputs) = (Vec::new(), Vec::<(usize, Vec<(usize, usize)>)>::new());
             for (k, term) in structure.terms.iter().enumerate() {
                 let nu = integer(term.order)?;
                 match model.output_index(i, term.signal) {
-                    Some(j) if j == i && nu < order => own.push((k, nu)),
+                    Some(j) if j == i && nu < order => autoregressive_terms.push((k, nu)),
                     None if nu <= order => match inputs.iter_mut().find(|(signal, _)| *signal == term.signal) {
                         Some((_, terms)) => terms.push((k, nu)),
                         None => inputs.push((term.signal, vec![(k, nu)])),
@@ -338,13 +343,13 @@ impl IntegerOrders {
                     let Some(values) = experiment.point_values.get(signal) else { return false };
                     values.is_zero_order_hold || (values.values.is_some() && model.law_of(signal).is_none())
                 };
-                let plain =
+                let has_plain_samples =
                     experiment.nonuniform.is_none() && experiment.filter.is_none() && !experiment.record.is_filtered();
-                if !plain || !inputs.iter().all(is_known_input) {
+                if !has_plain_samples || !inputs.iter().all(is_known_input) {
                     return None;
                 }
             }
-            equations.push(EquationOrders { order, own, inputs });
+            equations.push(EquationOrders { order, autoregressive_terms, inputs });
         }
         Some(Self { equations })
     }
@@ -354,19 +359,20 @@ impl IntegerOrders {
         let shortest_interval =
             experiments.iter().map(|e| e.record.step() * e.pulses_per_sample as f64).fold(f64::INFINITY, f64::min);
         self.equations.iter().enumerate().all(|(i, _)| {
-            let mut divisor: Vec<f64> = self.own_coefficients(model, i, point).iter().map(|a| -a).collect();
-            divisor.push(1.0);
-            spectral_radius(&divisor).is_some_and(|fastest| fastest * shortest_interval <= MAX_POLE_PHASE_RAD)
+            let mut denominator: Vec<f64> =
+                self.autoregressive_coefficients(model, i, point).iter().map(|a| -a).collect();
+            denominator.push(1.0);
+            spectral_radius(&denominator).is_some_and(|fastest| fastest * shortest_interval <= MAX_POLE_PHASE_RAD)
         })
     }
 
     /// Coefficients of D^0 y, …, D^(n − 1) y in equation `i` of order n.
-    fn own_coefficients(&self, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
-        let mut own = vec![0.0; self.equations[i].order];
-        for &(k, nu) in &self.equations[i].own {
-            own[nu] += model.equations[i].terms[k].2.at(&point.coefficients);
+    fn autoregressive_coefficients(&self, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
+        let mut coefficients = vec![0.0; self.equations[i].order];
+        for &(k, nu) in &self.equations[i].autoregressive_terms {
+            coefficients[nu] += model.equations[i].terms[k].2.at(&point.coefficients);
         }
-        own
+        coefficients
     }
 
     /// Return the residuals at a point, with the `linear` coefficients and the initial terms eliminated.
@@ -389,7 +395,7 @@ impl IntegerOrders {
             let (simulation, initial) =
                 self.simulate(model, experiment, (point, linear), &out.exponents, &mut companions)?;
             let mut remainders = experiment.measured_samples();
-            out.size = out.size.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
+            out.measured_norm = out.measured_norm.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
             let response = (0..self.equations.len()).flat_map(|i| simulation.response(self, model, i, point));
             let weights = (0..self.equations.len()).flat_map(|i| experiment.weights_of(i));
             remainders.iter_mut().zip(response.zip(weights)).for_each(|(e, (v, w))| *e -= w * v);
@@ -417,31 +423,33 @@ impl IntegerOrders {
         companions: &mut [Vec<Rc<Companion>>],
     ) -> Result<(ExactSimulation<'a>, Vec<(Option<usize>, Vec<f64>)>)> {
         let (record, count) = (&experiment.record, experiment.compared_count());
-        let (every, step) = (experiment.pulses_per_sample, record.step());
+        let (pulses_per_sample, step) = (experiment.pulses_per_sample, record.step());
         let outputs = self.equations.len();
         let overflow = || Error::Diverged { what: "simulation".into(), index: 0 };
         let mut equations = Vec::with_capacity(outputs);
         let (mut basis, mut columns) = (Vec::new(), Vec::new());
-        let place = |i: usize, samples: &mut dyn Iterator<Item = f64>| {
+        let weighted_column = |i: usize, samples: &mut dyn Iterator<Item = f64>| {
             let mut column = vec![0.0; outputs * count];
-            let own = column[i * count..(i + 1) * count].iter_mut();
-            own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v = w * y);
+            let equation_column = column[i * count..(i + 1) * count].iter_mut();
+            equation_column.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v = w * y);
             column
         };
         for (i, orders) in self.equations.iter().enumerate() {
-            let companion = Companion::of_width(&mut companions[i], &self.own_coefficients(model, i, point), step);
+            let companion =
+                Companion::of_width(&mut companions[i], &self.autoregressive_coefficients(model, i, point), step);
             let mut sources = Vec::new();
-            let mut add = |kind, input: Option<SourceInput<'a>>| -> Result<()> {
-                let (states, values) = companion.respond(input.as_ref(), None, (every, count)).ok_or_else(overflow)?;
+            let mut add_source = |kind, input: Option<SourceInput<'a>>| -> Result<()> {
+                let (states, values) =
+                    companion.respond(input.as_ref(), None, (pulses_per_sample, count)).ok_or_else(overflow)?;
                 sources.push(Source { kind, input, states, values });
                 Ok(())
             };
             for (q, (signal, _)) in orders.inputs.iter().enumerate() {
-                add(SourceKind::Input(q), Some(source_input(model, experiment, *signal, point)?))?;
+                add_source(SourceKind::Input(q), Some(source_input(model, experiment, *signal, point)?))?;
             }
             let powers: Vec<usize> = exponents[i].iter().filter_map(|&e| integer(e)).collect();
             if powers.iter().any(|&e| e < orders.order) {
-                add(SourceKind::Impulse, None)?;
+                add_source(SourceKind::Impulse, None)?;
             }
             for &e in powers.iter().filter(|&&e| e >= orders.order) {
                 // The input is a constant, or a ramp with one value per pulse edge.
@@ -451,22 +459,22 @@ impl IntegerOrders {
                 };
                 #[allow(clippy::cast_precision_loss)]
                 let samples = (0..length).map(|k| if length == 1 { 1.0 } else { k as f64 * step }).collect();
-                add(SourceKind::Power(e), Some(SourceInput { samples, intersample, delay: 0.0, before: 0.0 }))?;
+                add_source(SourceKind::Power(e), Some(SourceInput { samples, intersample, delay: 0.0, before: 0.0 }))?;
             }
             let simulation = EquationSimulation { companion, sources };
             for &e in &powers {
                 let mut values = vec![0.0; powers.len()];
-                if let Some(at) = powers.iter().position(|&p| p == e) {
-                    values[at] = 1.0;
+                if let Some(index) = powers.iter().position(|&p| p == e) {
+                    values[index] = 1.0;
                 }
                 let mut response = vec![0.0; count];
                 for source in &simulation.sources {
                     if !matches!(source.kind, SourceKind::Input(_)) {
-                        let (read, direct) = simulation.initial_output(&source.kind, &powers, &values);
-                        source.add_output(&read, direct, &mut response);
+                        let (output_row, direct) = simulation.initial_output(&source.kind, &powers, &values);
+                        source.add_output(&output_row, direct, &mut response);
                     }
                 }
-                let column = place(i, &mut response.into_iter());
+                let column = weighted_column(i, &mut response.into_iter());
                 extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE);
                 columns.push((Some(i), column));
             }
@@ -474,7 +482,7 @@ impl IntegerOrders {
         }
         if model.initial.has_level() {
             for i in 0..outputs {
-                let column = place(i, &mut std::iter::repeat(1.0));
+                let column = weighted_column(i, &mut std::iter::repeat(1.0));
                 extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE);
                 columns.push((None, column));
             }
@@ -492,15 +500,17 @@ impl IntegerOrders {
         model: &FreeModel,
         experiments: &[Experiment],
         linear: &[usize],
-        at: &Evaluation<ExactSimulation<'_>>,
+        evaluation: &Evaluation<ExactSimulation<'_>>,
     ) -> Result<Vec<Vec<f64>>> {
-        let point = &at.point;
+        let point = &evaluation.point;
         let (orders, coefficients) = (point.orders.len(), point.coefficients.len());
         let count = orders + coefficients + point.inputs.len();
-        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
-        for (run, (experiment, simulation)) in experiments.iter().zip(&at.parts).enumerate() {
+        let mut jacobian = vec![Vec::with_capacity(evaluation.residuals.len()); count];
+        for (run, (experiment, simulation)) in experiments.iter().zip(&evaluation.parts).enumerate() {
             let responses = (0..self.equations.len())
-                .map(|i| simulation.autoregressive_states(self, model, experiment, (i, point), &at.initial[run]))
+                .map(|i| {
+                    simulation.autoregressive_states(self, model, experiment, (i, point), &evaluation.initial[run])
+                })
                 .collect::<Option<Vec<_>>>()
                 .ok_or_else(|| Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 })?;
             for (parameter, out) in jacobian.iter_mut().enumerate() {
@@ -508,7 +518,7 @@ impl IntegerOrders {
                     // No order is free.
                     None => vec![0.0; self.equations.len() * experiment.compared_count()],
                     Some(j) if j < coefficients => match linear.iter().position(|&l| l == j) {
-                        Some(place) => simulation.effects[place].clone(),
+                        Some(index) => simulation.effects[index].clone(),
                         None => {
                             let mut column = simulation.input_effect(self, model, experiment, point, j);
                             simulation.add_autoregressive_effect(
@@ -546,15 +556,16 @@ pub(crate) fn source_input<'a>(
     point: &ParameterPoint,
 ) -> Result<SourceInput<'a>> {
     let record = &experiment.record;
-    let (means, instants) = (record.signal(signal), &experiment.point_values[signal]);
-    if let (false, Some(values)) = (instants.is_zero_order_hold, &instants.values) {
-        let every = experiment.pulses_per_sample;
+    let (means, point_values) = (record.signal(signal), &experiment.point_values[signal]);
+    if let (false, Some(values)) = (point_values.is_zero_order_hold, &point_values.values) {
+        let pulses_per_sample = experiment.pulses_per_sample;
         #[allow(clippy::cast_precision_loss)]
         let edge = |k: usize| {
-            let (row, rest) = (k / every, (k % every) as f64 / every as f64);
-            values[row] + if rest > 0.0 { rest * (values[row + 1] - values[row]) } else { 0.0 }
+            let (row, fraction) = (k / pulses_per_sample, (k % pulses_per_sample) as f64 / pulses_per_sample as f64);
+            values[row] + if fraction > 0.0 { fraction * (values[row + 1] - values[row]) } else { 0.0 }
         };
-        let samples = if every == 1 { Cow::Borrowed(&values[..]) } else { (0..=record.m()).map(edge).collect() };
+        let samples =
+            if pulses_per_sample == 1 { Cow::Borrowed(&values[..]) } else { (0..=record.m()).map(edge).collect() };
         return Ok(SourceInput { samples, intersample: Intersample::Linear, delay: 0.0, before: 0.0 });
     }
     let (mut samples, mut delay, mut before) = (Cow::Borrowed(means), 0.0, 0.0);
@@ -570,11 +581,11 @@ pub(crate) fn source_input<'a>(
 }
 
 impl Source<'_> {
-    /// Add `read`·x + `direct`·u to `samples`, where x are the states and u is the input.
-    fn add_output(&self, read: &[f64], direct: f64, samples: &mut [f64]) {
-        let rows = self.states.chunks_exact(read.len().max(1));
+    /// Add `output_row`·x + `direct`·u to `samples`, where x are the states and u is the input.
+    fn add_output(&self, output_row: &[f64], direct: f64, samples: &mut [f64]) {
+        let rows = self.states.chunks_exact(output_row.len().max(1));
         for ((y, row), u) in samples.iter_mut().zip(rows).zip(&self.values) {
-            *y += row.iter().zip(read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
+            *y += row.iter().zip(output_row).map(|(x, c)| x * c).sum::<f64>() + direct * u;
         }
     }
 }
@@ -587,19 +598,19 @@ impl EquationSimulation<'_> {
     #[allow(clippy::cast_possible_wrap)]
     fn initial_output(&self, kind: &SourceKind, powers: &[usize], values: &[f64]) -> (Vec<f64>, f64) {
         let n = self.companion.order;
-        let mut read = vec![0.0; n];
+        let mut output_row = vec![0.0; n];
         for (&e, x) in powers.iter().zip(values) {
             match kind {
                 SourceKind::Impulse if e < n => {
-                    read[n - 1 - e] += x * factorial(e) * self.companion.power(-(e as isize));
+                    output_row[n - 1 - e] += x * factorial(e) * self.companion.power(-(e as isize));
                 }
-                SourceKind::Power(own) if *own == e => {
-                    read[0] += x * factorial(e) * self.companion.power(-(n as isize));
+                SourceKind::Power(exponent) if *exponent == e => {
+                    output_row[0] += x * factorial(e) * self.companion.power(-(n as isize));
                 }
                 _ => {}
             }
         }
-        (read, 0.0)
+        (output_row, 0.0)
     }
 }
 
@@ -625,12 +636,12 @@ impl ExactSimulation<'_> {
 
     /// The unweighted samples of the output of equation `i` from zero initial conditions.
     fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
-        let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+        let coefficient = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];
         for source in &self.equations[i].sources {
             if let SourceKind::Input(q) = source.kind {
-                let (read, direct) = self.input_output(orders, (i, q), of, 0);
-                source.add_output(&read, direct, &mut samples);
+                let (output_row, direct) = self.input_output(orders, (i, q), coefficient, 0);
+                source.add_output(&output_row, direct, &mut samples);
             }
         }
         samples
@@ -648,17 +659,17 @@ impl ExactSimulation<'_> {
         let count = experiment.compared_count();
         let mut column = vec![0.0; orders.equations.len() * count];
         for (i, simulation) in self.equations.iter().enumerate() {
-            let of = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
-            let own = &mut column[i * count..(i + 1) * count];
+            let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
+            let equation_column = &mut column[i * count..(i + 1) * count];
             for source in &simulation.sources {
                 if let SourceKind::Input(q) = source.kind
-                    && orders.equations[i].inputs[q].1.iter().any(|&(k, _)| of(k) != 0.0)
+                    && orders.equations[i].inputs[q].1.iter().any(|&(k, _)| slope(k) != 0.0)
                 {
-                    let (read, direct) = self.input_output(orders, (i, q), of, 0);
-                    source.add_output(&read, direct, own);
+                    let (output_row, direct) = self.input_output(orders, (i, q), slope, 0);
+                    source.add_output(&output_row, direct, equation_column);
                 }
             }
-            own.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
+            equation_column.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
         }
         column
     }
@@ -677,18 +688,18 @@ impl ExactSimulation<'_> {
         let structures = model.structures(&point.orders);
         let exponents = model.exponents(experiment, i, &structures[i]);
         let powers: Vec<usize> = exponents.iter().filter_map(|&e| integer(e)).collect();
-        let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+        let coefficient = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut total = vec![0.0; n * count];
         for source in sources {
-            let (read, direct) = match source.kind {
-                SourceKind::Input(q) => self.input_output(orders, (i, q), of, 0),
+            let (output_row, direct) = match source.kind {
+                SourceKind::Input(q) => self.input_output(orders, (i, q), coefficient, 0),
                 _ => self.equations[i].initial_output(&source.kind, &powers, &initial[i]),
             };
-            if direct == 0.0 && read.iter().all(|v| *v == 0.0) {
+            if direct == 0.0 && output_row.iter().all(|v| *v == 0.0) {
                 continue;
             }
-            let grid = (experiment.pulses_per_sample, count);
-            let (states, _) = companion.respond(source.input.as_ref(), Some((&read, direct)), grid)?;
+            let sampling = (experiment.pulses_per_sample, count);
+            let (states, _) = companion.respond(source.input.as_ref(), Some((&output_row, direct)), sampling)?;
             for (sum, row) in total.chunks_exact_mut(n).zip(states.chunks_exact(2 * n)) {
                 sum.iter_mut().zip(&row[n..]).for_each(|(a, b)| *a += b);
             }
@@ -712,13 +723,15 @@ impl ExactSimulation<'_> {
         let count = experiment.compared_count();
         for (i, equation) in orders.equations.iter().enumerate() {
             let (companion, n) = (&self.equations[i].companion, equation.order);
-            for &(k, nu) in &equation.own {
+            for &(k, nu) in &equation.autoregressive_terms {
                 let slope = model.equations[i].terms[k].2.slope(&point.coefficients, j);
                 if slope != 0.0 {
                     let gain = slope * companion.power(nu as isize - n as isize);
                     let states = responses[i].iter().skip(nu).step_by(n);
-                    let own = column[i * count..(i + 1) * count].iter_mut();
-                    own.zip(experiment.weights_of(i).zip(states)).for_each(|(v, (w, x))| *v += w * gain * x);
+                    let equation_column = column[i * count..(i + 1) * count].iter_mut();
+                    equation_column
+                        .zip(experiment.weights_of(i).zip(states))
+                        .for_each(|(v, (w, x))| *v += w * gain * x);
                 }
             }
         }
@@ -736,8 +749,8 @@ impl ExactSimulation<'_> {
         let (count, input) = (experiment.compared_count(), model.inputs[law]);
         let mut column = vec![0.0; orders.equations.len() * count];
         for (i, simulation) in self.equations.iter().enumerate() {
-            let own = &mut column[i * count..(i + 1) * count];
-            let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
+            let equation_column = &mut column[i * count..(i + 1) * count];
+            let coefficient = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
             for source in &simulation.sources {
                 let SourceKind::Input(q) = source.kind else { continue };
                 if orders.equations[i].inputs[q].0 != input.signal {
@@ -745,22 +758,26 @@ impl ExactSimulation<'_> {
                 }
                 if input.law == InputLaw::Delay {
                     // The derivative is −D y. The infinite derivative of the jumps themselves is omitted.
-                    let (read, direct) = self.input_output(orders, (i, q), |k| -of(k), 1);
-                    source.add_output(&read, direct, own);
+                    let (output_row, direct) = self.input_output(orders, (i, q), |k| -coefficient(k), 1);
+                    source.add_output(&output_row, direct, equation_column);
                     continue;
                 }
                 let slope = model.apply_input_law(&experiment.record, input, point.inputs[law])?.1;
                 let slope =
                     SourceInput { samples: slope.into(), intersample: Intersample::Hold, delay: 0.0, before: 0.0 };
-                let grid = (experiment.pulses_per_sample, count);
+                let sampling = (experiment.pulses_per_sample, count);
                 let (states, values) = simulation
                     .companion
-                    .respond(Some(&slope), None, grid)
+                    .respond(Some(&slope), None, sampling)
                     .ok_or_else(|| Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 })?;
-                let (read, direct) = self.input_output(orders, (i, q), of, 0);
-                Source { kind: SourceKind::Impulse, input: None, states, values }.add_output(&read, direct, own);
+                let (output_row, direct) = self.input_output(orders, (i, q), coefficient, 0);
+                Source { kind: SourceKind::Impulse, input: None, states, values }.add_output(
+                    &output_row,
+                    direct,
+                    equation_column,
+                );
             }
-            own.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
+            equation_column.iter_mut().zip(experiment.weights_of(i)).for_each(|(v, w)| *v *= w);
         }
         Ok(column)
     }

@@ -26,13 +26,13 @@ impl FreeModel {
         experiments: &[Experiment],
         caches: &mut [EvaluationCache],
         linear: &[usize],
-        at: &Evaluation<Linearization>,
+        evaluation: &Evaluation<Linearization>,
     ) -> Result<Vec<Vec<f64>>> {
-        let point = &at.point;
+        let point = &evaluation.point;
         let count = point.orders.len() + point.coefficients.len() + point.inputs.len();
-        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
-        for (index, ((experiment, part), cache)) in experiments.iter().zip(&at.parts).zip(caches).enumerate() {
-            self.sensitivities(experiment, cache, part, point, &at.initial[index], linear, &mut jacobian)?;
+        let mut jacobian = vec![Vec::with_capacity(evaluation.residuals.len()); count];
+        for (index, ((experiment, part), cache)) in experiments.iter().zip(&evaluation.parts).zip(caches).enumerate() {
+            self.sensitivities(experiment, cache, part, point, &evaluation.initial[index], linear, &mut jacobian)?;
         }
         if jacobian.iter().flatten().any(|v| !v.is_finite()) {
             return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
@@ -57,19 +57,19 @@ impl FreeModel {
         let (m, n) = (record.m(), self.equations.len());
         let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
         let mut columns: Vec<Option<Vec<f64>>> = vec![None; jacobian.len()];
-        for (&coefficient, driven) in linear.iter().zip(&part.linear_effects) {
-            columns[orders.len() + coefficient] = Some(driven.samples.clone());
+        for (&coefficient, effect) in linear.iter().zip(&part.linear_effects) {
+            columns[orders.len() + coefficient] = Some(effect.samples.clone());
         }
-        let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
+        let parameters: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
         part.system.inverse()?.solve_each(
             (n, m),
-            open.len(),
-            |place, rights| {
+            parameters.len(),
+            |index, right_hand_sides| {
                 cache.stop.check()?;
-                let parameter = open[place];
+                let parameter = parameters[index];
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
-                        let turns = parameter < orders.len();
+                        let is_order = parameter < orders.len();
                         let weight = self.right_hand_side_weight((i, k), point, parameter);
                         if weight == 0.0 {
                             continue;
@@ -77,18 +77,30 @@ impl FreeModel {
                         let operator = &part.operators[i][k];
                         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
                             let slope = &part.input_means[input].1;
-                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || cache.spectrum(slope));
+                            right_hand_sides.add(
+                                i,
+                                weight,
+                                (operator, false),
+                                || Cow::Borrowed(slope),
+                                || cache.spectrum(slope),
+                            );
                         } else if let Some(j) = self.output_index(i, *signal) {
                             let (response, spectrum) = (&part.response[j], &mut responses[j]);
                             let make_spectrum = || spectrum.get_or_insert_with(|| cache.spectrum(response)).clone();
-                            rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), make_spectrum);
+                            right_hand_sides.add(
+                                i,
+                                weight,
+                                (operator, is_order),
+                                || Cow::Borrowed(response),
+                                make_spectrum,
+                            );
                         } else {
                             let series = || {
                                 Cow::Borrowed(self.input_means(record, (*signal, operator.eta()), &part.input_means))
                             };
                             let make_spectrum =
                                 || cache.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
-                            rights.add(i, weight, (operator, turns), series, make_spectrum);
+                            right_hand_sides.add(i, weight, (operator, is_order), series, make_spectrum);
                         }
                     }
                     if parameter < orders.len()
@@ -96,15 +108,15 @@ impl FreeModel {
                             initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, cache))
                     {
                         let series = || Cow::Owned(cache.filter_series(&initial_slope));
-                        rights.add_series(i, series, || cache.filtered_spectrum(&initial_slope));
+                        right_hand_sides.add_series(i, series, || cache.filtered_spectrum(&initial_slope));
                     }
                 }
                 Ok(())
             },
-            |place, means| {
+            |index, means| {
                 if let Some(means) = means {
-                    columns[open[place]] =
-                        Some(part.parameter_effect(open[place], means, (self, experiment, point))?.samples);
+                    columns[parameters[index]] =
+                        Some(part.parameter_effect(parameters[index], means, (self, experiment, point))?.samples);
                 }
                 Ok(())
             },
@@ -136,8 +148,8 @@ impl FreeModel {
         match parameter.checked_sub(orders.len()) {
             Some(coefficient) => monomial.slope(coefficients, coefficient),
             None => {
-                let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
-                monomial.at(coefficients) * (of(&equation.order) - of(order))
+                let order_weight = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
+                monomial.at(coefficients) * (order_weight(&equation.order) - order_weight(order))
             }
         }
     }
@@ -159,16 +171,16 @@ pub(crate) fn initial_exponent_slopes(
         return None;
     }
     let exponents = |shift: f64| {
-        let mut shifted = orders.to_vec();
-        shifted[parameter] += shift;
-        model.exponents(experiment, i, &model.structures(&shifted)[i])
+        let mut shifted_orders = orders.to_vec();
+        shifted_orders[parameter] += shift;
+        model.exponents(experiment, i, &model.structures(&shifted_orders)[i])
     };
-    let (below, own_exponents, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
-    if [&below, &own_exponents, &above].iter().any(|list| list.len() != count) {
+    let (exponents_below, exponents, exponents_above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
+    if [&exponents_below, &exponents, &exponents_above].iter().any(|list| list.len() != count) {
         // The number of initial terms changes at this order. The projection adapts to it in the next evaluation.
         return None;
     }
-    let slopes = below.iter().zip(&above).map(|(below, above)| (above - below) / (2.0 * SHIFT));
+    let slopes = exponents_below.iter().zip(&exponents_above).map(|(below, above)| (above - below) / (2.0 * SHIFT));
     // Smaller differences are rounding.
     Some(slopes.map(|slope| if slope.abs() < SHIFT { 0.0 } else { slope }).collect())
 }
@@ -192,7 +204,7 @@ fn initial_term_derivative(
         }
         out.resize(experiment.record.m(), 0.0);
         let power = cache.initial_term(exponent);
-        out.iter_mut().zip(power.slope()).for_each(|(v, by)| *v += x * slope * by);
+        out.iter_mut().zip(power.slope()).for_each(|(v, slope_of_power)| *v += x * slope * slope_of_power);
     }
     Some(out).filter(|out| !out.is_empty())
 }

@@ -30,50 +30,55 @@ struct Kink {
 
 /// Kink correction of one experiment.
 pub(crate) struct KinkCorrection {
-    all: Vec<Kink>,
+    kinks: Vec<Kink>,
 }
 
 impl KinkCorrection {
     /// Return the kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
-    pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
+    pub(crate) fn new(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
         let NonuniformSamples { interpolation, jumps } = experiment.nonuniform.as_ref()?;
         let step = experiment.record.step();
-        let mut all = Vec::new();
+        let mut kinks = Vec::new();
         for (equation, structure) in structures.iter().enumerate() {
-            let integration = |term: usize| structure.order - structure.terms[term].order;
-            let own: Vec<usize> = (0..structure.terms.len())
+            let integration_order = |term: usize| structure.order - structure.terms[term].order;
+            let autoregressive_terms: Vec<usize> = (0..structure.terms.len())
                 .filter(|&k| model.output_index(equation, structure.terms[k].signal) == Some(equation))
                 .collect();
-            for (term, driver) in structure.terms.iter().enumerate() {
-                let Some(Some(near)) = jumps.get(driver.signal) else { continue };
-                if model.output_index(equation, driver.signal).is_some() {
+            for (term, input_term) in structure.terms.iter().enumerate() {
+                let Some(Some(input_jumps)) = jumps.get(input_term.signal) else { continue };
+                if model.output_index(equation, input_term.signal).is_some() {
                     continue;
                 }
-                for terms in std::iter::once(vec![term]).chain(own.iter().map(|&k| vec![term, k])) {
-                    let eta: f64 = terms.iter().map(|&k| integration(k)).sum();
+                for terms in std::iter::once(vec![term]).chain(autoregressive_terms.iter().map(|&k| vec![term, k])) {
+                    let eta: f64 = terms.iter().map(|&k| integration_order(k)).sum();
                     // Direct feedthrough has its own correction.
                     if eta < FEEDTHROUGH_ORDER_TOLERANCE || (terms.len() > 1 && eta >= SMOOTH_INTEGRATION_ORDER) {
                         continue;
                     }
                     let shift = ORDER_DIFFERENCE_STEP.min(0.5 * eta);
-                    let (up, down) = (
-                        interpolation.kink_corrections(near, eta + shift, step),
-                        interpolation.kink_corrections(near, eta - shift, step),
+                    let (upper, lower) = (
+                        interpolation.kink_corrections(input_jumps, eta + shift, step),
+                        interpolation.kink_corrections(input_jumps, eta - shift, step),
                     );
-                    let slopes = up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
-                    all.push(Kink { equation, terms, values: interpolation.kink_corrections(near, eta, step), slopes });
+                    let slopes = upper.iter().zip(&lower).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
+                    kinks.push(Kink {
+                        equation,
+                        terms,
+                        values: interpolation.kink_corrections(input_jumps, eta, step),
+                        slopes,
+                    });
                 }
             }
         }
-        Some(Self { all })
+        Some(Self { kinks })
     }
 
     /// Correction of the weighted samples for an initial term t^e with e = `exponent`; 0 for uniform samples.
     pub(crate) fn initial_term_correction(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
         let mut rows = vec![vec![0.0; experiment.compared_count()]; experiment.samples.len()];
-        if let Some(own) = experiment.nonuniform.as_ref().filter(|_| exponent.fract() != 0.0) {
-            let start = own.interpolation.jumps(&[0.0], &[libm::tgamma(exponent + 1.0)]);
-            rows[equation] = own.interpolation.kink_corrections(&start, exponent, experiment.record.step());
+        if let Some(nonuniform) = experiment.nonuniform.as_ref().filter(|_| exponent.fract() != 0.0) {
+            let start = nonuniform.interpolation.jumps(&[0.0], &[libm::tgamma(exponent + 1.0)]);
+            rows[equation] = nonuniform.interpolation.kink_corrections(&start, exponent, experiment.record.step());
         }
         experiment.weighted_corrections(&rows)
     }
@@ -88,15 +93,15 @@ impl KinkCorrection {
         direct: Option<&Feedthrough>,
         weights: impl Fn(&Kink) -> (f64, f64),
     ) -> Vec<f64> {
-        let mut driven = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
-        for corner in &self.all {
-            let (value, slope) = weights(corner);
-            let rows = corner.values.iter().zip(&corner.slopes);
-            driven[corner.equation].iter_mut().zip(rows).for_each(|(v, (c, s))| *v += value * c + slope * s);
+        let mut corrections = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
+        for kink in &self.kinks {
+            let (value, slope) = weights(kink);
+            let rows = kink.values.iter().zip(&kink.slopes);
+            corrections[kink.equation].iter_mut().zip(rows).for_each(|(v, (c, s))| *v += value * c + slope * s);
         }
         experiment.weighted_corrections(&match direct {
-            Some(direct) => direct.apply_coupling(driven),
-            None => driven,
+            Some(direct) => direct.apply_coupling(corrections),
+            None => corrections,
         })
     }
 
@@ -130,15 +135,17 @@ impl KinkCorrection {
             let value = |k: usize| equation.terms[k].2.at(&point.coefficients);
             match parameter.checked_sub(point.orders.len()) {
                 None => {
-                    let of = |weights: &[f64]| weights.get(parameter).copied().unwrap_or(0.0);
-                    let exponent_slope = |k: &usize| of(&equation.order.weights) - of(&equation.terms[*k].1.weights);
+                    let order_weight = |weights: &[f64]| weights.get(parameter).copied().unwrap_or(0.0);
+                    let exponent_slope =
+                        |k: &usize| order_weight(&equation.order.weights) - order_weight(&equation.terms[*k].1.weights);
                     let product: f64 = c.terms.iter().map(|&k| value(k)).product();
                     (0.0, product * c.terms.iter().map(exponent_slope).sum::<f64>())
                 }
                 Some(j) => {
-                    let one = |k: usize| equation.terms[k].2.slope(&point.coefficients, j);
-                    let others = |k: usize| c.terms.iter().filter(|&&l| l != k).map(|&l| value(l)).product::<f64>();
-                    (c.terms.iter().map(|&k| one(k) * others(k)).sum(), 0.0)
+                    let term_slope = |k: usize| equation.terms[k].2.slope(&point.coefficients, j);
+                    let other_factors =
+                        |k: usize| c.terms.iter().filter(|&&l| l != k).map(|&l| value(l)).product::<f64>();
+                    (c.terms.iter().map(|&k| term_slope(k) * other_factors(k)).sum(), 0.0)
                 }
             }
         };

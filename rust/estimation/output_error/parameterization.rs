@@ -43,11 +43,11 @@ impl Coordinate {
     /// Return a coefficient after a shift by `delta` in its coordinate.
     pub(crate) fn shift(self, value: f64, delta: f64) -> f64 {
         // The linearization is meaningless beyond a factor of e^5.
-        let bounded = delta.clamp(-5.0, 5.0);
+        let limited_delta = delta.clamp(-5.0, 5.0);
         match self {
             Self::Plain => value + delta,
-            Self::Logarithm => value * libm::exp(bounded),
-            Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
+            Self::Logarithm => value * libm::exp(limited_delta),
+            Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(limited_delta),
             Self::Fixed => value,
         }
     }
@@ -90,9 +90,9 @@ impl Monomial {
     /// Derivative of the monomial with respect to coefficient `i`.
     pub(crate) fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
         let Some(&(_, n)) = self.powers.iter().find(|&&(j, _)| j == i) else { return 0.0 };
-        let rest = self.powers.iter().filter(|&&(j, _)| j != i);
-        let others = rest.fold(self.factor, |product, &(j, k)| product * coefficients[j].powi(k));
-        others * f64::from(n) * coefficients[i].powi(n - 1)
+        let other_powers = self.powers.iter().filter(|&&(j, _)| j != i);
+        let other_factors = other_powers.fold(self.factor, |product, &(j, k)| product * coefficients[j].powi(k));
+        other_factors * f64::from(n) * coefficients[i].powi(n - 1)
     }
 }
 
@@ -119,7 +119,8 @@ pub struct ParameterPoint {
 }
 
 impl ParameterPoint {
-    /// Value of the parameter with this index, in the order: orders, coefficients, input parameters; NaN if there is none.
+    /// Value of the parameter with this index, in the order: orders, coefficients, input parameters; NaN if there is
+    /// none.
     pub(crate) fn value(&self, parameter: usize) -> f64 {
         let mut values = self.orders.iter().chain(&self.coefficients).chain(&self.inputs);
         values.nth(parameter).copied().unwrap_or(f64::NAN)
@@ -170,15 +171,15 @@ impl FreeModel {
     ///
     /// [`Error::Structure`] if one of them is invalid.
     pub(crate) fn check_structure(&self, signals: usize, derived: usize) -> Result<()> {
-        let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+        let structure_error = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         let coefficients = self.coordinates.len();
         for equation in &self.equations {
-            let missing = |(signal, _, c): &(usize, AffineOrder, Monomial)| {
+            let has_missing_item = |(signal, _, c): &(usize, AffineOrder, Monomial)| {
                 *signal >= signals + derived || c.powers.iter().any(|&(i, _)| i >= coefficients)
             };
-            if equation.output >= signals || equation.terms.iter().any(missing) {
+            if equation.output >= signals || equation.terms.iter().any(has_missing_item) {
                 let what = "an equation contains a signal or a coefficient that does not exist".to_owned();
-                return refuse(what, "number them from 0");
+                return structure_error(what, "number them from 0");
             }
             for order in equation.terms.iter().map(|term| &term.1).chain([&equation.order]) {
                 order.check(&self.order_bounds)?;
@@ -187,23 +188,26 @@ impl FreeModel {
         for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
             if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
                 let what = format!("signal {signal} has a free delay or limit but is not an input");
-                return refuse(what, "delay and limit inputs only");
+                return structure_error(what, "delay and limit inputs only");
             }
             if self.law_of(signal) != Some(k) {
-                return refuse(
+                return structure_error(
                     format!("signal {signal} has two free parameters"),
                     "free only one parameter of an input",
                 );
             }
-            let least = if law == InputLaw::Delay { f64::MIN } else { 0.0 };
-            if !(least <= low && low <= high && high.is_finite()) {
-                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two increasing values");
+            let min_bound = if law == InputLaw::Delay { f64::MIN } else { 0.0 };
+            if !(min_bound <= low && low <= high && high.is_finite()) {
+                return structure_error(
+                    format!("bounds {low} to {high} of a delay or limit"),
+                    "give two increasing values",
+                );
             }
         }
         if let Some((low, high)) =
             self.order_bounds.iter().find(|(low, high)| low.is_nan() || high.is_nan() || low > high)
         {
-            return refuse(format!("bounds {low} to {high} of an order"), "give two increasing orders");
+            return structure_error(format!("bounds {low} to {high} of an order"), "give two increasing orders");
         }
         self.check_priors()
     }
@@ -311,18 +315,21 @@ impl FreeModel {
 
     /// Order of each equation, and pairs of coefficient and order of its autoregressive terms.
     fn autoregressive_terms(&self, point: &ParameterPoint) -> Vec<(f64, Vec<(f64, f64)>)> {
-        let own = |(structure, equation): (&Structure, &FreeEquation)| {
+        let autoregressive_terms_of = |(structure, equation): (&Structure, &FreeEquation)| {
             let terms = structure.terms.iter().zip(&equation.terms);
-            let own = terms.filter(|(term, _)| term.signal == structure.output);
-            (structure.order, own.map(|(term, (_, _, c))| (c.at(&point.coefficients), term.order)).collect())
+            let autoregressive_pairs = terms.filter(|(term, _)| term.signal == structure.output);
+            (
+                structure.order,
+                autoregressive_pairs.map(|(term, (_, _, c))| (c.at(&point.coefficients), term.order)).collect(),
+            )
         };
-        self.structures(&point.orders).iter().zip(&self.equations).map(own).collect()
+        self.structures(&point.orders).iter().zip(&self.equations).map(autoregressive_terms_of).collect()
     }
 
     /// Return true if an equation is unstable. Coupled equations are not checked, and the result is false.
     pub(crate) fn is_unstable(&self, point: &ParameterPoint) -> bool {
-        let uncoupled = !self.coupled || self.equations.len() == 1;
-        uncoupled && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
+        let is_uncoupled = !self.coupled || self.equations.len() == 1;
+        is_uncoupled && self.autoregressive_terms(point).iter().any(|(order, terms)| is_unstable(*order, terms))
     }
 
     /// Return true if the pulses of every experiment resolve the autoregressive terms of each equation, or if equations
@@ -336,20 +343,20 @@ impl FreeModel {
             return true;
         }
         self.autoregressive_terms(point).iter().all(|(order, terms)| {
-            let own: Vec<(f64, f64)> = terms.iter().map(|(c, nu)| (*c, order - nu)).collect();
+            let eta_terms: Vec<(f64, f64)> = terms.iter().map(|(c, nu)| (*c, order - nu)).collect();
             experiments.iter().all(|experiment| {
                 let h = experiment.record.step();
-                let first = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
-                let leading = 1.0 - own.iter().map(first).sum::<f64>();
-                nyquist_margin(&own, h) / leading >= MIN_NYQUIST_RESPONSE_RATIO
+                let first_coefficient = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
+                let leading = 1.0 - eta_terms.iter().map(first_coefficient).sum::<f64>();
+                nyquist_margin(&eta_terms, h) / leading >= MIN_NYQUIST_RESPONSE_RATIO
             })
         })
     }
 }
 
 /// Value of an affine order without rounding, which is continuous in the free orders.
-fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
-    law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
+fn unrounded_order(law: &AffineOrder, free_orders: &[f64]) -> f64 {
+    law.constant + law.weights.iter().zip(free_orders).map(|(w, x)| w * x).sum::<f64>()
 }
 
 /// Kind of input nonlinearity.
@@ -404,20 +411,25 @@ impl InputLaw {
                 remedy: "give a delay of at least 0, and symmetric limits of at least 0".into(),
             });
         }
-        let excess = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };
+        let excess_sign = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };
         Ok(match self {
             Self::Delay => {
                 let steps = value / step;
-                let whole = steps.floor();
-                let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
-                let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / step).collect();
+                let whole_steps = steps.floor();
+                let (delayed, delayed_further) =
+                    (delay_samples(means, whole_steps, before)?, delay_samples(means, whole_steps + 1.0, before)?);
+                let slope = delayed
+                    .iter()
+                    .zip(&delayed_further)
+                    .map(|(delayed, delayed_further)| (delayed_further - delayed) / step)
+                    .collect();
                 (delay_samples(means, steps, before)?, slope)
             }
-            Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), excess(v))).unzip(),
+            Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), excess_sign(v))).unzip(),
             Self::DeadZone => means
                 .iter()
                 .map(|&v| {
-                    let side = excess(v);
+                    let side = excess_sign(v);
                     (if side == 0.0 { 0.0 } else { v - value * side }, -side)
                 })
                 .unzip(),
@@ -444,25 +456,27 @@ impl InputLaw {
     ) -> Result<Vec<(PulseJump, PulseJump)>> {
         if self == Self::Delay {
             let steps = value / step;
-            let (whole, share) = (steps.floor(), steps - steps.floor());
-            if share == 0.0 {
+            let (whole_steps, fraction) = (steps.floor(), steps - steps.floor());
+            if fraction == 0.0 {
                 return Ok(Vec::new());
             }
-            let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
+            let (delayed, delayed_further) =
+                (delay_samples(means, whole_steps, before)?, delay_samples(means, whole_steps + 1.0, before)?);
             let slope = |pulse| PulseJump { pulse, fraction: 1.0 / step, before: 0.0, after: 0.0 };
-            let pairs = far.into_iter().zip(near).enumerate().filter(|(_, (before, after))| before != after);
-            let jump = |(pulse, (before, after))| (PulseJump { pulse, fraction: share, before, after }, slope(pulse));
+            let pairs =
+                delayed_further.into_iter().zip(delayed).enumerate().filter(|(_, (before, after))| before != after);
+            let jump = |(pulse, (before, after))| (PulseJump { pulse, fraction, before, after }, slope(pulse));
             return Ok(pairs.map(jump).collect());
         }
-        let ends: Vec<f64> = jumps.iter().flat_map(|jump| [jump.before, jump.after]).collect();
-        let (ends, slopes) = self.apply(&ends, value, step, before)?;
-        let jump = |(jump, (ends, slopes)): (&PulseJump, (&[f64], &[f64]))| {
+        let values: Vec<f64> = jumps.iter().flat_map(|jump| [jump.before, jump.after]).collect();
+        let (values, slopes) = self.apply(&values, value, step, before)?;
+        let jump = |(jump, (values, slopes)): (&PulseJump, (&[f64], &[f64]))| {
             (
-                PulseJump { before: ends[0], after: ends[1], ..*jump },
+                PulseJump { before: values[0], after: values[1], ..*jump },
                 PulseJump { pulse: jump.pulse, fraction: 0.0, before: slopes[0], after: slopes[1] },
             )
         };
-        Ok(jumps.iter().zip(ends.chunks(2).zip(slopes.chunks(2))).map(jump).collect())
+        Ok(jumps.iter().zip(values.chunks(2).zip(slopes.chunks(2))).map(jump).collect())
     }
 }
 
@@ -573,25 +587,27 @@ fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     let mut rows: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for equation in &model.equations {
         for (_, order, coefficient) in &equation.terms {
-            let mut often = vec![0.0; count];
+            let mut powers_of_coefficients = vec![0.0; count];
             for &(j, n) in coefficient.powers.iter().filter(|(j, _)| is_scaled(model, *j)) {
-                often[j] += f64::from(n);
+                powers_of_coefficients[j] += f64::from(n);
             }
-            if often.iter().any(|&n| n != 0.0) {
-                rows.push((often, order_difference(&equation.order, order)));
+            if powers_of_coefficients.iter().any(|&n| n != 0.0) {
+                rows.push((powers_of_coefficients, order_difference(&equation.order, order)));
             }
         }
     }
     let mut pivots = Vec::new();
     for j in 0..count {
         let pivot_count = pivots.len();
-        let Some(at) = (pivot_count..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else { continue };
-        rows.swap(pivot_count, at);
+        let Some(pivot_row) = (pivot_count..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else {
+            continue;
+        };
+        rows.swap(pivot_count, pivot_row);
         let pivot = rows[pivot_count].clone();
-        for (i, (often, power)) in rows.iter_mut().enumerate() {
-            let by = if i == pivot_count { 1.0 - 1.0 / pivot.0[j] } else { often[j] / pivot.0[j] };
-            often.iter_mut().zip(&pivot.0).for_each(|(v, p)| *v -= by * p);
-            power.iter_mut().zip(&pivot.1).for_each(|(v, p)| *v -= by * p);
+        for (i, (powers_of_coefficients, power)) in rows.iter_mut().enumerate() {
+            let factor = if i == pivot_count { 1.0 - 1.0 / pivot.0[j] } else { powers_of_coefficients[j] / pivot.0[j] };
+            powers_of_coefficients.iter_mut().zip(&pivot.0).for_each(|(v, p)| *v -= factor * p);
+            power.iter_mut().zip(&pivot.1).for_each(|(v, p)| *v -= factor * p);
         }
         pivots.push(j);
     }

@@ -67,25 +67,25 @@ impl FreeModel {
                 })
                 .collect();
             let steps = solve_linear_steps(&sides)?;
-            linear.iter().zip(&steps).for_each(|(&j, by)| out.point.coefficients[j] += by);
-            for (answer, experiment) in responses.iter_mut().zip(experiments) {
+            linear.iter().zip(&steps).for_each(|(&j, step)| out.point.coefficients[j] += step);
+            for (simulation, experiment) in responses.iter_mut().zip(experiments) {
                 let Linearization {
-                    linear_effects: driven,
+                    linear_effects: effects,
                     response,
-                    feedthrough: direct,
+                    feedthrough,
                     input_means: nonlinearity_outputs,
                     ..
-                } = &mut answer.linearization;
-                for (column, by) in driven.iter_mut().zip(&steps) {
-                    column.apply(*by, &mut answer.residuals, response);
+                } = &mut simulation.linearization;
+                for (column, step) in effects.iter_mut().zip(&steps) {
+                    column.apply(*step, &mut simulation.residuals, response);
                 }
-                if direct.is_some() {
-                    *direct = Feedthrough::of(self, experiment, &structures, &out.point, nonlinearity_outputs)?;
+                if feedthrough.is_some() {
+                    *feedthrough = Feedthrough::new(self, experiment, &structures, &out.point, nonlinearity_outputs)?;
                 }
             }
         }
-        for answer in responses {
-            Self::add_initial_terms(answer, structures.len(), &mut out)?;
+        for simulation in responses {
+            Self::add_initial_terms(simulation, structures.len(), &mut out)?;
         }
         Ok(out)
     }
@@ -108,21 +108,21 @@ impl FreeModel {
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let has_level = self.initial.has_level();
         let needs_terms = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
-        let (response, solved) = self.rest_response(experiment, cache, &operators, point, &nonlinearity_outputs)?;
+        let (response, inverse) = self.rest_response(experiment, cache, &operators, point, &nonlinearity_outputs)?;
         cache.stop.check()?;
         let mut residuals = experiment.measured_samples();
-        out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
-        let mut sampled = experiment.weighted_samples(&response);
-        let jump_correction = JumpCorrection::of(self, experiment, &nonlinearity_outputs);
-        jump_correction.correct(self, experiment, point, &mut sampled)?;
-        residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
-        let direct = Feedthrough::of(self, experiment, structures, point, &nonlinearity_outputs)?;
-        if let Some(direct) = &direct {
-            residuals.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
+        out.measured_norm = out.measured_norm.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
+        let mut simulated_samples = experiment.weighted_samples(&response);
+        let jump_correction = JumpCorrection::new(self, experiment, &nonlinearity_outputs);
+        jump_correction.correct(self, experiment, point, &mut simulated_samples)?;
+        residuals.iter_mut().zip(simulated_samples).for_each(|(e, v)| *e -= v);
+        let feedthrough = Feedthrough::new(self, experiment, structures, point, &nonlinearity_outputs)?;
+        if let Some(feedthrough) = &feedthrough {
+            residuals.iter_mut().zip(feedthrough.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
         }
-        let kink_correction = KinkCorrection::of(self, experiment, structures);
+        let kink_correction = KinkCorrection::new(self, experiment, structures);
         if let Some(kink_correction) = &kink_correction {
-            let correction = kink_correction.weighted_correction(self, experiment, point, direct.as_ref());
+            let correction = kink_correction.weighted_correction(self, experiment, point, feedthrough.as_ref());
             residuals.iter_mut().zip(correction).for_each(|(e, v)| *e -= v);
         }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
@@ -133,19 +133,20 @@ impl FreeModel {
         if needs_terms {
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
-            let is_filter_only = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
-            let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !is_filter_only(i, e)).copied().collect();
+            let affects_only_filter = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
+            let response_terms: Vec<(usize, f64)> =
+                terms.iter().filter(|&&(i, e)| !affects_only_filter(i, e)).copied().collect();
             let mut responses =
-                cache.initial_term_responses(&solved, (structures.len(), record.m()), &moving)?.into_iter();
+                cache.initial_term_responses(&inverse, (structures.len(), record.m()), &response_terms)?.into_iter();
             for (i, exponent) in terms {
-                let response = if is_filter_only(i, exponent) { None } else { responses.next() };
+                let response = if affects_only_filter(i, exponent) { None } else { responses.next() };
                 let (samples, means) = match response {
                     None => (cache.impulse_samples(experiment, i, exponent), Rc::default()),
                     Some(means) => {
                         let mut samples = experiment.weighted_samples(&truncate_means(&means, record.m()));
                         if experiment.nonuniform.is_some() {
-                            let corner = KinkCorrection::initial_term_correction(experiment, i, exponent);
-                            samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
+                            let correction = KinkCorrection::initial_term_correction(experiment, i, exponent);
+                            samples.iter_mut().zip(correction).for_each(|(v, c)| *v += c);
                         }
                         (samples, means)
                     }
@@ -162,13 +163,13 @@ impl FreeModel {
             initial_responses.push(InitialTermResponse { equation: None, samples, means: Rc::default() });
         }
         let mut linearization = Linearization {
-            system: solved,
+            system: inverse,
             operators,
             response,
             basis,
             linear_effects: Vec::new(),
             input_means: nonlinearity_outputs,
-            feedthrough: direct,
+            feedthrough,
             jump_correction,
             kink_correction,
         };
@@ -192,7 +193,7 @@ impl FreeModel {
                 let eta = structure.order - term.order;
                 let is_hold =
                     experiment.point_values.get(term.signal).is_some_and(|instant| instant.is_zero_order_hold);
-                let least = if term.signal == structure.output {
+                let min_eta = if term.signal == structure.output {
                     MIN_INTEGRATION_ORDER
                 } else if is_hold {
                     // The derivative of a jump is infinite.
@@ -200,7 +201,7 @@ impl FreeModel {
                 } else {
                     MIN_INTEGRATION_ORDER - MAX_ORDER_EXCESS
                 };
-                if eta < least {
+                if eta < min_eta {
                     // This is reported as divergence, so that the optimization shortens its step.
                     return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
                 }
@@ -223,32 +224,33 @@ impl FreeModel {
         let (record, n) = (&experiment.record, operators.len());
         let m = record.m();
         let coefficient = |i: usize, k: usize| self.equations[i].terms[k].2.at(&point.coefficients);
-        let places = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
-        let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.integer_order()).collect();
-        if let Some(orders) = whole {
-            let own = places().zip(&orders).filter_map(|((i, k), &order)| {
+        let term_indices = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
+        let integer_orders: Option<Vec<usize>> =
+            operators.iter().flatten().map(|operator| operator.integer_order()).collect();
+        if let Some(orders) = integer_orders {
+            let autoregressive_terms = term_indices().zip(&orders).filter_map(|((i, k), &order)| {
                 let j = self.output_index(i, self.equations[i].terms[k].0)?;
                 Some((i, j, order, coefficient(i, k)))
             });
-            let highest = orders.iter().copied().max().unwrap_or(0);
-            let solved = SystemInverse::from_running_sums(RunningSumSystem::new(
+            let max_order = orders.iter().copied().max().unwrap_or(0);
+            let inverse = SystemInverse::from_running_sums(RunningSumSystem::new(
                 n,
-                highest,
+                max_order,
                 record.step(),
-                &own.collect::<Vec<_>>(),
+                &autoregressive_terms.collect::<Vec<_>>(),
             )?);
             let mut response = vec![vec![0.0; m]; n];
-            solved.inverse()?.solve_each(
+            inverse.inverse()?.solve_each(
                 (n, m),
                 1,
-                |_, rights| {
-                    for (i, k) in places() {
+                |_, right_hand_sides| {
+                    for (i, k) in term_indices() {
                         let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
                         if self.output_index(i, signal).is_none() && c != 0.0 {
                             let eta = operators[i][k].eta();
                             let series =
                                 || Cow::Borrowed(self.input_means(record, (signal, eta), nonlinearity_outputs));
-                            rights.add(i, c, (&operators[i][k], false), series, || {
+                            right_hand_sides.add(i, c, (&operators[i][k], false), series, || {
                                 cache.input_spectrum(self, experiment, (signal, eta), nonlinearity_outputs)
                             });
                         }
@@ -260,20 +262,20 @@ impl FreeModel {
                     Ok(())
                 },
             )?;
-            return Ok((response, Rc::new(solved)));
+            return Ok((response, Rc::new(inverse)));
         }
         let mut rhs = vec![vec![0.0; m]; n];
         let mut sum = SumOfProducts::with_length(cache.total);
         let mut buffers = Buffers::default();
         let mut bits = Vec::new();
         for (i, row) in operators.iter().enumerate() {
-            let mut drives = false;
+            let mut has_input = false;
             for (k, operator) in row.iter().enumerate() {
                 let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
                 if self.output_index(i, signal).is_some() {
                     bits.extend([operator.eta().to_bits(), c.to_bits()]);
                 } else if c != 0.0 {
-                    drives = true;
+                    has_input = true;
                     sum.add(
                         c,
                         &operator.spectrum(false),
@@ -281,11 +283,11 @@ impl FreeModel {
                     );
                 }
             }
-            if drives {
+            if has_input {
                 sum.take(&mut rhs[i], &mut buffers);
             }
         }
-        let solved = cache.system_inverse(bits, || {
+        let inverse = cache.system_inverse(bits, || {
             let mut matrix = vec![vec![vec![0.0; cache.pulses()]; n]; n];
             for (i, row) in operators.iter().enumerate() {
                 matrix[i][i][0] += 1.0;
@@ -298,10 +300,10 @@ impl FreeModel {
             }
             SystemInverse::from_matrix(matrix)
         })?;
-        let response = solved.solve_by_division(&rhs)?;
+        let response = inverse.solve_by_division(&rhs)?;
         let response =
             response.ok_or_else(|| Error::Internal { what: "equations without a solution by division".into() })?;
-        Ok((response, solved))
+        Ok((response, inverse))
     }
 
     /// Pulse means of the signal `signal` as a term of integration order `eta` uses them, after the input nonlinearity.
@@ -318,22 +320,26 @@ impl FreeModel {
     /// linearization to `out`.
     ///
     /// The estimates follow from a projection of the residuals on the responses to the initial terms.
-    fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation<Linearization>) -> Result<()> {
-        let RestSimulation { mut linearization, mut residuals, initial_responses } = answer;
+    fn add_initial_terms(
+        simulation: RestSimulation,
+        equations: usize,
+        out: &mut Evaluation<Linearization>,
+    ) -> Result<()> {
+        let RestSimulation { mut linearization, mut residuals, initial_responses } = simulation;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
         if !initial_responses.is_empty() {
-            let (places, columns): (Vec<_>, Vec<_>) = initial_responses
+            let (equations_and_means, columns): (Vec<_>, Vec<_>) = initial_responses
                 .into_iter()
                 .map(|InitialTermResponse { equation, samples, means }| ((equation, means), samples))
                 .unzip();
             let (values, _) = least_squares::solve(&columns, &residuals, 0)?;
-            for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
+            for (((i, means), column), x) in equations_and_means.iter().zip(&columns).zip(&values) {
                 if let Some(i) = i {
                     initial[*i].push(*x);
                 }
                 residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-                for (total, more) in linearization.response.iter_mut().zip(means.iter()) {
-                    total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);
+                for (total, contribution) in linearization.response.iter_mut().zip(means.iter()) {
+                    total.iter_mut().zip(contribution).for_each(|(y, v)| *y += x * v);
                 }
             }
         }
@@ -344,10 +350,11 @@ impl FreeModel {
     }
 
     /// Return true if the integration order of a term depends on a free order.
-    fn depends_on_free_order(&self, equation: usize, term: usize) -> bool {
-        let item = &self.equations[equation];
-        let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
-        (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
+    fn depends_on_free_order(&self, equation_index: usize, term: usize) -> bool {
+        let equation = &self.equations[equation_index];
+        let order_weight = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
+        (0..self.order_bounds.len())
+            .any(|k| order_weight(&equation.order.weights, k) != order_weight(&equation.terms[term].1.weights, k))
     }
 }
 
@@ -362,7 +369,7 @@ fn truncate_means(means: &PulseMeans, m: usize) -> Cow<'_, [Vec<f64>]> {
 impl FreeModel {
     /// Indices of the coefficients that occur alone and only in terms of external inputs.
     pub(crate) fn linear_coefficients(&self) -> Vec<usize> {
-        let stays = |j: usize| {
+        let occurs_in_input_terms_only = |j: usize| {
             let mut is_free = false;
             for (i, equation) in self.equations.iter().enumerate() {
                 for (signal, _, monomial) in &equation.terms {
@@ -376,8 +383,8 @@ impl FreeModel {
             }
             is_free
         };
-        let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
-        (0..self.coordinates.len()).filter(|&j| moves(j) && stays(j)).collect()
+        let is_scalable = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
+        (0..self.coordinates.len()).filter(|&j| is_scalable(j) && occurs_in_input_terms_only(j)).collect()
     }
 
     /// Return the effect of each of the given input coefficients on an experiment.
@@ -393,20 +400,20 @@ impl FreeModel {
             return Ok(Vec::new());
         }
         let (record, n) = (&experiment.record, self.equations.len());
-        let mut driven = Vec::with_capacity(coefficients.len());
+        let mut effects = Vec::with_capacity(coefficients.len());
         linearization.system.inverse()?.solve_each(
             (n, record.m()),
             coefficients.len(),
-            |place, rights| {
+            |index, right_hand_sides| {
                 cache.stop.check()?;
                 for (i, equation) in self.equations.iter().enumerate() {
                     for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
-                        let weight = monomial.slope(&point.coefficients, coefficients[place]);
+                        let weight = monomial.slope(&point.coefficients, coefficients[index]);
                         if weight != 0.0 {
                             let eta = linearization.operators[i][k].eta();
                             let series =
                                 || Cow::Borrowed(self.input_means(record, (*signal, eta), &linearization.input_means));
-                            rights.add(i, weight, (&linearization.operators[i][k], false), series, || {
+                            right_hand_sides.add(i, weight, (&linearization.operators[i][k], false), series, || {
                                 cache.input_spectrum(self, experiment, (*signal, eta), &linearization.input_means)
                             });
                         }
@@ -414,18 +421,18 @@ impl FreeModel {
                 }
                 Ok(())
             },
-            |place, means| {
-                let parameter = point.orders.len() + coefficients[place];
+            |index, means| {
+                let parameter = point.orders.len() + coefficients[index];
                 let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
                 let effect = linearization.parameter_effect(parameter, means, (self, experiment, point))?;
                 if let Some(index) = effect.samples.iter().position(|v| !v.is_finite()) {
                     return Err(Error::Diverged { what: "simulation".into(), index });
                 }
-                driven.push(effect);
+                effects.push(effect);
                 Ok(())
             },
         )?;
-        Ok(driven)
+        Ok(effects)
     }
 }
 
@@ -463,8 +470,8 @@ impl Linearization {
     ) -> Result<ParameterEffect> {
         let mut samples = experiment.weighted_samples(&means);
         self.jump_correction.correct_slope(model, experiment, point, parameter, &mut samples)?;
-        if let Some(direct) = &self.feedthrough {
-            add_feedthrough_derivative(model, experiment, direct, point, parameter, &mut samples);
+        if let Some(feedthrough) = &self.feedthrough {
+            add_feedthrough_derivative(model, experiment, feedthrough, point, parameter, &mut samples);
         }
         if let Some(kink_correction) = &self.kink_correction {
             kink_correction.add_slope(model, experiment, self.feedthrough.as_ref(), point, parameter, &mut samples);
@@ -483,11 +490,11 @@ pub(crate) struct ParameterEffect {
 
 impl ParameterEffect {
     /// Apply a change of the parameter by `by` to residuals and pulse means.
-    pub(crate) fn apply(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
-        if by != 0.0 {
-            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
-            for (total, more) in response.iter_mut().zip(&self.means) {
-                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
+    pub(crate) fn apply(&mut self, change: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+        if change != 0.0 {
+            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= change * v);
+            for (total, contribution) in response.iter_mut().zip(&self.means) {
+                total.iter_mut().zip(contribution).for_each(|(y, v)| *y += change * v);
             }
         }
         self.means = Vec::new();

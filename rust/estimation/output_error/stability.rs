@@ -32,8 +32,10 @@ const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 /// assert!(is_unstable(2.0, &[(-4.0, 0.0), (0.1, 1.0)]));
 /// ```
 #[must_use]
-pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
-    let powers = merge_close_powers(std::iter::once((1.0, alpha)).chain(own.iter().map(|&(c, nu)| (-c, nu))).collect());
+pub fn is_unstable(alpha: f64, autoregressive_terms: &[(f64, f64)]) -> bool {
+    let powers = merge_close_powers(
+        std::iter::once((1.0, alpha)).chain(autoregressive_terms.iter().map(|&(c, nu)| (-c, nu))).collect(),
+    );
     let by_power = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
     let (Some(&low), Some(&high)) = (powers.iter().min_by(by_power), powers.iter().max_by(by_power)) else {
         return false;
@@ -41,11 +43,13 @@ pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
     if high.1 <= low.1 {
         return false;
     }
-    let share = (DOMINANCE_RATIO * powers.len() as f64).ln();
+    let log_ratio = (DOMINANCE_RATIO * powers.len() as f64).ln();
     // ln ω at which another power is smaller than the dominant one by the dominance ratio.
-    let apart = |end: (f64, f64), &(c, p): &(f64, f64)| (end.0.abs().ln() - c.abs().ln() - share) / (p - end.1);
-    let ends = |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| apart(end, power));
-    let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
+    let crossing = |end: (f64, f64), &(c, p): &(f64, f64)| (end.0.abs().ln() - c.abs().ln() - log_ratio) / (p - end.1);
+    let crossings =
+        |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| crossing(end, power));
+    let (first, last) =
+        (crossings(low).fold(f64::INFINITY, f64::min), crossings(high).fold(f64::NEG_INFINITY, f64::max));
     let steps = ((last - first) / MAX_LOG_FREQUENCY_STEP).ceil().clamp(1.0, 1e6);
     let mut angle = 0.0;
     let mut start = (first, curve_point(&powers, first));
@@ -79,8 +83,8 @@ fn curve_point(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     let logs = || powers.iter().map(|(c, p)| c.abs().ln() + p * log_omega);
     let largest = logs().fold(f64::NEG_INFINITY, f64::max);
     powers.iter().zip(logs()).fold((0.0, 0.0), |(re, im), ((c, p), log)| {
-        let size = (log - largest).exp() * c.signum();
-        (re + size * (0.5 * PI * p).cos(), im + size * (0.5 * PI * p).sin())
+        let magnitude = (log - largest).exp() * c.signum();
+        (re + magnitude * (0.5 * PI * p).cos(), im + magnitude * (0.5 * PI * p).sin())
     })
 }
 
@@ -88,16 +92,16 @@ fn curve_point(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
 fn angle_change(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
     let ((a, (x, y)), (b, (u, v))) = (from, to);
     let angle = (x * v - y * u).atan2(x * u + y * v);
-    let middle = 0.5 * (a + b);
+    let mid_frequency = 0.5 * (a + b);
     if angle.abs() <= MAX_ANGLE_STEP_RAD {
         return angle;
     }
     // At extreme frequencies the spacing of floating-point numbers exceeds the smallest step, or the curve is NaN.
-    if b - a < MIN_LOG_FREQUENCY_STEP || !(middle > a && middle < b) || angle.is_nan() {
+    if b - a < MIN_LOG_FREQUENCY_STEP || !(mid_frequency > a && mid_frequency < b) || angle.is_nan() {
         // The curve passes through 0, so a zero lies on the axis: return a value that counts as unstable.
         return f64::NEG_INFINITY;
     }
-    let midpoint = (middle, curve_point(powers, middle));
+    let midpoint = (mid_frequency, curve_point(powers, mid_frequency));
     angle_change(powers, from, midpoint) + angle_change(powers, midpoint, to)
 }
 
@@ -122,9 +126,9 @@ mod tests {
         // s^1.2 − c s^0.6 + 1 is unstable if a root in s^0.6 has an argument below 0.3π in magnitude.
         for k in 0..200 {
             let c = -2.5 + 0.025 * f64::from(k);
-            let disc = 0.25 * c * c - 1.0;
-            let angle = if disc < 0.0 {
-                (-disc).sqrt().atan2(0.5 * c)
+            let discriminant = 0.25 * c * c - 1.0;
+            let angle = if discriminant < 0.0 {
+                (-discriminant).sqrt().atan2(0.5 * c)
             } else if c > 0.0 {
                 0.0
             } else {
@@ -139,13 +143,13 @@ mod tests {
     #[test]
     fn extreme_values_terminate() {
         // Regression test of infinite recursion; only termination is checked.
-        for (alpha, own) in [
+        for (alpha, terms) in [
             (1e-9, [(-0.954, 0.0), (5e-324, 0.5)]),
             (0.0, [(1e308, 0.0), (-0.468, 0.5)]),
             (1e308, [(1.0, 0.0), (-1.0, -1e308)]),
             (1.6, [(-5e-324, 0.0), (1e308, 0.5)]),
         ] {
-            std::hint::black_box(is_unstable(alpha, &own));
+            std::hint::black_box(is_unstable(alpha, &terms));
         }
     }
 

@@ -35,10 +35,10 @@ impl<'a> RightHandSides<'a> {
     /// Set all sums to zero.
     pub(crate) fn clear(&mut self) {
         match self {
-            Self::Spectra(rights) => {
-                for (used, right) in rights.iter_mut().filter(|(used, _)| *used) {
-                    right.clear();
-                    *used = false;
+            Self::Spectra(sums) => {
+                for (is_nonzero, sum) in sums.iter_mut().filter(|(is_nonzero, _)| *is_nonzero) {
+                    sum.clear();
+                    *is_nonzero = false;
                 }
             }
             Self::Sums(sources) => sources.clear(),
@@ -48,7 +48,7 @@ impl<'a> RightHandSides<'a> {
     /// Return true if a summand was added.
     pub(crate) fn is_nonzero(&self) -> bool {
         match self {
-            Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
+            Self::Spectra(sums) => sums.iter().any(|(is_nonzero, _)| *is_nonzero),
             Self::Sums(sources) => !sources.is_empty(),
         }
     }
@@ -63,15 +63,15 @@ impl<'a> RightHandSides<'a> {
         target: &mut SumOfProducts,
         buffers: &mut Buffers,
     ) -> Option<Vec<Vec<f64>>> {
-        let Self::Spectra(rights) = self else { return None };
-        let of_row = |row: &Vec<Kernel>| {
-            let used_pairs = row.iter().zip(rights).filter(|(_, (used, _))| *used);
-            used_pairs.for_each(|(entry, (_, right))| target.add_product(right, entry));
+        let Self::Spectra(sums) = self else { return None };
+        let multiply_row = |row: &Vec<Kernel>| {
+            let nonzero_pairs = row.iter().zip(sums).filter(|(_, (is_nonzero, _))| *is_nonzero);
+            nonzero_pairs.for_each(|(entry, (_, sum))| target.add_product(sum, entry));
             let mut means = vec![0.0; m];
             target.take(&mut means, buffers);
             means
         };
-        self.is_nonzero().then(|| rows.iter().map(of_row).collect())
+        self.is_nonzero().then(|| rows.iter().map(multiply_row).collect())
     }
 
     /// Return the summands as sources of the running sums; empty for spectra.
@@ -101,10 +101,10 @@ impl<'a> RightHandSides<'a> {
         spectrum: impl FnOnce() -> Rc<Kernel>,
     ) {
         match self {
-            Self::Spectra(rights) => {
-                let (used, right) = &mut rights[equation];
-                *used = true;
-                right.add(weight, &operator.spectrum(slope), &spectrum());
+            Self::Spectra(sums) => {
+                let (is_nonzero, sum) = &mut sums[equation];
+                *is_nonzero = true;
+                sum.add(weight, &operator.spectrum(slope), &spectrum());
             }
             Self::Sums(sources) => {
                 // Integer orders are fixed and have no derivative.
@@ -125,10 +125,10 @@ impl<'a> RightHandSides<'a> {
         spectrum: impl FnOnce() -> Rc<Kernel>,
     ) {
         match self {
-            Self::Spectra(rights) => {
-                let (used, right) = &mut rights[equation];
-                *used = true;
-                right.add_series(&spectrum());
+            Self::Spectra(sums) => {
+                let (is_nonzero, sum) = &mut sums[equation];
+                *is_nonzero = true;
+                sum.add_series(&spectrum());
             }
             Self::Sums(sources) => sources.push((equation, 0, 1.0, series())),
         }
@@ -189,8 +189,8 @@ impl SystemInverse {
 
     /// Return the responses of `n` outputs over `m` pulses to the initial terms t^e of equations.
     ///
-    /// `terms` contains the pairs (index of the equation, e), and `power` returns the initial term of an exponent. If
-    /// `keep`, the responses are cached.
+    /// `terms` contains the pairs (index of the equation, e), and `initial_term_of` returns the initial term of an
+    /// exponent. If `stores_responses`, the responses are cached.
     ///
     /// # Errors
     /// An error if the series do not match the matrix ([`Solver::solve`]).
@@ -198,76 +198,81 @@ impl SystemInverse {
         &self,
         (n, m): (usize, usize),
         terms: &[(usize, f64)],
-        keep: bool,
-        power: impl Fn(f64) -> Rc<InitialTerm>,
+        stores_responses: bool,
+        initial_term_of: impl Fn(f64) -> Rc<InitialTerm>,
     ) -> Result<Vec<Rc<PulseMeans>>> {
         let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
-        let open: Vec<(usize, f64)> =
+        let uncached_terms: Vec<(usize, f64)> =
             terms.iter().filter(|t| !self.initial_responses.borrow().contains_key(&key(t))).copied().collect();
-        let powers: Vec<Rc<InitialTerm>> = open.iter().map(|&(_, e)| power(e)).collect();
-        let mut computed = HashMap::new();
+        let powers: Vec<Rc<InitialTerm>> = uncached_terms.iter().map(|&(_, e)| initial_term_of(e)).collect();
+        let mut new_responses = HashMap::new();
         self.inverse()?.solve_each(
             (n, m),
-            open.len(),
-            |place, rights| {
-                let power = &powers[place];
-                rights.add_series(open[place].0, || Cow::Borrowed(power.series()), || power.spectrum());
+            uncached_terms.len(),
+            |index, right_hand_sides| {
+                let power = &powers[index];
+                right_hand_sides.add_series(
+                    uncached_terms[index].0,
+                    || Cow::Borrowed(power.series()),
+                    || power.spectrum(),
+                );
                 Ok(())
             },
-            |place, means| {
-                computed.insert(key(&open[place]), Rc::new(means.unwrap_or_default()));
+            |index, means| {
+                new_responses.insert(key(&uncached_terms[index]), Rc::new(means.unwrap_or_default()));
                 Ok(())
             },
         )?;
         let mut cache = self.initial_responses.borrow_mut();
-        let answers =
-            terms.iter().filter_map(|t| cache.get(&key(t)).or_else(|| computed.get(&key(t))).cloned()).collect();
-        if keep {
-            cache.extend(computed);
+        let responses =
+            terms.iter().filter_map(|t| cache.get(&key(t)).or_else(|| new_responses.get(&key(t))).cloned()).collect();
+        if stores_responses {
+            cache.extend(new_responses);
         }
-        Ok(answers)
+        Ok(responses)
     }
 }
 
 impl Inverse {
     /// Solve for `count` right-hand sides, with `n` outputs and `m` pulses.
     ///
-    /// `fill` fills each right-hand side. `receive` receives the pulse means of the outputs, or None for a zero
+    /// `fill` fills each right-hand side. `receive_means` receives the pulse means of the outputs, or None for a zero
     /// right-hand side.
     ///
     /// # Errors
-    /// The errors of `fill` and `receive`.
+    /// The errors of `fill` and `receive_means`.
     pub(crate) fn solve_each<'a>(
         &self,
         (n, m): (usize, usize),
         count: usize,
         mut fill: impl FnMut(usize, &mut RightHandSides<'a>) -> Result<()>,
-        mut receive: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
+        mut receive_means: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
     ) -> Result<()> {
         match self {
             Self::Spectra { rows, total } => {
                 let sum = || (false, SumOfProducts::with_length(*total));
-                let mut rights = RightHandSides::Spectra((0..n).map(|_| sum()).collect());
+                let mut right_hand_sides = RightHandSides::Spectra((0..n).map(|_| sum()).collect());
                 let mut target = SumOfProducts::with_length(*total);
                 let mut buffers = Buffers::default();
-                for place in 0..count {
-                    fill(place, &mut rights)?;
-                    receive(place, rights.apply_inverse(rows, m, &mut target, &mut buffers))?;
-                    rights.clear();
+                for index in 0..count {
+                    fill(index, &mut right_hand_sides)?;
+                    receive_means(index, right_hand_sides.apply_inverse(rows, m, &mut target, &mut buffers))?;
+                    right_hand_sides.clear();
                 }
             }
             Self::Sums(recursion) => {
                 for first in (0..count).step_by(RIGHT_SIDE_LANES) {
-                    let mut lists = Vec::with_capacity(RIGHT_SIDE_LANES);
-                    for place in first..(first + RIGHT_SIDE_LANES).min(count) {
-                        let mut rights = RightHandSides::Sums(Vec::new());
-                        fill(place, &mut rights)?;
-                        lists.push(rights);
+                    let mut batch = Vec::with_capacity(RIGHT_SIDE_LANES);
+                    for index in first..(first + RIGHT_SIDE_LANES).min(count) {
+                        let mut right_hand_sides = RightHandSides::Sums(Vec::new());
+                        fill(index, &mut right_hand_sides)?;
+                        batch.push(right_hand_sides);
                     }
-                    let sources: Vec<Vec<Source>> = lists.iter().map(RightHandSides::sources).collect();
-                    for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
+                    let sources: Vec<Vec<Source>> = batch.iter().map(RightHandSides::sources).collect();
+                    for (index, (means, right_hand_sides)) in
+                        (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&batch))
                     {
-                        receive(place, rights.is_nonzero().then_some(means))?;
+                        receive_means(index, right_hand_sides.is_nonzero().then_some(means))?;
                     }
                 }
             }
@@ -288,7 +293,7 @@ const INTEGER_TOLERANCE: f64 = 1e-12;
 /// Integral operator of a term: kernel, and its derivative with respect to the order if the order is free.
 pub(crate) struct Operator {
     eta: f64,
-    free: bool,
+    is_free: bool,
     m: usize,
     step: f64,
     /// Kernel and, for orders of at least 0, its derivative; computed when first needed.
@@ -298,12 +303,12 @@ pub(crate) struct Operator {
 
 impl Operator {
     /// Return the operator of integration order `eta` on a grid of `m` pulses of width `step` \[s\].
-    pub(crate) fn new(eta: f64, free: bool, m: usize, step: f64) -> Self {
-        Self { eta, free, m, step, series: OnceCell::new(), spectra: [OnceCell::new(), OnceCell::new()] }
+    pub(crate) fn new(eta: f64, is_free: bool, m: usize, step: f64) -> Self {
+        Self { eta, is_free, m, step, series: OnceCell::new(), spectra: [OnceCell::new(), OnceCell::new()] }
     }
 
     fn series(&self) -> &(Vec<f64>, Vec<f64>) {
-        self.series.get_or_init(|| match self.free && self.eta >= 0.0 {
+        self.series.get_or_init(|| match self.is_free && self.eta >= 0.0 {
             true => kernel_with_derivative(self.eta, self.m, self.step),
             false => (kernel(self.eta, self.m, self.step), Vec::new()),
         })
@@ -314,7 +319,7 @@ impl Operator {
     /// For a negative order, the derivative is a product of three series.
     fn slope(&self) -> Kernel {
         let total = SPECTRUM_FACTORS * self.m;
-        if self.eta >= 0.0 || !self.free {
+        if self.eta >= 0.0 || !self.is_free {
             return Kernel::with_length(&self.series().1, total);
         }
         // With the kernel F(η), the kernel of a negative order is 1/F(−η). Its derivative with respect to η is
@@ -332,9 +337,9 @@ impl Operator {
         self.eta
     }
 
-    /// Return true if the operator has the order `eta` and the flag `free`.
-    pub(crate) fn matches_order(&self, eta: f64, free: bool) -> bool {
-        self.eta.to_bits() == eta.to_bits() && self.free == free
+    /// Return true if the operator has the order `eta` and the flag `is_free`.
+    pub(crate) fn matches_order(&self, eta: f64, is_free: bool) -> bool {
+        self.eta.to_bits() == eta.to_bits() && self.is_free == is_free
     }
 
     /// Kernel of the integral.
@@ -346,7 +351,7 @@ impl Operator {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn integer_order(&self) -> Option<usize> {
         let nearest = self.eta.round();
-        let is_integer = !self.free && (self.eta - nearest).abs() <= INTEGER_TOLERANCE && nearest >= 0.0;
+        let is_integer = !self.is_free && (self.eta - nearest).abs() <= INTEGER_TOLERANCE && nearest >= 0.0;
         (is_integer && nearest <= MAX_SUMS as f64).then_some(nearest as usize)
     }
 
@@ -368,7 +373,7 @@ pub(crate) struct InitialTerm {
     exponent: f64,
     step: f64,
     filter: Option<Rc<SeriesFilter>>,
-    raw: Vec<f64>,
+    unfiltered: Vec<f64>,
     series: OnceCell<Vec<f64>>,
     spectrum: OnceCell<Rc<Kernel>>,
     slope: OnceCell<Vec<f64>>,
@@ -395,30 +400,36 @@ impl SeriesFilter {
 impl InitialTerm {
     /// Return the initial term t^e with e = `exponent` on a grid of `m` pulses of width `step` \[s\].
     pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<SeriesFilter>>) -> Self {
-        let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
+        let unfiltered =
+            if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
         let (series, spectrum, slope) = Default::default();
-        Self { exponent, step, filter, raw, series, spectrum, slope }
+        Self { exponent, step, filter, unfiltered, series, spectrum, slope }
     }
 
     /// Pulse means after the filter.
     pub(crate) fn series(&self) -> &[f64] {
         match &self.filter {
-            None => &self.raw,
-            Some(filter) => self.series.get_or_init(|| filter.apply(&self.raw)),
+            None => &self.unfiltered,
+            Some(filter) => self.series.get_or_init(|| filter.apply(&self.unfiltered)),
         }
     }
 
     /// Pulse means of the derivative of t^e with respect to e, before the filter.
     pub(crate) fn slope(&self) -> &[f64] {
-        let of = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
-        self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))
+        let slope_function = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
+        self.slope.get_or_init(|| slope_function(self.exponent, self.unfiltered.len(), self.step))
     }
 
     /// Spectrum of the pulse means after the filter, padded for a product with one more series.
     pub(crate) fn spectrum(&self) -> Rc<Kernel> {
-        let compute =
-            || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
-        if self.raw.len() > MAX_CACHED_PULSES {
+        let compute = || {
+            Rc::new(filtered_spectrum(
+                &self.unfiltered,
+                self.filter.as_deref(),
+                SPECTRUM_FACTORS * self.unfiltered.len(),
+            ))
+        };
+        if self.unfiltered.len() > MAX_CACHED_PULSES {
             return compute();
         }
         self.spectrum.get_or_init(compute).clone()

@@ -119,7 +119,7 @@ pub fn integer_order_optima(
         coefficients: vec![0.0; parameter_set.coefficients.len()],
         inputs: delays.first().cloned().unwrap_or_default(),
     };
-    if !is_supported || IntegerOrders::of(model, objective.experiments(), &start).is_none() {
+    if !is_supported || IntegerOrders::new(model, objective.experiments(), &start).is_none() {
         return Ok(None);
     }
     let mut candidates: Vec<Candidate> = Vec::new();
@@ -404,7 +404,7 @@ impl<'a> Equation<'a> {
                 refined.push(guess);
                 continue;
             }
-            let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &guess.point) else { continue };
+            let Some(exact) = IntegerOrders::new(&self.model, self.experiments, &guess.point) else { continue };
             let problem =
                 SectionsProblem { equation: self, exact, linear: self.model.linear_coefficients(), base: &guess.point };
             let settings = MinimizationSettings { evaluations: SECTION_EVALUATIONS, tolerance: COST_TOLERANCE };
@@ -425,7 +425,7 @@ impl<'a> Equation<'a> {
     /// Simulate at a point with the optimal input coefficients. Return None if the simulation is not finite.
     fn evaluate(&self, point: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
         self.stop.check()?;
-        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, point) else { return Ok(None) };
+        let Some(exact) = IntegerOrders::new(&self.model, self.experiments, point) else { return Ok(None) };
         let linear = self.model.linear_coefficients();
         Ok(exact.evaluate(&self.model, self.experiments, point, &linear).ok().filter(|e| cost(e).is_finite()))
     }
@@ -593,7 +593,7 @@ impl<'a> Equation<'a> {
     ///
     /// None if the system of linear equations is singular.
     fn instrument_step(&self, evaluation: &Evaluation<'a>) -> Result<Option<Vec<f64>>> {
-        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &evaluation.point) else { return Ok(None) };
+        let Some(exact) = IntegerOrders::new(&self.model, self.experiments, &evaluation.point) else { return Ok(None) };
         let linear = self.model.linear_coefficients();
         let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, evaluation) else { return Ok(None) };
         let orders = evaluation.point.orders.len();
