@@ -71,51 +71,54 @@ impl OutputSimulation {
 
     fn has_state_space(&self) -> bool {
         let recording = &self.recording;
-        let orders =
+        let has_integer_orders =
             |e: &Equation| is_integer(e.structure.order) && e.structure.terms.iter().all(|term| is_integer(term.order));
-        let uniform = self.times.is_none() && !recording.has_nonuniform_samples() && recording.free_inputs.is_empty();
-        let enters = |signal: usize| {
-            let of = |e: &Equation| {
+        let has_uniform_samples =
+            self.times.is_none() && !recording.has_nonuniform_samples() && recording.free_inputs.is_empty();
+        let is_input_of_equation = |signal: usize| {
+            let has_input = |e: &Equation| {
                 e.structure.output != signal && e.structure.terms.iter().any(|term| term.signal == signal)
             };
-            self.simulated_output(signal).is_none() && self.equations.iter().any(of)
+            self.simulated_output(signal).is_none() && self.equations.iter().any(has_input)
         };
-        let usable = |signal: usize| {
+        let is_usable = |signal: usize| {
             let samples = recording.acting_samples(signal);
             let peak = samples.iter().fold(0.0, |peak: f64, v| peak.max(v.abs()));
             recording.channels()[signal].role != Role::Derived
                 && (peak == 0.0 || peak >= MIN_SIGNAL_PEAK)
-                && !(enters(signal) && samples.iter().any(|v| v.is_nan()))
+                && !(is_input_of_equation(signal) && samples.iter().any(|v| v.is_nan()))
         };
         self.is_linear()
             && recording.filter.is_none()
-            && uniform
-            && self.equations.iter().all(orders)
-            && (0..recording.channels().len()).all(usable)
+            && has_uniform_samples
+            && self.equations.iter().all(has_integer_orders)
+            && (0..recording.channels().len()).all(is_usable)
     }
 
     /// Return the samples of all outputs, with the inputs if `is_driven` and without inputs otherwise. None if there is
     /// no state-space form.
     fn respond(&self, terms: &Terms, is_driven: bool, stop: &Stop) -> Result<Option<Rows>> {
-        let together = |equations: &[Equation], terms: &[Vec<(f64, f64)>]| {
+        let respond_equations = |equations: &[Equation], terms: &[Vec<(f64, f64)>]| {
             let (rows, step) = (self.recording.len(), self.recording.step());
-            let own = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
-            let read = |signal: usize| equations.iter().flat_map(|e| &e.structure.terms).any(|t| t.signal == signal);
-            let signals = (0..self.recording.channels().len()).filter(|&s| is_driven && read(s) && !own(s));
+            let is_output = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
+            let is_signal_of_term =
+                |signal: usize| equations.iter().flat_map(|e| &e.structure.terms).any(|t| t.signal == signal);
+            let signals =
+                (0..self.recording.channels().len()).filter(|&s| is_driven && is_signal_of_term(s) && !is_output(s));
             let inputs: Vec<InputSignal> = signals.map(|signal| self.input(signal)).collect();
             let mut terms = terms.to_vec();
-            terms.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
+            terms.iter_mut().for_each(|equation_terms| equation_terms.sort_by(|a, b| a.0.total_cmp(&b.0)));
             let response = state_space::respond(equations, &inputs, &terms, step, rows, stop)?;
             Ok(response.map(|samples| samples.chunks(rows).map(<[f64]>::to_vec).collect::<Rows>()))
         };
         if self.recording.is_coupled {
-            return together(&self.equations, terms);
+            return respond_equations(&self.equations, terms);
         }
         let outputs = self.equations.iter().zip(terms).map(|(equation, terms)| {
             if !is_driven && terms.is_empty() {
                 return Ok(Some(vec![vec![0.0; self.recording.len()]]));
             }
-            together(std::slice::from_ref(equation), std::slice::from_ref(terms))
+            respond_equations(std::slice::from_ref(equation), std::slice::from_ref(terms))
         });
         Ok(outputs.collect::<Result<Option<Vec<Rows>>>>()?.map(|rows| rows.concat()))
     }

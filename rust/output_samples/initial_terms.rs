@@ -32,8 +32,8 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
     }
 }
 
-/// Fit initial terms to the measured samples, and add their responses to the samples `driven` of a simulation from
-/// rest.
+/// Fit initial terms to the measured samples, and add their responses to the samples `rest_samples` of a simulation
+/// from rest.
 ///
 /// `units` holds (index of the equation, exponent) of each term, and `columns` the samples of all outputs for this term
 /// with coefficient 1. With `has_level`, the level of each output is an additional term with the exponent ∞. The weight
@@ -57,12 +57,12 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
 /// ```
 pub fn fit_initial_terms(
     measured: &[Vec<f64>],
-    driven: Vec<Vec<f64>>,
+    rest_samples: Vec<Vec<f64>>,
     units: &[(usize, f64)],
     mut columns: Vec<Rows>,
     has_level: bool,
 ) -> Result<OutputSamples> {
-    let (n, count) = (driven.len(), driven.first().map_or(0, Vec::len));
+    let (n, count) = (rest_samples.len(), rest_samples.first().map_or(0, Vec::len));
     check_length("responses to initial terms", units.len(), columns.len())?;
     for rows in columns.iter().map(Vec::as_slice).chain([measured]) {
         check_length("outputs", n, rows.len())?;
@@ -78,26 +78,29 @@ pub fn fit_initial_terms(
         return Err(Error::Structure { what, remedy: "number them from 0".into() });
     }
     let weights: Vec<f64> = measured.iter().map(|row| weight(row)).collect();
-    let weighted = |rows: &Rows| -> Vec<f64> {
-        let of = |((row, sample), w): ((&Vec<f64>, &Vec<f64>), &f64)| -> Vec<f64> {
+    let weight_rows = |rows: &Rows| -> Vec<f64> {
+        let weight_row = |((row, sample), w): ((&Vec<f64>, &Vec<f64>), &f64)| -> Vec<f64> {
             row.iter().zip(sample).map(|(v, sample)| if sample.is_nan() { 0.0 } else { w * v }).collect()
         };
-        rows.iter().zip(measured).zip(&weights).flat_map(of).collect()
+        rows.iter().zip(measured).zip(&weights).flat_map(weight_row).collect()
     };
-    let missing = measured.iter().zip(&driven).map(|(y, v)| y.iter().zip(v).map(|(y, v)| y - v).collect()).collect();
-    let mut scaled: Vec<Vec<f64>> = columns.iter().map(weighted).collect();
-    let sizes: Vec<f64> = scaled.iter().map(|column| norm(column)).collect();
-    let usable: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k].is_finite() && sizes[k] > 0.0).collect();
-    let columns_of_matrix: Vec<Vec<f64>> =
-        usable.iter().map(|&k| std::mem::take(&mut scaled[k]).into_iter().map(|v| v / sizes[k]).collect()).collect();
-    let error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
-    let solution =
-        minimum_norm_solution(&columns_of_matrix, &weighted(&missing), COLLINEARITY_TOLERANCE).ok_or_else(error)?;
+    let differences =
+        measured.iter().zip(&rest_samples).map(|(y, v)| y.iter().zip(v).map(|(y, v)| y - v).collect()).collect();
+    let mut weighted_columns: Vec<Vec<f64>> = columns.iter().map(weight_rows).collect();
+    let norms: Vec<f64> = weighted_columns.iter().map(|column| norm(column)).collect();
+    let usable_columns: Vec<usize> = (0..norms.len()).filter(|&k| norms[k].is_finite() && norms[k] > 0.0).collect();
+    let columns_of_matrix: Vec<Vec<f64>> = usable_columns
+        .iter()
+        .map(|&k| std::mem::take(&mut weighted_columns[k]).into_iter().map(|v| v / norms[k]).collect())
+        .collect();
+    let convergence_error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
+    let solution = minimum_norm_solution(&columns_of_matrix, &weight_rows(&differences), COLLINEARITY_TOLERANCE)
+        .ok_or_else(convergence_error)?;
     let mut values = vec![0.0; units.len()];
-    for (&k, value) in usable.iter().zip(solution) {
-        values[k] = value / sizes[k];
+    for (&k, value) in usable_columns.iter().zip(solution) {
+        values[k] = value / norms[k];
     }
-    let (mut outputs, mut initial) = (driven, vec![Vec::new(); n]);
+    let (mut outputs, mut initial) = (rest_samples, vec![Vec::new(); n]);
     for ((&(i, exponent), value), column) in units.iter().zip(values).zip(&columns) {
         initial[i].push((exponent, value));
         if value != 0.0 {

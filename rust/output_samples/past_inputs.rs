@@ -38,7 +38,7 @@ struct WeightedColumns {
     /// Norm of each column before the division by it.
     norms: Vec<f64>,
     /// Column numbers of the terms without a prior.
-    free: Vec<usize>,
+    columns_without_prior: Vec<usize>,
 }
 
 impl OutputSimulation {
@@ -76,13 +76,13 @@ impl OutputSimulation {
     pub fn fit_past_inputs(
         &self,
         exponents: &[Vec<f64>],
-        free: &[Vec<f64>],
+        exponents_without_prior: &[Vec<f64>],
         has_level: bool,
         options: Refinement,
         stop: &Stop,
     ) -> Result<Option<Terms>> {
         let n = self.equations.len();
-        check_length("exponents without a prior", n, free.len())?;
+        check_length("exponents without a prior", n, exponents_without_prior.len())?;
         let units = self.unit_terms(exponents)?;
         let initial = InitialTerms::UnitResponses { exponents: exponents.to_vec() };
         let responses = self.refine(&initial, options, stop)?.samples.outputs;
@@ -93,44 +93,47 @@ impl OutputSimulation {
         let measured = self.recording.compared_rows(FIRST_REFINEMENT)?;
         let weights: Vec<f64> = measured.iter().map(|row| initial_terms::weight(row)).collect();
         // Weighted samples of all outputs at which an output was measured.
-        let weighted = |rows: &[Vec<f64>]| -> Vec<f64> {
-            let of = |((row, output), weight)| {
+        let weight_rows = |rows: &[Vec<f64>]| -> Vec<f64> {
+            let weighted_row = |((row, output), weight)| {
                 let measured = std::iter::zip::<&Vec<f64>, &Vec<f64>>(row, output).filter(|(_, y)| !y.is_nan());
                 measured.map(move |(v, _): (&f64, &f64)| weight * v)
             };
-            rows.iter().zip(&measured).zip(&weights).flat_map(of).collect()
+            rows.iter().zip(&measured).zip(&weights).flat_map(weighted_row).collect()
         };
         let mut blocks = responses.chunks(n);
-        let driven = blocks.next().unwrap_or_default();
-        let mut names = units.clone();
-        let mut columns: Vec<Vec<f64>> = blocks.map(&weighted).collect();
+        let input_response = blocks.next().unwrap_or_default();
+        let mut terms_of_columns = units.clone();
+        let mut columns: Vec<Vec<f64>> = blocks.map(&weight_rows).collect();
         for i in 0..if has_level { n } else { 0 } {
-            names.push((i, f64::INFINITY));
-            columns.push(weighted(
+            terms_of_columns.push((i, f64::INFINITY));
+            columns.push(weight_rows(
                 &(0..n).map(|j| vec![f64::from(u8::from(i == j)); measured[j].len()]).collect::<Rows>(),
             ));
         }
         let norms: Vec<f64> = columns.iter().map(|column| norm(column)).collect();
-        let used: Vec<usize> = (0..names.len()).filter(|&k| norms[k] > 0.0).collect();
-        let is_free = |(i, exponent): (usize, f64)| exponent.is_infinite() || free[i].contains(&exponent);
+        let nonzero_columns: Vec<usize> = (0..terms_of_columns.len()).filter(|&k| norms[k] > 0.0).collect();
+        let is_free =
+            |(i, exponent): (usize, f64)| exponent.is_infinite() || exponents_without_prior[i].contains(&exponent);
         let terms = WeightedColumns {
-            columns: used.iter().map(|&k| columns[k].iter().map(|v| v / norms[k]).collect()).collect(),
-            norms: used.iter().map(|&k| norms[k]).collect(),
-            free: (0..used.len()).filter(|&k| is_free(names[used[k]])).collect(),
+            columns: nonzero_columns.iter().map(|&k| columns[k].iter().map(|v| v / norms[k]).collect()).collect(),
+            norms: nonzero_columns.iter().map(|&k| norms[k]).collect(),
+            columns_without_prior: (0..nonzero_columns.len())
+                .filter(|&k| is_free(terms_of_columns[nonzero_columns[k]]))
+                .collect(),
         };
-        let is_driven = driven.iter().flatten().any(|v| *v != 0.0);
-        let target = weighted(&combine(&measured, &driven.to_vec(), |y, v| y - v));
+        let is_driven = input_response.iter().flatten().any(|v| *v != 0.0);
+        let target = weight_rows(&combine(&measured, &input_response.to_vec(), |y, v| y - v));
         let groups = past.iter().map(|octaves| {
-            let first =
+            let first_squares =
                 |rows: &Rows| rows.iter().zip(&weights).map(|(row, weight)| (weight * row[0]).powi(2)).sum::<f64>();
-            (octaves.iter().map(first).sum(), octaves.iter().map(|rows| weighted(rows)).collect())
+            (octaves.iter().map(first_squares).sum(), octaves.iter().map(|rows| weight_rows(rows)).collect())
         });
-        let values = terms.fit(&target, is_driven.then(|| weighted(driven)), &groups.collect::<Vec<_>>())?;
-        let mut found = vec![Vec::new(); n];
-        for (&k, value) in used.iter().zip(values) {
-            found[names[k].0].push((names[k].1, value));
+        let values = terms.fit(&target, is_driven.then(|| weight_rows(input_response)), &groups.collect::<Vec<_>>())?;
+        let mut fitted_terms = vec![Vec::new(); n];
+        for (&k, value) in nonzero_columns.iter().zip(values) {
+            fitted_terms[terms_of_columns[k].0].push((terms_of_columns[k].1, value));
         }
-        Ok(Some(found))
+        Ok(Some(fitted_terms))
     }
 
     /// Return the responses `[equation][octave]` to a unit input that acted in this equation during this octave of past
@@ -142,8 +145,8 @@ impl OutputSimulation {
         let octaves: Vec<usize> = std::iter::once(0).chain(octaves).chain([past]).collect();
         let rest = InitialTerms::Given(vec![Vec::new(); n]);
         let mut responses = Vec::with_capacity(n);
-        for forced in 0..n {
-            let simulation = self.unit_step(forced, rows + past)?;
+        for equation_index in 0..n {
+            let simulation = self.unit_step(equation_index, rows + past)?;
             let steps = match simulation.exact_samples(&rest, stop) {
                 Ok(None) => simulation.refine(&rest, options, stop).map(|refined| refined.samples.outputs),
                 Ok(Some(samples)) => Ok(samples.outputs),
@@ -156,9 +159,11 @@ impl OutputSimulation {
             if !steps.iter().flatten().all(|v| v.is_finite()) {
                 return Ok(None);
             }
-            let shifted: Vec<Rows> =
+            let shifted_responses: Vec<Rows> =
                 octaves.iter().map(|&k| steps.iter().map(|row| self.samples_after(row, k)).collect()).collect();
-            responses.push(shifted.windows(2).map(|pair| combine(&pair[1], &pair[0], |new, old| new - old)).collect());
+            responses.push(
+                shifted_responses.windows(2).map(|pair| combine(&pair[1], &pair[0], |new, old| new - old)).collect(),
+            );
         }
         Ok(Some(responses))
     }
@@ -167,25 +172,26 @@ impl OutputSimulation {
     /// sampling intervals.
     fn samples_after(&self, samples: &[f64], shift: usize) -> Vec<f64> {
         let Some(times) = &self.times else { return samples[shift..shift + self.recording.len()].to_vec() };
-        let grid: Vec<f64> = (0..samples.len()).map(|k| self.recording.step() * k as f64).collect();
-        let later: Vec<f64> = times.iter().map(|time| time + self.recording.step() * shift as f64).collect();
-        later.iter().map(|time| interpolate(*time, &grid, samples)).collect()
+        let sample_times: Vec<f64> = (0..samples.len()).map(|k| self.recording.step() * k as f64).collect();
+        let shifted_times: Vec<f64> = times.iter().map(|time| time + self.recording.step() * shift as f64).collect();
+        shifted_times.iter().map(|time| interpolate(*time, &sample_times, samples)).collect()
     }
 
     /// Return a simulation from rest with `rows` uniform samples. A unit step is added to the right-hand side of the
-    /// equation with index `forced`. The inputs of the run are zero.
-    fn unit_step(&self, forced: usize, rows: usize) -> Result<Self> {
+    /// equation with index `equation_index`. The inputs of the run are zero.
+    fn unit_step(&self, equation_index: usize, rows: usize) -> Result<Self> {
         let outputs = self.recording.outputs();
-        let own = |signal: usize, i: usize| {
+        let output_index = |signal: usize, i: usize| {
             let output = outputs.iter().position(|output| *output == signal);
             output.filter(|&output| output == i || self.recording.is_coupled)
         };
-        let equation = |(i, item): (usize, &Equation)| {
-            let given = item.structure.terms.iter().zip(&item.coefficients);
-            let given = given.filter_map(|(term, c)| own(term.signal, i).map(|signal| (Term { signal, ..*term }, *c)));
-            let forcing = (i == forced).then_some((Term { signal: outputs.len(), order: 0.0 }, 1.0));
-            let (terms, coefficients) = given.chain(forcing).unzip();
-            Equation::new(Structure { output: i, order: item.structure.order, terms }, coefficients)
+        let equation = |(i, equation): (usize, &Equation)| {
+            let terms_of_outputs = equation.structure.terms.iter().zip(&equation.coefficients);
+            let terms_of_outputs = terms_of_outputs
+                .filter_map(|(term, c)| output_index(term.signal, i).map(|signal| (Term { signal, ..*term }, *c)));
+            let forcing = (i == equation_index).then_some((Term { signal: outputs.len(), order: 0.0 }, 1.0));
+            let (terms, coefficients) = terms_of_outputs.chain(forcing).unzip();
+            Equation::new(Structure { output: i, order: equation.structure.order, terms }, coefficients)
         };
         let output = |signal: &usize| {
             let channel = &self.recording.channels()[*signal];
@@ -207,45 +213,52 @@ impl WeightedColumns {
     /// Fit all terms to a target, and return their coefficients, one per column. The target is the weighted measured
     /// samples minus the response to the inputs.
     ///
-    /// `driven` are the weighted samples of the response to the inputs, None if it is zero. Each entry of `groups`
-    /// belongs to one equation. It holds the sum of squares of the first samples of the octave responses, and these
-    /// responses.
-    fn fit(&self, target: &[f64], driven: Option<Vec<f64>>, groups: &[(f64, Rows)]) -> Result<Vec<f64>> {
+    /// `input_response` are the weighted samples of the response to the inputs, None if it is zero. Each entry of
+    /// `groups` belongs to one equation. It holds the sum of squares of the first samples of the octave responses, and
+    /// these responses.
+    fn fit(&self, target: &[f64], input_response: Option<Vec<f64>>, groups: &[(f64, Rows)]) -> Result<Vec<f64>> {
         let space = decompose(&self.columns)?;
-        let free: Rows = self.free.iter().map(|&k| self.columns[k].clone()).collect();
-        let basis = if free.is_empty() { Vec::new() } else { significant(decompose(&free)?).0 };
-        let without = |mut column: Vec<f64>| {
+        let free_columns: Rows = self.columns_without_prior.iter().map(|&k| self.columns[k].clone()).collect();
+        let basis = if free_columns.is_empty() { Vec::new() } else { significant_vectors(decompose(&free_columns)?).0 };
+        let project = |mut column: Vec<f64>| {
             project_out(&basis, &mut column);
             column
         };
-        let remainder = without(target.to_vec());
+        let remainder = project(target.to_vec());
         // If no input changes, only the past moves the output.
-        let reference = driven.map_or_else(|| remainder.clone(), without);
-        let size = mean(&reference.iter().map(|v| v * v).collect::<Vec<_>>());
+        let reference = input_response.map_or_else(|| remainder.clone(), project);
+        let mean_square = mean(&reference.iter().map(|v| v * v).collect::<Vec<_>>());
         let (left, values, right) = {
-            let whole = space.right.clone();
-            let (left, values) = significant(space);
-            let right: Rows = whole.into_iter().take(values.len()).collect();
+            let right_vectors = space.right.clone();
+            let (left, values) = significant_vectors(space);
+            let right: Rows = right_vectors.into_iter().take(values.len()).collect();
             (left, values, right)
         };
         // Coefficients of the terms that reproduce the response to each octave.
-        let mixing: Rows = (groups.iter())
+        let octave_coefficients: Rows = (groups.iter())
             .flat_map(|(first, octaves)| {
-                let scale = if *first > 0.0 { (size / first).sqrt() } else { 0.0 };
+                let scale = if *first > 0.0 { (mean_square / first).sqrt() } else { 0.0 };
                 octaves.iter().map(move |octave| (scale, octave))
             })
             .map(|(scale, octave)| {
-                let amounts = left.iter().zip(&values).map(|(u, value)| scale * inner(u, octave) / value);
-                linear_combination(&right, &amounts.collect::<Vec<_>>(), self.columns.len())
+                let weights = left.iter().zip(&values).map(|(u, value)| scale * inner(u, octave) / value);
+                linear_combination(&right, &weights.collect::<Vec<_>>(), self.columns.len())
             })
             .collect();
-        let shapes: Rows =
-            mixing.iter().map(|amounts| without(linear_combination(&self.columns, amounts, target.len()))).collect();
-        let mut values = linear_combination(&mixing, &posterior_mean(&shapes, &remainder)?, self.columns.len());
+        let octave_responses: Rows = octave_coefficients
+            .iter()
+            .map(|weights| project(linear_combination(&self.columns, weights, target.len())))
+            .collect();
+        let mut values = linear_combination(
+            &octave_coefficients,
+            &posterior_mean(&octave_responses, &remainder)?,
+            self.columns.len(),
+        );
         let explained = linear_combination(&self.columns, &values, target.len());
-        let left: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
-        let offsets = minimum_norm_solution(&free, &left, MIN_SINGULAR_VALUE_RATIO).ok_or_else(not_decomposed)?;
-        self.free.iter().zip(offsets).for_each(|(&k, value)| values[k] += value);
+        let residuals: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
+        let offsets = minimum_norm_solution(&free_columns, &residuals, MIN_SINGULAR_VALUE_RATIO)
+            .ok_or_else(decomposition_error)?;
+        self.columns_without_prior.iter().zip(offsets).for_each(|(&k, value)| values[k] += value);
         Ok(values.iter().zip(&self.norms).map(|(value, norm)| value / norm).collect())
     }
 }
@@ -257,42 +270,43 @@ impl WeightedColumns {
 /// is noise, whose variance is increased for autocorrelation.
 fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
     let SingularValues { left, values, right } = decompose(columns)?;
-    let along: Vec<f64> = left.iter().map(|u| inner(u, target)).collect();
-    let explained = linear_combination(&left, &along, target.len());
+    let projections: Vec<f64> = left.iter().map(|u| inner(u, target)).collect();
+    let explained = linear_combination(&left, &projections, target.len());
     let noise: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
     let variance = mean(&noise.iter().map(|v| v * v).collect::<Vec<_>>()) * variance_inflation(&noise);
-    let ratios =
-        |of: &dyn Fn(f64) -> f64| -> Vec<f64> { along.iter().zip(&values).map(|(a, value)| a * of(*value)).collect() };
+    let ratios = |factor_of: &dyn Fn(f64) -> f64| -> Vec<f64> {
+        projections.iter().zip(&values).map(|(a, value)| a * factor_of(*value)).collect()
+    };
     if variance.is_nan() || variance <= 0.0 {
         let exact = ratios(&|value| if value > 0.0 { 1.0 / value } else { 0.0 });
         return Ok(linear_combination(&right, &exact, columns.len()));
     }
-    let power = |size: f64, value: f64| (size * value).powi(2);
-    let cost = |size: &f64| -> f64 {
-        let terms = along
+    let power = |scale: f64, value: f64| (scale * value).powi(2);
+    let cost = |scale: &f64| -> f64 {
+        let terms = projections
             .iter()
             .zip(&values)
-            .map(|(a, value)| a * a / (variance + power(*size, *value)) + (power(*size, *value) / variance).ln_1p());
+            .map(|(a, value)| a * a / (variance + power(*scale, *value)) + (power(*scale, *value) / variance).ln_1p());
         terms.sum()
     };
-    let best = PAST_INPUT_SIZES.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or(0.0);
-    let means = ratios(&|value| best * best * value / (variance + power(best, value)));
+    let best_scale = PAST_INPUT_SIZES.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or(0.0);
+    let means = ratios(&|value| best_scale * best_scale * value / (variance + power(best_scale, value)));
     Ok(linear_combination(&right, &means, columns.len()))
 }
 
 /// Return the singular value decomposition of the matrix with these columns.
 fn decompose(columns: &[Vec<f64>]) -> Result<SingularValues> {
-    singular_values(columns).ok_or_else(not_decomposed)
+    singular_values(columns).ok_or_else(decomposition_error)
 }
 
-fn not_decomposed() -> Error {
+fn decomposition_error() -> Error {
     Error::Internal { what: "singular values of responses to past inputs that do not converge".into() }
 }
 
 /// Return the left singular vectors and the singular values, without those at the level of rounding errors.
-fn significant(all: SingularValues) -> (Rows, Vec<f64>) {
-    let least = MIN_SINGULAR_VALUE_RATIO * all.values.first().copied().unwrap_or(0.0);
-    all.left.into_iter().zip(all.values).filter(|(_, value)| *value > least).unzip()
+fn significant_vectors(decomposition: SingularValues) -> (Rows, Vec<f64>) {
+    let threshold = MIN_SINGULAR_VALUE_RATIO * decomposition.values.first().copied().unwrap_or(0.0);
+    decomposition.left.into_iter().zip(decomposition.values).filter(|(_, value)| *value > threshold).unzip()
 }
 
 /// Return the sum of the columns times their coefficients, as a vector of `length` values.

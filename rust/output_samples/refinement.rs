@@ -89,34 +89,38 @@ impl OutputSimulation {
             return Ok(long_samples);
         }
         let intervals = self.recording.len() - 1;
-        let (mut table, mut failures, mut every) = (RichardsonTable::default(), 0, FIRST_REFINEMENT);
+        let (mut table, mut failures, mut pulses_per_sample) = (RichardsonTable::default(), 0, FIRST_REFINEMENT);
         loop {
             stop.check()?;
-            let last = intervals.saturating_mul(2 * every) > options.max_pulses;
-            let OutputSamples { outputs, initial: terms } = match self.samples(every, initial) {
+            let is_last = intervals.saturating_mul(2 * pulses_per_sample) > options.max_pulses;
+            let OutputSamples { outputs, initial: terms } = match self.samples(pulses_per_sample, initial) {
                 // The equations are singular if a coefficient c of the output satisfies 1 = c h^α / Γ(α + 2). This can
                 // be true for one step h, but not for two.
                 Err(error) if error.kind() == Kind::Model && failures != 1 => self.unknown_samples(initial),
                 long_samples => long_samples?,
             };
-            let finite = outputs.iter().flatten().all(|v| v.is_finite());
-            let owners = terms.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |_| i));
+            let is_finite = outputs.iter().flatten().all(|v| v.is_finite());
+            let owners = terms.iter().enumerate().flat_map(|(i, equation_terms)| equation_terms.iter().map(move |_| i));
             let values = terms.iter().flatten().map(|term| term.1).collect();
             table.add(outputs, values, &relative_change);
             let long_samples = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
             let limit = long_samples.ok_or_else(|| Error::Internal { what: "no grid for the simulation".into() })?;
             // The scheme of a stiff equation may be unstable on a coarse grid. If it is unstable on two grids in
             // succession, finer grids are not tried.
-            failures = if finite || every == FIRST_REFINEMENT { 0 } else { failures + 1 };
-            if last || failures == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
+            failures = if is_finite || pulses_per_sample == FIRST_REFINEMENT { 0 } else { failures + 1 };
+            if is_last || failures == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
                 let mut values = limit.terms.into_iter();
-                let initial = terms.into_iter().map(|own| {
-                    own.into_iter().zip(values.by_ref()).map(|((exponent, _), value)| (exponent, value)).collect()
+                let initial = terms.into_iter().map(|equation_terms| {
+                    equation_terms
+                        .into_iter()
+                        .zip(values.by_ref())
+                        .map(|((exponent, _), value)| (exponent, value))
+                        .collect()
                 });
                 let samples = OutputSamples { outputs: limit.samples, initial: initial.collect() };
-                return Ok(RefinedSamples { samples, refinement: every, change: limit.change });
+                return Ok(RefinedSamples { samples, refinement: pulses_per_sample, change: limit.change });
             }
-            every *= 2;
+            pulses_per_sample *= 2;
         }
     }
 
@@ -169,8 +173,9 @@ impl<'a> SampleResponses<'a> {
     /// Prepare the superposition of responses for a simulation; None if superposition does not apply.
     fn new(simulation: &'a OutputSimulation, units: Vec<(usize, f64)>, stop: &'a Stop) -> Option<Self> {
         let OutputSimulation { recording, equations, times, .. } = simulation;
-        let special = !simulation.is_linear() || recording.is_all_filtered() || recording.has_nonuniform_samples();
-        if special || times.is_some() || simulation.has_improper_term() {
+        let is_unsupported =
+            !simulation.is_linear() || recording.is_all_filtered() || recording.has_nonuniform_samples();
+        if is_unsupported || times.is_some() || simulation.has_improper_term() {
             return None;
         }
         let mut inputs: Vec<(usize, Vec<f64>, bool)> = Vec::new();
@@ -180,11 +185,11 @@ impl<'a> SampleResponses<'a> {
                 if term.signal == structure.output || simulation.simulated_output(term.signal).is_some() {
                     continue;
                 }
-                let direct = (term.order - structure.order).abs() <= ORDER_TOLERANCE;
+                let has_feedthrough = (term.order - structure.order).abs() <= ORDER_TOLERANCE;
                 // A delayed input depends on values before the run, and direct feedthrough has a value at the last
                 // sample. Neither is a response to one of its samples.
                 let delay = channel.delay.unwrap_or(0.0);
-                let depends_on_other_samples = delay > 0.0 && (direct || !recording.is_at_rest);
+                let depends_on_other_samples = delay > 0.0 && (has_feedthrough || !recording.is_at_rest);
                 if channel.role == Role::Derived || delay < 0.0 || depends_on_other_samples {
                     return None;
                 }
@@ -201,11 +206,11 @@ impl<'a> SampleResponses<'a> {
         self.simulation.equations.len()
     }
 
-    /// Return the responses to unit input samples, to first samples and to initial terms, on a grid of `every` pulses
-    /// per sampling interval. Each response is a block of one row per output. It is NaN if the equations are singular
-    /// on the grid.
-    fn compute(&self, every: usize, intervals: usize) -> Result<Rows> {
-        match self.try_compute(every, intervals) {
+    /// Return the responses to unit input samples, to first samples and to initial terms, on a grid of
+    /// `pulses_per_sample` pulses per sampling interval. Each response is a block of one row per output. It is NaN if
+    /// the equations are singular on the grid.
+    fn compute(&self, pulses_per_sample: usize, intervals: usize) -> Result<Rows> {
+        match self.try_compute(pulses_per_sample, intervals) {
             Err(error) if error.kind() == Kind::Model => {
                 let blocks = self.inputs.len() + self.first_samples().count() + self.units.len();
                 Ok(vec![vec![f64::NAN; intervals + 1]; blocks * self.outputs()])
@@ -214,34 +219,36 @@ impl<'a> SampleResponses<'a> {
         }
     }
 
-    fn try_compute(&self, every: usize, intervals: usize) -> Result<Rows> {
-        let (mut rows, mut first) = (Vec::new(), Vec::new());
+    fn try_compute(&self, pulses_per_sample: usize, intervals: usize) -> Result<Rows> {
+        let (mut rows, mut first_responses) = (Vec::new(), Vec::new());
         let rest = InitialTerms::Given(vec![Vec::new(); self.outputs()]);
         for (signal, samples, is_linear) in &self.inputs {
             self.stop.check()?;
             // The unit sample of a signal that is linear between samples is a triangle, which begins one interval
             // earlier.
             let ramp = usize::from(*is_linear);
-            let mut block = self.unit(Some((*signal, ramp)), intervals + ramp).samples(every, &rest)?.outputs;
+            let mut block =
+                self.unit(Some((*signal, ramp)), intervals + ramp).samples(pulses_per_sample, &rest)?.outputs;
             if *is_linear {
                 for row in &mut block {
                     row.remove(0);
                 }
                 if samples[0] != 0.0 {
-                    let whole = self.unit(Some((*signal, 0)), intervals).samples(every, &rest)?.outputs;
-                    first.extend(combine(&whole, &block, |w, b| w - b));
+                    let full_response =
+                        self.unit(Some((*signal, 0)), intervals).samples(pulses_per_sample, &rest)?.outputs;
+                    first_responses.extend(combine(&full_response, &block, |w, b| w - b));
                 }
             }
             rows.extend(block);
         }
-        rows.extend(first);
+        rows.extend(first_responses);
         if !self.units.is_empty() {
             self.stop.check()?;
             let zero_inputs = self.unit(None, intervals);
-            let grid = Grid::new(&zero_inputs, every)?;
-            let (_, responses) = grid.rest_and_units(&self.units)?;
+            let pulse_grid = Grid::new(&zero_inputs, pulses_per_sample)?;
+            let (_, responses) = pulse_grid.rest_and_units(&self.units)?;
             for (unit, means) in self.units.iter().zip(responses) {
-                rows.extend(grid.unit_samples(*unit, &means)?);
+                rows.extend(pulse_grid.unit_samples(*unit, &means)?);
             }
         }
         Ok(rows)
@@ -289,13 +296,13 @@ impl<'a> SampleResponses<'a> {
                 Ok(OutputSamples { outputs, initial: vec![Vec::new(); n] })
             }
             InitialTerms::Fitted { has_level, .. } => {
-                let driven = self.superpose(responses, 0, &vec![0.0; self.units.len()]);
+                let samples = self.superpose(responses, 0, &vec![0.0; self.units.len()]);
                 if self.units.is_empty() && !has_level {
-                    return Ok(OutputSamples { outputs: driven, initial: vec![Vec::new(); n] });
+                    return Ok(OutputSamples { outputs: samples, initial: vec![Vec::new(); n] });
                 }
                 let columns = responses.chunks(n).skip(self.inputs.len() + self.first_samples().count());
                 let measured = self.simulation.recording.compared_rows(FINEST_FULL_GRID)?;
-                fit_initial_terms(&measured, driven, &self.units, columns.map(<[_]>::to_vec).collect(), *has_level)
+                fit_initial_terms(&measured, samples, &self.units, columns.map(<[_]>::to_vec).collect(), *has_level)
             }
         }
     }
@@ -315,83 +322,89 @@ fn refine_long_record(
         return Ok(None);
     }
     let exponents = match initial {
-        InitialTerms::Given(terms) => terms.iter().map(|own| own.iter().map(|term| term.0).collect()).collect(),
+        InitialTerms::Given(terms) => {
+            terms.iter().map(|equation_terms| equation_terms.iter().map(|term| term.0).collect()).collect()
+        }
         InitialTerms::Fitted { exponents, .. } | InitialTerms::UnitResponses { exponents } => exponents.clone(),
     };
     let Some(responses) = SampleResponses::new(simulation, simulation.unit_terms(&exponents)?, stop) else {
         return Ok(None);
     };
-    let grids = FULL_GRID_REFINEMENTS.iter().map(|&every| responses.compute(every, intervals));
-    let grids = grids.collect::<Result<Vec<_>>>()?;
-    if !grids[1..].iter().all(has_small_growth) {
+    let rows_by_refinement =
+        FULL_GRID_REFINEMENTS.iter().map(|&pulses_per_sample| responses.compute(pulses_per_sample, intervals));
+    let rows_by_refinement = rows_by_refinement.collect::<Result<Vec<_>>>()?;
+    if !rows_by_refinement[1..].iter().all(has_small_growth) {
         return Ok(None);
     }
-    let estimate = responses.samples(&grids[grids.len() - 1], initial)?;
-    let sizes: Vec<f64> = estimate.outputs.iter().map(|row| peak(row)).collect();
+    let estimate = responses.samples(&rows_by_refinement[rows_by_refinement.len() - 1], initial)?;
+    let peaks: Vec<f64> = estimate.outputs.iter().map(|row| peak(row)).collect();
     let mut terms: Vec<f64> = estimate.initial.iter().flatten().filter(|t| t.0.is_finite()).map(|t| t.1).collect();
     terms.resize(responses.units.len(), 0.0);
     let measure = |first: usize, new: &Rows, old: &Rows| -> Vec<f64> {
-        let by = combine(new, old, |n, o| n - o);
-        if !by.iter().flatten().all(|v| v.is_finite()) {
-            return vec![f64::INFINITY; sizes.len()];
+        let difference = combine(new, old, |n, o| n - o);
+        if !difference.iter().flatten().all(|v| v.is_finite()) {
+            return vec![f64::INFINITY; peaks.len()];
         }
-        let changes = responses.superpose(&by, first, &terms);
-        let of = |(row, size): (&Vec<f64>, &f64)| match peak(row) {
+        let changes = responses.superpose(&difference, first, &terms);
+        let relative_peak = |(row, size): (&Vec<f64>, &f64)| match peak(row) {
             0.0 => 0.0,
-            most => most / if *size > 0.0 { *size } else { 1e-300 },
+            largest => largest / if *size > 0.0 { *size } else { 1e-300 },
         };
-        changes.iter().zip(&sizes).map(of).collect()
+        changes.iter().zip(&peaks).map(relative_peak).collect()
     };
-    let part =
+    let time_slice =
         |rows: &Rows, first: usize, end: usize| rows.iter().map(|row| row[first..end].to_vec()).collect::<Rows>();
     let mut ranges = Vec::new();
     for (first, end) in time_ranges(intervals) {
         let mut limit = RichardsonTable::default();
-        for rows in &grids[usize::from(first == 0)..] {
-            limit.add(part(rows, first, end), Vec::new(), &|new, old| measure(first, new, old));
+        for rows in &rows_by_refinement[usize::from(first == 0)..] {
+            limit.add(time_slice(rows, first, end), Vec::new(), &|new, old| measure(first, new, old));
         }
         ranges.push(TimeRange { first, end, refinement: FINEST_FULL_GRID, limit });
     }
-    drop(grids);
-    let (count, share) = (ranges.len(), options.tolerance / ranges.len() as f64);
-    let (best, refinement, change) = loop {
+    drop(rows_by_refinement);
+    let (count, range_tolerance) = (ranges.len(), options.tolerance / ranges.len() as f64);
+    let (limit_rows, refinement, change) = loop {
         let estimates =
             ranges.iter().map(|range| range.limit.estimate(&[], 0.0, &|new, old| measure(range.first, new, old)));
         let error = || Error::Internal { what: "no grid of a response".into() };
         let estimates = estimates.collect::<Option<Vec<_>>>().ok_or_else(error)?;
-        let of = |i: usize| estimates.iter().filter_map(|estimate| estimate.change.get(i)).sum::<f64>();
-        let change: Vec<f64> = (0..responses.outputs()).map(of).collect();
-        let widest = (0..count).rev().find(|&k| {
-            !estimates[k].change.iter().all(|c| *c <= share)
+        let total_change = |i: usize| estimates.iter().filter_map(|estimate| estimate.change.get(i)).sum::<f64>();
+        let change: Vec<f64> = (0..responses.outputs()).map(total_change).collect();
+        let widest_range = (0..count).rev().find(|&k| {
+            !estimates[k].change.iter().all(|c| *c <= range_tolerance)
                 && (2 * ranges[k].refinement).saturating_mul(ranges[k].end) <= options.max_pulses
         });
-        let widest = widest.filter(|_| !change.iter().all(|c| *c <= options.tolerance));
-        let Some((end, every)) = widest.map(|k| (ranges[k].end, 2 * ranges[k].refinement)) else {
-            let mut best = vec![Vec::new(); estimates[0].samples.len()];
+        let widest_range = widest_range.filter(|_| !change.iter().all(|c| *c <= options.tolerance));
+        let Some((end, pulses_per_sample)) = widest_range.map(|k| (ranges[k].end, 2 * ranges[k].refinement)) else {
+            let mut limit_rows = vec![Vec::new(); estimates[0].samples.len()];
             for estimate in estimates {
-                best.iter_mut().zip(estimate.samples).for_each(|(row, more)| row.extend(more));
+                limit_rows.iter_mut().zip(estimate.samples).for_each(|(row, range_samples)| row.extend(range_samples));
             }
-            break (best, ranges[count - 1].refinement, change);
+            break (limit_rows, ranges[count - 1].refinement, change);
         };
         stop.check()?;
-        let finer = responses.compute(every, end - 1)?;
-        for range in ranges.iter_mut().filter(|range| range.end <= end && 2 * range.refinement == every) {
+        let finer = responses.compute(pulses_per_sample, end - 1)?;
+        for range in ranges.iter_mut().filter(|range| range.end <= end && 2 * range.refinement == pulses_per_sample) {
             let (first, end) = (range.first, range.end);
-            range.limit.add(part(&finer, first, end), Vec::new(), &|new, old| measure(first, new, old));
-            range.refinement = every;
+            range.limit.add(time_slice(&finer, first, end), Vec::new(), &|new, old| measure(first, new, old));
+            range.refinement = pulses_per_sample;
         }
     };
-    Ok(Some(RefinedSamples { samples: responses.samples(&best, initial)?, refinement, change }))
+    Ok(Some(RefinedSamples { samples: responses.samples(&limit_rows, initial)?, refinement, change }))
 }
 
 /// Divide responses over `intervals` sampling intervals into time ranges. Return (first sample, end) of each range.
 fn time_ranges(intervals: usize) -> Vec<(usize, usize)> {
-    let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / RANGE_END_RATIO));
-    let mut ends: Vec<usize> =
-        ends.enumerate().take_while(|(k, end)| *k == 0 || *end >= MIN_RANGE_INTERVALS).map(|(_, end)| end).collect();
-    ends.reverse();
-    let firsts = std::iter::once(0).chain(ends.iter().copied());
-    firsts.zip(ends.iter().copied()).collect()
+    let range_ends = std::iter::successors(Some(intervals + 1), |range_end| Some(range_end / RANGE_END_RATIO));
+    let mut range_ends: Vec<usize> = range_ends
+        .enumerate()
+        .take_while(|(k, range_end)| *k == 0 || *range_end >= MIN_RANGE_INTERVALS)
+        .map(|(_, range_end)| range_end)
+        .collect();
+    range_ends.reverse();
+    let range_starts = std::iter::once(0).chain(range_ends.iter().copied());
+    range_starts.zip(range_ends.iter().copied()).collect()
 }
 
 /// True if the responses are finite and grow so little over the record that their superposition does not lose digits.

@@ -98,9 +98,9 @@ impl OutputSimulation {
         times: Option<Vec<f64>>,
     ) -> Result<Self> {
         equations.iter().try_for_each(|equation| equation.check(recording.channels().len()))?;
-        let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
-        if own != recording.outputs() {
-            let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
+        let equation_outputs: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
+        if equation_outputs != recording.outputs() {
+            let what = format!("equations of signals {equation_outputs:?} for outputs {:?}", recording.outputs());
             return Err(Error::Structure {
                 what,
                 remedy: "give one equation per output, in the sequence of the outputs".into(),
@@ -143,9 +143,9 @@ impl OutputSimulation {
         times: Option<Vec<f64>>,
     ) -> Result<Self> {
         let recorded = recording.channels().len();
-        let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
-        if own != recording.outputs() {
-            let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
+        let equation_outputs: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
+        if equation_outputs != recording.outputs() {
+            let what = format!("equations of signals {equation_outputs:?} for outputs {:?}", recording.outputs());
             return Err(Error::Structure {
                 what,
                 remedy: "give one equation per output, in the sequence of the outputs".into(),
@@ -158,14 +158,14 @@ impl OutputSimulation {
         let simulation = Self { recording, equations, frictions, times, derived };
         simulation.system().check()?;
         for (i, Equation { structure, .. }) in simulation.equations.iter().enumerate() {
-            let driven = |signal: usize| match signal.checked_sub(recorded) {
+            let depends_on_input = |signal: usize| match signal.checked_sub(recorded) {
                 None => simulation.system().output_index(i, signal).is_none(),
-                Some(at) => {
-                    let channels = &simulation.derived[at].channels;
+                Some(index) => {
+                    let channels = &simulation.derived[index].channels;
                     channels.iter().any(|channel| simulation.system().output_index(i, channel.0).is_none())
                 }
             };
-            let is_improper = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
+            let is_improper = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && depends_on_input(t.signal);
             if let Some(term) = structure.terms.iter().find(is_improper) {
                 return Err(Error::OutOfRange {
                     name: "order of an input in equations with non-linear terms".into(),
@@ -195,8 +195,8 @@ impl OutputSimulation {
     }
 
     /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. Return (exponent e,
-    /// coefficient c) of each initial term c t^e, by equation. The simulation uses `every` block pulses per sampling
-    /// interval.
+    /// coefficient c) of each initial term c t^e, by equation. The simulation uses `pulses_per_sample` block pulses per
+    /// sampling interval.
     ///
     /// The outputs are not linear in the initial terms, which are therefore found by local optimization. It starts from
     /// the measured position and velocity at the start of the run.
@@ -223,15 +223,20 @@ impl OutputSimulation {
     /// assert!((terms[0][0].1 - 2.0).abs() < 1e-6);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn fit_initial_states(&self, initial: Initial, every: usize, stop: &Stop) -> Result<Vec<Vec<(f64, f64)>>> {
-        let experiment = self.recording.experiment(Sampling { pulses_per_sample: every, ..Sampling::default() })?;
+    pub fn fit_initial_states(
+        &self,
+        initial: Initial,
+        pulses_per_sample: usize,
+        stop: &Stop,
+    ) -> Result<Vec<Vec<(f64, f64)>>> {
+        let experiment = self.recording.experiment(Sampling { pulses_per_sample, ..Sampling::default() })?;
         let weights: Vec<f64> = (self.recording.outputs().iter())
             .map(|&output| initial_terms::weight(&self.recording.channels()[output].samples))
             .collect();
         let experiments = [experiment.with_weights(&weights, None)?];
         let monomial = |factor: f64| Monomial { factor, powers: Vec::new() };
         let order = |constant: f64| AffineOrder { constant, weights: Vec::new() };
-        let fixed = |Equation { structure, coefficients }: &Equation| FreeEquation {
+        let fixed_equation = |Equation { structure, coefficients }: &Equation| FreeEquation {
             output: structure.output,
             order: order(structure.order),
             terms: (structure.terms.iter().zip(coefficients))
@@ -244,8 +249,8 @@ impl OutputSimulation {
             speed: monomial(law.speed),
         };
         let (equations, filtered) =
-            (self.equations.iter().map(fixed).collect(), nonlinear::filtered_outputs(&experiments));
-        let frictions = self.frictions.iter().map(|(place, friction)| (*place, law(*friction))).collect();
+            (self.equations.iter().map(fixed_equation).collect(), nonlinear::filtered_outputs(&experiments));
+        let frictions = self.frictions.iter().map(|(equation, friction)| (*equation, law(*friction))).collect();
         let model = FreeModel {
             equations,
             order_bounds: Vec::new(),
@@ -260,8 +265,8 @@ impl OutputSimulation {
         Ok(optimum.initial.into_iter().flatten().collect())
     }
 
-    /// Return the samples of the outputs, simulated on a grid of `every` block pulses per sampling interval. They are
-    /// not finite if the simulation diverges.
+    /// Return the samples of the outputs, simulated on a grid of `pulses_per_sample` block pulses per sampling
+    /// interval. They are not finite if the simulation diverges.
     ///
     /// # Errors
     /// The errors of [`Recording::pulses`] for an invalid number of pulses, of [`simulate::respond`] for linear models,
@@ -282,38 +287,42 @@ impl OutputSimulation {
     /// assert!((simulation.samples(4, &rest)?.outputs[0][20] - 0.5724).abs() < 1e-2);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn samples(&self, every: usize, initial: &InitialTerms) -> Result<OutputSamples> {
-        let grid = Grid::new(self, every)?;
+    pub fn samples(&self, pulses_per_sample: usize, initial: &InitialTerms) -> Result<OutputSamples> {
+        let pulse_grid = Grid::new(self, pulses_per_sample)?;
         let (units, has_level) = match initial {
             InitialTerms::Given(terms) => {
                 check_length("initial terms", self.equations.len(), terms.len())?;
-                let outputs = grid.samples(&grid.respond(terms)?, terms, true)?;
+                let outputs = pulse_grid.samples(&pulse_grid.respond(terms)?, terms, true)?;
                 return Ok(OutputSamples { outputs, initial: terms.clone() });
             }
             InitialTerms::Fitted { exponents, has_level } => (self.unit_terms(exponents)?, *has_level),
             InitialTerms::UnitResponses { exponents } => (self.unit_terms(exponents)?, false),
         };
-        let rest = vec![Vec::new(); self.equations.len()];
-        let (means, responses) = grid.rest_and_units(&units)?;
-        let mut driven = grid.samples(&means, &rest, true)?;
+        let no_terms = vec![Vec::new(); self.equations.len()];
+        let (means, responses) = pulse_grid.rest_and_units(&units)?;
+        let mut rest_samples = pulse_grid.samples(&means, &no_terms, true)?;
         let is_separate = matches!(initial, InitialTerms::UnitResponses { .. });
-        let is_finite = driven.iter().flatten().all(|v| v.is_finite());
+        let is_finite = rest_samples.iter().flatten().all(|v| v.is_finite());
         if !is_separate && ((units.is_empty() && !has_level) || !is_finite) {
-            return Ok(OutputSamples { outputs: driven, initial: rest });
+            return Ok(OutputSamples { outputs: rest_samples, initial: no_terms });
         }
-        let columns = units.iter().zip(responses).map(|(unit, means)| grid.unit_samples(*unit, &means));
+        let columns = units.iter().zip(responses).map(|(unit, means)| pulse_grid.unit_samples(*unit, &means));
         let columns = columns.collect::<Result<Vec<_>>>()?;
         if is_separate {
-            driven.extend(columns.into_iter().flatten());
-            return Ok(OutputSamples { outputs: driven, initial: rest });
+            rest_samples.extend(columns.into_iter().flatten());
+            return Ok(OutputSamples { outputs: rest_samples, initial: no_terms });
         }
-        fit_initial_terms(&self.recording.compared_rows(every)?, driven, &units, columns, has_level)
+        fit_initial_terms(&self.recording.compared_rows(pulses_per_sample)?, rest_samples, &units, columns, has_level)
     }
 
     /// Return (index of the equation, exponent) of each initial term.
     pub(super) fn unit_terms(&self, exponents: &[Vec<f64>]) -> Result<Vec<(usize, f64)>> {
         check_length("exponents of the initial terms", self.equations.len(), exponents.len())?;
-        Ok(exponents.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |e| (i, *e))).collect())
+        Ok(exponents
+            .iter()
+            .enumerate()
+            .flat_map(|(i, equation_exponents)| equation_exponents.iter().map(move |e| (i, *e)))
+            .collect())
     }
 
     /// Return the index of the equation whose simulated output is this signal. None for inputs. Also None if outputs
@@ -324,8 +333,9 @@ impl OutputSimulation {
 
     /// True if an equation has an improper term, whose order is above the order of its equation.
     pub(super) fn has_improper_term(&self) -> bool {
-        let above = |e: &Equation| e.structure.terms.iter().any(|t| t.order > e.structure.order + ORDER_TOLERANCE);
-        self.equations.iter().any(above)
+        let has_improper =
+            |e: &Equation| e.structure.terms.iter().any(|t| t.order > e.structure.order + ORDER_TOLERANCE);
+        self.equations.iter().any(has_improper)
     }
 }
 
@@ -337,14 +347,14 @@ fn coefficient(terms: &[(f64, f64)], exponent: f64) -> f64 {
 /// Multiply rows by a square, row-major matrix. Without a matrix, return the rows unchanged.
 fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
     let (Some(matrix), n) = (matrix, rows.len()) else { return rows };
-    let of = |i: usize| {
+    let product_row = |i: usize| {
         let mut out = vec![0.0; rows[i].len()];
         for (row, gain) in rows.iter().zip(&matrix[i * n..]) {
             out.iter_mut().zip(row).for_each(|(sum, v)| *sum += gain * v);
         }
         out
     };
-    (0..n).map(of).collect()
+    (0..n).map(product_row).collect()
 }
 
 /// Return the ratio of the leading coefficients of a sensor filter, or 0 if its relative degree is not `degree`.
@@ -352,15 +362,16 @@ fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
 /// For degree 0, this is the gain of the filter for a jump. For a degree n > 0, it is the jump of its response to the
 /// derivative of order n − 1 of an impulse.
 fn leading_gain(filter: &Filter, degree: f64) -> f64 {
-    let of = |part: &[(f64, f64)]| {
+    let leading_term = |part: &[(f64, f64)]| {
         let highest = part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |most: f64, (_, order)| most.max(*order));
         (highest, part.iter().filter(|(_, order)| *order == highest).map(|(c, _)| c).sum::<f64>())
     };
-    let ((top, above), (bottom, below)) = (of(&filter.numerator), of(&filter.denominator));
-    if (bottom - top - degree).abs() > ORDER_TOLERANCE {
+    let ((numerator_order, numerator_coefficient), (denominator_order, denominator_coefficient)) =
+        (leading_term(&filter.numerator), leading_term(&filter.denominator));
+    if (denominator_order - numerator_order - degree).abs() > ORDER_TOLERANCE {
         0.0
     } else {
-        above / below
+        numerator_coefficient / denominator_coefficient
     }
 }
 
@@ -373,28 +384,28 @@ fn relative_degree(filter: &Filter) -> f64 {
 /// Pulse means of a recording on one grid of block pulses, and positions of the samples on the grid.
 pub(super) struct Grid<'a> {
     simulation: &'a OutputSimulation,
-    every: usize,
+    pulses_per_sample: usize,
     record: Record,
     /// Sensor filter of the simulated outputs as a power series in the one-step delay. None without a filter, or if the
     /// record itself is filtered.
     output_filter: Option<Vec<f64>>,
-    at: Option<SampleInterpolation>,
+    interpolation: Option<SampleInterpolation>,
 }
 
 impl<'a> Grid<'a> {
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn new(simulation: &'a OutputSimulation, every: usize) -> Result<Self> {
+    pub(super) fn new(simulation: &'a OutputSimulation, pulses_per_sample: usize) -> Result<Self> {
         let recording = &simulation.recording;
-        let filtered = recording.is_all_filtered();
-        let pulses = recording.pulses((recording.len() - 1).saturating_mul(every), filtered)?;
-        let is_simple = !simulation.is_linear();
-        let record = if is_simple { pulses.into_record()? } else { pulses.into_record_with_initial_state()? };
+        let is_filtered = recording.is_all_filtered();
+        let pulses = recording.pulses((recording.len() - 1).saturating_mul(pulses_per_sample), is_filtered)?;
+        let is_nonlinear = !simulation.is_linear();
+        let record = if is_nonlinear { pulses.into_record()? } else { pulses.into_record_with_initial_state()? };
         let (m, step) = (record.m(), record.step());
-        let filter = recording.filter.as_ref().filter(|_| !filtered);
+        let filter = recording.filter.as_ref().filter(|_| !is_filtered);
         let output_filter = filter.map(|filter| filter.series(m, step)).transpose()?;
-        let places = simulation.times.as_ref().map(|times| times.iter().map(|t| (t / step).min(m as f64)).collect());
-        let at = places.map(|places| SampleInterpolation::new(places, m)).transpose()?;
-        Ok(Self { simulation, every, record, output_filter, at })
+        let positions = simulation.times.as_ref().map(|times| times.iter().map(|t| (t / step).min(m as f64)).collect());
+        let interpolation = positions.map(|positions| SampleInterpolation::new(positions, m)).transpose()?;
+        Ok(Self { simulation, pulses_per_sample, record, output_filter, interpolation })
     }
 
     /// Return the pulse means of the outputs before the sensor filter, with these initial terms.
@@ -406,8 +417,8 @@ impl<'a> Grid<'a> {
         if recording.is_coupled {
             return simulate::respond(equations, &self.record, terms);
         }
-        let outputs = equations.iter().zip(terms).map(|(equation, own)| {
-            simulate::respond(std::slice::from_ref(equation), &self.record, std::slice::from_ref(own))
+        let outputs = equations.iter().zip(terms).map(|(equation, equation_terms)| {
+            simulate::respond(std::slice::from_ref(equation), &self.record, std::slice::from_ref(equation_terms))
         });
         Ok(outputs.collect::<Result<Vec<_>>>()?.concat())
     }
@@ -423,12 +434,12 @@ impl<'a> Grid<'a> {
         let mut rest = Vec::with_capacity(equations.len());
         let mut responses = vec![vec![vec![0.0; self.record.m()]; equations.len()]; units.len()];
         for (i, equation) in equations.iter().enumerate() {
-            let own: Vec<usize> = (0..units.len()).filter(|&k| units[k].0 == i).collect();
-            let exponents: Vec<(usize, f64)> = own.iter().map(|&k| (0, units[k].1)).collect();
+            let indices: Vec<usize> = (0..units.len()).filter(|&k| units[k].0 == i).collect();
+            let exponents: Vec<(usize, f64)> = indices.iter().map(|&k| (0, units[k].1)).collect();
             let (outputs, rows) =
                 simulate::respond_and_units(std::slice::from_ref(equation), &self.record, &exponents)?;
             rest.extend(outputs);
-            own.into_iter().zip(rows).for_each(|(k, row)| responses[k].splice(i..=i, row).for_each(drop));
+            indices.into_iter().zip(rows).for_each(|(k, row)| responses[k].splice(i..=i, row).for_each(drop));
         }
         Ok((rest, responses))
     }
@@ -451,10 +462,10 @@ impl<'a> Grid<'a> {
     /// added.
     fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
         let OutputSimulation { recording, equations, times, .. } = self.simulation;
-        let (n, m, every) = (means.len(), self.record.m(), self.every);
-        let count = times.as_ref().map_or(m / every + 1, Vec::len);
+        let (n, m, pulses_per_sample) = (means.len(), self.record.m(), self.pulses_per_sample);
+        let count = times.as_ref().map_or(m / pulses_per_sample + 1, Vec::len);
         let mut system = identity(n);
-        let (mut now, mut start) = (vec![vec![0.0; count]; n], vec![vec![0.0]; n]);
+        let (mut feedthrough, mut initial_values) = (vec![vec![0.0; count]; n], vec![vec![0.0]; n]);
         // This array is as long as the grid, so it is allocated only for direct feedthrough.
         let mut input_part: Option<Rows> = None;
         let degree = recording.filter.as_ref().map_or(0.0, relative_degree);
@@ -464,7 +475,8 @@ impl<'a> Grid<'a> {
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
             // In a filtered record, the initial terms pass the filter as well. The filter turns one of them into a
             // jump.
-            start[i][0] = if self.record.is_filtered() { after_filter(i) } else { coefficient(&terms[i], 0.0) };
+            initial_values[i][0] =
+                if self.record.is_filtered() { after_filter(i) } else { coefficient(&terms[i], 0.0) };
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
                 if structure.integration(k).abs() > ORDER_TOLERANCE || self.is_derived(term.signal) {
                     continue;
@@ -474,16 +486,19 @@ impl<'a> Grid<'a> {
                 } else if is_driven {
                     let input_part = input_part.get_or_insert_with(|| vec![vec![0.0; m]; n]);
                     add_multiple(&mut input_part[i], c, self.record.signal(term.signal));
-                    add_multiple(&mut now[i], c, &self.values_at_samples(term.signal)?);
+                    add_multiple(&mut feedthrough[i], c, &self.values_at_samples(term.signal)?);
                 }
             }
         }
-        let through = if system == identity(n) { None } else { Some(small::inverse(&system, n)?) };
-        let through = through.as_ref();
-        let (input_part, now, start) =
-            (input_part.map(|input_part| apply(through, input_part)), apply(through, now), apply(through, start));
-        let mut rest = match &input_part {
-            Some(input_part) => combine(means, input_part, |mean, driven| mean - driven),
+        let coupling_inverse = if system == identity(n) { None } else { Some(small::inverse(&system, n)?) };
+        let coupling_inverse = coupling_inverse.as_ref();
+        let (input_part, feedthrough, initial_values) = (
+            input_part.map(|input_part| apply(coupling_inverse, input_part)),
+            apply(coupling_inverse, feedthrough),
+            apply(coupling_inverse, initial_values),
+        );
+        let mut smooth_means = match &input_part {
+            Some(input_part) => combine(means, input_part, |mean, input_mean| mean - input_mean),
             None => means.clone(),
         };
         let (mut gains, mut offsets) = (vec![1.0; n], vec![0.0; n]);
@@ -496,52 +511,56 @@ impl<'a> Grid<'a> {
                 if degree > 0.0 {
                     offsets[i] = after_filter(i);
                 }
-                rest[i] = series::multiply(series, &means[i], m);
+                smooth_means[i] = series::multiply(series, &means[i], m);
                 if let Some(input_part) = &input_part {
-                    add_multiple(&mut rest[i], -gains[i], &input_part[i]);
+                    add_multiple(&mut smooth_means[i], -gains[i], &input_part[i]);
                 }
             }
         }
-        let mut out = match (&self.at, times) {
-            (Some(at), Some(times)) => {
-                let mut kinks = apply(through, self.kink_corrections(at, terms, is_driven));
+        let mut out = match (&self.interpolation, times) {
+            (Some(interpolation), Some(times)) => {
+                let mut kinks = apply(coupling_inverse, self.kink_corrections(interpolation, terms, is_driven));
                 kinks.iter_mut().zip(&gains).filter(|(_, gain)| **gain != 1.0).for_each(|(row, _)| row.fill(0.0));
-                let mut out: Rows = rest.iter().map(|row| at.interpolate(row)).collect();
+                let mut out: Rows = smooth_means.iter().map(|row| interpolation.interpolate(row)).collect();
                 for (i, (row, kinks)) in out.iter_mut().zip(kinks).enumerate() {
                     add_multiple(row, 1.0, &kinks);
                     // At t = 0 no input has been integrated yet.
-                    let begins = gains[i] * start[i][0] + offsets[i];
-                    row.iter_mut().zip(times).filter(|(_, t)| **t <= 0.0).for_each(|(v, _)| *v = begins);
+                    let initial_value = gains[i] * initial_values[i][0] + offsets[i];
+                    row.iter_mut().zip(times).filter(|(_, t)| **t <= 0.0).for_each(|(v, _)| *v = initial_value);
                 }
                 out
             }
             _ => {
-                let improper = self.simulation.has_improper_term();
-                let excess = if improper && is_driven { Some(self.responses_after_sample()?) } else { None };
-                let of = |i: usize| {
-                    let row = &rest[i];
+                let has_improper_term = self.simulation.has_improper_term();
+                let later_response =
+                    if has_improper_term && is_driven { Some(self.responses_after_sample()?) } else { None };
+                let output_samples = |i: usize| {
+                    let row = &smooth_means[i];
                     let mut out = Vec::with_capacity(count);
-                    out.push(gains[i] * start[i][0] + offsets[i]);
-                    for (k, at) in (every..=m).step_by(every).enumerate() {
-                        out.push(if !improper || m < 3 {
-                            1.5 * row[at - 1] - 0.5 * row[at.saturating_sub(2)]
-                        } else if at == m {
+                    out.push(gains[i] * initial_values[i][0] + offsets[i]);
+                    for (k, pulse) in (pulses_per_sample..=m).step_by(pulses_per_sample).enumerate() {
+                        out.push(if !has_improper_term || m < 3 {
+                            1.5 * row[pulse - 1] - 0.5 * row[pulse.saturating_sub(2)]
+                        } else if pulse == m {
                             row[m - 1] + 0.5 * row[m - 2] - 0.5 * row[m - 3]
                         } else {
                             // An improper term differentiates. At one order above its equation this is nearly Tustin's
                             // rule, so the pulse means have a component of alternating sign. The average of the pulses
                             // on both sides eliminates it.
-                            let excess = excess.as_ref().filter(|_| gains[i] == 1.0).map_or(0.0, |excess| excess[i][k]);
-                            0.5 * (row[at - 1] + row[at]) - excess
+                            let later_response = later_response
+                                .as_ref()
+                                .filter(|_| gains[i] == 1.0)
+                                .map_or(0.0, |later_response| later_response[i][k]);
+                            0.5 * (row[pulse - 1] + row[pulse]) - later_response
                         });
                     }
                     out
                 };
-                (0..n).map(of).collect()
+                (0..n).map(output_samples).collect()
             }
         };
-        for ((row, gain), now) in out.iter_mut().zip(gains).zip(&now) {
-            add_multiple(row, gain, now);
+        for ((row, gain), feedthrough) in out.iter_mut().zip(gains).zip(&feedthrough) {
+            add_multiple(row, gain, feedthrough);
         }
         Ok(out)
     }
@@ -559,18 +578,18 @@ impl<'a> Grid<'a> {
     fn values_at_samples(&self, signal: usize) -> Result<Vec<f64>> {
         let OutputSimulation { recording, times, .. } = self.simulation;
         let (channel, means) = (recording.channel(signal)?, self.record.signal(signal));
-        if let (Some(at), Some(times)) = (&self.at, times) {
-            return Ok(recording.values_at(signal, times).unwrap_or_else(|| at.interpolate(means)));
+        if let (Some(interpolation), Some(times)) = (&self.interpolation, times) {
+            return Ok(recording.values_at(signal, times).unwrap_or_else(|| interpolation.interpolate(means)));
         }
-        let filtered = self.record.is_filtered() && !channel.is_filtered;
-        if !filtered && channel.delay.unwrap_or(0.0) == 0.0 {
+        let is_filtered = self.record.is_filtered() && !channel.is_filtered;
+        if !is_filtered && channel.delay.unwrap_or(0.0) == 0.0 {
             // The signal may have a slope discontinuity at the sample, which a mean over pulses would round off.
             return Ok(recording.acting_samples(signal).into_owned());
         }
-        if filtered || !channel.is_zero_order_hold() {
-            return Ok(point_samples(means).into_iter().step_by(self.every).collect());
+        if is_filtered || !channel.is_zero_order_hold() {
+            return Ok(point_samples(means).into_iter().step_by(self.pulses_per_sample).collect());
         }
-        Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
+        Ok(means.iter().copied().step_by(self.pulses_per_sample).chain(means.last().copied()).collect())
     }
 
     /// Return, for each output, the part of its samples that is due to the response after the sample time. The first
@@ -581,48 +600,50 @@ impl<'a> Grid<'a> {
     /// sample time only direct feedthrough acts, as in the joint fit.
     fn responses_after_sample(&self) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
-        let (n, m, every) = (equations.len(), self.record.m(), self.every);
+        let (n, m, pulses_per_sample) = (equations.len(), self.record.m(), self.pulses_per_sample);
         let signals = recording.channels().len();
         // Gains over the first pulse, and gains of direct feedthrough.
         let mut systems = [identity(n), identity(n)];
-        let mut driven = [vec![0.0; n * signals], vec![0.0; n * signals]];
-        let mut halves: Vec<Option<Vec<f64>>> = vec![None; signals];
+        let mut input_gains = [vec![0.0; n * signals], vec![0.0; n * signals]];
+        let mut jump_halves: Vec<Option<Vec<f64>>> = vec![None; signals];
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
                 let (eta, channel) = (structure.integration(k), recording.channel(term.signal)?);
-                let own =
+                let output =
                     self.simulation.simulated_output(term.signal).or((term.signal == structure.output).then_some(i));
-                if own.is_none()
+                if output.is_none()
                     && (channel.role == Role::Derived || (self.record.is_filtered() && !channel.is_filtered))
                 {
                     // The filter smooths this signal, or only its pulse means are known.
                     continue;
                 }
                 let gains = [first_coefficient(eta, self.record.step()), f64::from(eta.abs() <= ORDER_TOLERANCE)];
-                for ((system, driven), gain) in systems.iter_mut().zip(&mut driven).zip(gains) {
-                    match own {
+                for ((system, input_gains), gain) in systems.iter_mut().zip(&mut input_gains).zip(gains) {
+                    match output {
                         Some(j) => system[i * n + j] -= c * gain,
-                        None => driven[i * signals + term.signal] += c * gain,
+                        None => input_gains[i * signals + term.signal] += c * gain,
                     }
                 }
-                if own.is_none() && halves[term.signal].is_none() {
+                if output.is_none() && jump_halves[term.signal].is_none() {
                     let (means, sign) =
                         (self.record.signal(term.signal), if channel.is_zero_order_hold() { 1.0 } else { -1.0 });
                     let values = self.values_at_samples(term.signal)?;
-                    let half = (every..m).step_by(every).zip(&values[1..]);
-                    let half = half.map(|(at, value)| sign * (value - 0.5 * (means[at - 1] + means[at]))).collect();
-                    halves[term.signal] = Some(half);
+                    let jump_half = (pulses_per_sample..m).step_by(pulses_per_sample).zip(&values[1..]);
+                    let jump_half = jump_half
+                        .map(|(pulse, value)| sign * (value - 0.5 * (means[pulse - 1] + means[pulse])))
+                        .collect();
+                    jump_halves[term.signal] = Some(jump_half);
                 }
             }
         }
         let inverses = [small::inverse(&systems[0], n)?, small::inverse(&systems[1], n)?];
-        let gain = |way: usize, i: usize, signal: usize| -> f64 {
-            (0..n).map(|j| inverses[way][i * n + j] * driven[way][j * signals + signal]).sum()
+        let gain = |kind: usize, i: usize, signal: usize| -> f64 {
+            (0..n).map(|j| inverses[kind][i * n + j] * input_gains[kind][j * signals + signal]).sum()
         };
-        let mut out = vec![vec![0.0; m / every - 1]; n];
-        for (signal, half) in halves.iter().enumerate() {
+        let mut out = vec![vec![0.0; m / pulses_per_sample - 1]; n];
+        for (signal, jump_half) in jump_halves.iter().enumerate() {
             for (i, row) in out.iter_mut().enumerate() {
-                add_multiple(row, gain(0, i, signal) - gain(1, i, signal), half.as_deref().unwrap_or_default());
+                add_multiple(row, gain(0, i, signal) - gain(1, i, signal), jump_half.as_deref().unwrap_or_default());
             }
         }
         Ok(out)
@@ -633,31 +654,35 @@ impl<'a> Grid<'a> {
     ///
     /// A correction includes the direct path of a jump and one pass through each term of the output, as in the joint
     /// fit.
-    fn kink_corrections(&self, at: &SampleInterpolation, terms: &Terms, is_driven: bool) -> Rows {
+    fn kink_corrections(&self, interpolation: &SampleInterpolation, terms: &Terms, is_driven: bool) -> Rows {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let step = self.record.step();
-        let mut out = vec![vec![0.0; at.len()]; equations.len()];
+        let mut out = vec![vec![0.0; interpolation.len()]; equations.len()];
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
             for &(power, value) in terms[i].iter().filter(|(power, value)| *value != 0.0 && power.fract() != 0.0) {
-                let jump = at.jumps(&[0.0], &[value * libm::tgamma(power + 1.0)]);
-                add_multiple(&mut out[i], 1.0, &at.kink_corrections(&jump, power, step));
+                let jump = interpolation.jumps(&[0.0], &[value * libm::tgamma(power + 1.0)]);
+                add_multiple(&mut out[i], 1.0, &interpolation.kink_corrections(&jump, power, step));
             }
             let is_known_correction = |k: usize| {
                 let signal = structure.terms[k].signal;
                 self.is_derived(signal) || self.simulation.simulated_output(signal).is_some()
             };
-            let own: Vec<usize> =
+            let autoregressive_terms: Vec<usize> =
                 (0..coefficients.len()).filter(|&k| structure.terms[k].signal == structure.output).collect();
-            for k in (0..coefficients.len()).filter(|&k| is_driven && !own.contains(&k) && !is_known_correction(k)) {
-                let Some((times, sizes)) = recording.jumps(structure.terms[k].signal) else { continue };
-                let jumps = at.jumps(&times.iter().map(|time| time / step).collect::<Vec<_>>(), &sizes);
-                for path in std::iter::once(vec![k]).chain(own.iter().map(|&other| vec![k, other])) {
+            for k in (0..coefficients.len())
+                .filter(|&k| is_driven && !autoregressive_terms.contains(&k) && !is_known_correction(k))
+            {
+                let Some((times, jump_sizes)) = recording.jumps(structure.terms[k].signal) else { continue };
+                let jumps = interpolation.jumps(&times.iter().map(|time| time / step).collect::<Vec<_>>(), &jump_sizes);
+                for path in
+                    std::iter::once(vec![k]).chain(autoregressive_terms.iter().map(|&other_term| vec![k, other_term]))
+                {
                     let order: f64 = path.iter().map(|&k| structure.order - structure.terms[k].order).sum();
                     if order <= ORDER_TOLERANCE || (path.len() > 1 && order >= SMOOTH_INTEGRATION_ORDER) {
                         continue;
                     }
                     let gain: f64 = path.iter().map(|&k| coefficients[k]).product();
-                    add_multiple(&mut out[i], gain, &at.kink_corrections(&jumps, order, step));
+                    add_multiple(&mut out[i], gain, &interpolation.kink_corrections(&jumps, order, step));
                 }
             }
         }

@@ -55,9 +55,10 @@ impl LinearizedProblem {
         residuals: &[f64],
         fixes_kinks: bool,
     ) -> Self {
-        let (mut order, rest): (Vec<usize>, Vec<usize>) = (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
+        let (mut order, other_parameters): (Vec<usize>, Vec<usize>) =
+            (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
         let eliminated_count = order.len();
-        order.extend(rest);
+        order.extend(other_parameters);
         let mut columns = Vec::with_capacity(jacobian.len() + 1);
         let mut scales = Vec::with_capacity(jacobian.len());
         for &i in &order {
@@ -66,30 +67,37 @@ impl LinearizedProblem {
             for (other, slope) in problem.coupled_derivatives(point, i) {
                 column.iter_mut().zip(&jacobian[other]).for_each(|(v, w)| *v += slope * w);
             }
-            let size = norm(&column);
-            let scale = if size > 0.0 { 1.0 / size } else { 0.0 };
+            let column_norm = norm(&column);
+            let scale = if column_norm > 0.0 { 1.0 / column_norm } else { 0.0 };
             column.iter_mut().for_each(|v| *v *= scale);
             columns.push(column);
-            scales.push(size);
+            scales.push(column_norm);
         }
         let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
         columns.push(residuals.to_vec());
-        let scaled = |(down, up): (f64, f64), scale: f64| (down * scale, up * scale);
-        let distance_to_bounds: Vec<(f64, f64)> =
-            order.iter().zip(&scales).map(|(&i, &scale)| scaled(problem.distance_to_bounds(point, i), scale)).collect();
+        let scale_distances = |(lower, upper): (f64, f64), scale: f64| (lower * scale, upper * scale);
+        let distance_to_bounds: Vec<(f64, f64)> = order
+            .iter()
+            .zip(&scales)
+            .map(|(&i, &scale)| scale_distances(problem.distance_to_bounds(point, i), scale))
+            .collect();
         let constraints = (problem.constraints(point).into_iter())
-            .map(|(normal, room)| {
-                let unscaled = |(&i, &scale): (&usize, &f64)| if scale > 0.0 { normal[i] / scale } else { 0.0 };
-                let direction: Vec<f64> = order.iter().zip(&scales).map(unscaled).collect();
-                let size = norm(&direction);
-                let (size, room) = if size > 0.0 { (size, room / size) } else { (1.0, f64::INFINITY) };
-                (direction.iter().map(|v| v / size).collect(), room)
+            .map(|(normal, distance)| {
+                let unscale = |(&i, &scale): (&usize, &f64)| if scale > 0.0 { normal[i] / scale } else { 0.0 };
+                let direction: Vec<f64> = order.iter().zip(&scales).map(unscale).collect();
+                let direction_norm = norm(&direction);
+                let (direction_norm, distance) = if direction_norm > 0.0 {
+                    (direction_norm, distance / direction_norm)
+                } else {
+                    (1.0, f64::INFINITY)
+                };
+                (direction.iter().map(|v| v / direction_norm).collect(), distance)
             })
             .collect();
         let is_fixed = (distance_to_bounds.iter().zip(&gradient).enumerate())
-            .map(|(place, (&(down, up), &g))| {
-                let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
-                out || scales[place] <= 0.0 || (fixes_kinks && problem.has_kinks(point, order[place]))
+            .map(|(column, (&(lower, upper), &g))| {
+                let is_blocked = if g > 0.0 { lower <= 0.0 } else { upper <= 0.0 };
+                is_blocked || scales[column] <= 0.0 || (fixes_kinks && problem.has_kinks(point, order[column]))
             })
             .collect();
         Self {
@@ -123,10 +131,11 @@ impl LinearizedProblem {
     pub(crate) fn active_constraints(&self) -> Vec<(usize, f64)> {
         let is_active = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
         let active: Vec<usize> = (0..self.constraints.len()).filter(is_active).collect();
-        let free = |values: &[f64]| values.iter().zip(&self.is_fixed).map(|(v, f)| if *f { 0.0 } else { *v }).collect();
-        let normals: Vec<Vec<f64>> = active.iter().map(|&k| free(&self.constraints[k].0)).collect();
-        let downhill: Vec<f64> = self.gradient.iter().map(|g| -g).collect();
-        let multipliers = small::nonnegative_solution(&normals, &free(&downhill));
+        let without_fixed =
+            |values: &[f64]| values.iter().zip(&self.is_fixed).map(|(v, f)| if *f { 0.0 } else { *v }).collect();
+        let normals: Vec<Vec<f64>> = active.iter().map(|&k| without_fixed(&self.constraints[k].0)).collect();
+        let descent_direction: Vec<f64> = self.gradient.iter().map(|g| -g).collect();
+        let multipliers = small::nonnegative_solution(&normals, &without_fixed(&descent_direction));
         active.into_iter().zip(multipliers).filter(|(_, multiplier)| *multiplier > 0.0).collect()
     }
 
@@ -165,18 +174,18 @@ impl LinearizedProblem {
         let mut is_fixed = self.is_fixed.clone();
         let mut step = loop {
             let step = step_of(&is_fixed)?;
-            let out = (0..step.len()).find(|&i| {
-                let (down, up) = self.distance_to_bounds[i];
-                !is_fixed[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
+            let blocked_parameter = (0..step.len()).find(|&i| {
+                let (lower, upper) = self.distance_to_bounds[i];
+                !is_fixed[i] && ((step[i] < 0.0 && lower <= 0.0) || (step[i] > 0.0 && upper <= 0.0))
             });
-            match out {
+            match blocked_parameter {
                 Some(i) => is_fixed[i] = true,
                 None => break step,
             }
         };
         step.iter_mut()
             .zip(&self.distance_to_bounds)
-            .for_each(|(s, &(down, up))| *s = s.max(-down.max(0.0)).min(up.max(0.0)));
+            .for_each(|(s, &(lower, upper))| *s = s.max(-lower.max(0.0)).min(upper.max(0.0)));
         Some(step)
     }
 
@@ -186,21 +195,22 @@ impl LinearizedProblem {
     pub(crate) fn predicted_decrease(&self, step: &[f64], first: usize) -> f64 {
         let k = step.len();
         let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
-        let (quadratic, along) = (first..k)
+        let (quadratic, linear) = (first..k)
             .map(|i| (image(i), self.r[i * (k + 1) + k]))
             .fold((0.0, 0.0), |(a, b), (v, e)| (a + v * v, b + v * e));
-        (-2.0 * along - quadratic) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
+        (-2.0 * linear - quadratic) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
     /// Product JᵀJ s of the Gauss–Newton matrix with a step s in coordinates, by parameter.
     ///
     /// The eliminated parameters are projected out.
-    pub(crate) fn columns_along(&self, step: &[f64]) -> Vec<f64> {
+    pub(crate) fn gauss_newton_product(&self, step: &[f64]) -> Vec<f64> {
         let k = self.scales.len();
-        let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
+        let scaled_step: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
         let images: Vec<f64> = (0..k)
             .map(|i| {
-                let image = (i.max(self.eliminated_count)..k).map(|j| self.r[i * (k + 1) + j] * scaled[j]).sum::<f64>();
+                let image =
+                    (i.max(self.eliminated_count)..k).map(|j| self.r[i * (k + 1) + j] * scaled_step[j]).sum::<f64>();
                 if i < self.eliminated_count {
                     0.0
                 } else {
@@ -209,8 +219,8 @@ impl LinearizedProblem {
             })
             .collect();
         let mut out = vec![0.0; k];
-        for (place, (&i, scale)) in self.order.iter().zip(&self.scales).enumerate().skip(self.eliminated_count) {
-            out[i] = scale * (0..=place).map(|l| self.r[l * (k + 1) + place] * images[l]).sum::<f64>();
+        for (column, (&i, scale)) in self.order.iter().zip(&self.scales).enumerate().skip(self.eliminated_count) {
+            out[i] = scale * (0..=column).map(|l| self.r[l * (k + 1) + column] * images[l]).sum::<f64>();
         }
         out
     }
@@ -218,8 +228,8 @@ impl LinearizedProblem {
     /// Gradient of the cost by the coordinates, one value per parameter; 0 for eliminated parameters.
     pub(crate) fn gradient_by_parameter(&self) -> Vec<f64> {
         let mut out = vec![0.0; self.scales.len()];
-        for (place, &i) in self.order.iter().enumerate().skip(self.eliminated_count) {
-            out[i] = self.gradient[place] * self.scales[place];
+        for (column, &i) in self.order.iter().enumerate().skip(self.eliminated_count) {
+            out[i] = self.gradient[column] * self.scales[column];
         }
         out
     }
@@ -243,9 +253,9 @@ impl LinearizedProblem {
             target[a] =
                 -(self.eliminated_count..=i).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + k]).sum::<f64>();
         }
-        let solved = small::positive_solve(&matrix, &target)?;
+        let solution = small::positive_solve(&matrix, &target)?;
         let mut step = vec![0.0; k];
-        free.iter().zip(solved).for_each(|(&i, s)| step[i] = s);
+        free.iter().zip(solution).for_each(|(&i, s)| step[i] = s);
         Some(step)
     }
 
@@ -261,12 +271,12 @@ impl LinearizedProblem {
 
 /// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor `r` of [J | e], with s = 0 for fixed parameters.
 ///
-/// λ is `damping`, except for the first `projected` parameters. These are eliminated and have the damping
+/// λ is `damping`, except for the first `eliminated_count` parameters. These are eliminated and have the damping
 /// [`MIN_DAMPING`]. Each constraint (normal, room) means normal · s ≤ room.
 fn triangular_damped_step(
     r: &[f64],
     is_fixed: &[bool],
-    projected: usize,
+    eliminated_count: usize,
     damping: f64,
     constraints: &[(Vec<f64>, f64)],
 ) -> Vec<f64> {
@@ -277,12 +287,12 @@ fn triangular_damped_step(
     let mut columns: Vec<Vec<f64>> = free
         .iter()
         .enumerate()
-        .map(|(at, &j)| {
+        .map(|(column_index, &j)| {
             let mut column = vec![0.0; k + free.len()];
             for (i, value) in column.iter_mut().enumerate().take(j + 1) {
                 *value = r[i * (k + 1) + j];
             }
-            column[k + at] = if j < projected { MIN_DAMPING } else { damping }.sqrt();
+            column[k + column_index] = if j < eliminated_count { MIN_DAMPING } else { damping }.sqrt();
             column
         })
         .collect();
@@ -294,14 +304,14 @@ fn triangular_damped_step(
     let q = dense::triangular_factor(&columns);
     let stride = free.len() + 1;
     let rhs: Vec<f64> = (0..free.len()).map(|i| q[i * stride + free.len()]).collect();
-    let mut solved = back_substitute(&q, stride, &rhs);
-    let own: Vec<(Vec<f64>, f64)> =
+    let mut solution = back_substitute(&q, stride, &rhs);
+    let free_constraints: Vec<(Vec<f64>, f64)> =
         constraints.iter().map(|(normal, room)| (free.iter().map(|&j| normal[j]).collect(), room.max(0.0))).collect();
-    if own.iter().any(|(normal, room)| inner(normal, &solved) > *room) {
-        solved = constrained_solution(&q, stride, &rhs, &own);
+    if free_constraints.iter().any(|(normal, room)| inner(normal, &solution) > *room) {
+        solution = constrained_solution(&q, stride, &rhs, &free_constraints);
     }
     let mut step = vec![0.0; k];
-    free.iter().zip(solved).for_each(|(&j, s)| step[j] = s);
+    free.iter().zip(solution).for_each(|(&j, s)| step[j] = s);
     step
 }
 
@@ -310,7 +320,7 @@ fn triangular_damped_step(
 /// In z = R x − rhs this is a least-distance problem, which is solved by nonnegative least squares (Lawson & Hanson,
 /// doi:10.1137/1.9781611971217, §23.4).
 fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(Vec<f64>, f64)]) -> Vec<f64> {
-    let (k, size) = (rhs.len(), norm(rhs));
+    let (k, rhs_norm) = (rhs.len(), norm(rhs));
     let unconstrained = back_substitute(r, stride, rhs);
     let columns: Vec<Vec<f64>> = (constraints.iter())
         .filter(|(normal, room)| room.is_finite() && normal.iter().any(|v| *v != 0.0))
@@ -318,23 +328,23 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
             // −R⁻ᵀ normal, followed by the distance from the constraint.
             let mut column: Vec<f64> = Vec::with_capacity(k + 1);
             for i in 0..k {
-                let before: f64 = (0..i).map(|l| r[l * stride + i] * column[l]).sum();
-                column.push((-normal[i] - before) / r[i * stride + i]);
+                let known_sum: f64 = (0..i).map(|l| r[l * stride + i] * column[l]).sum();
+                column.push((-normal[i] - known_sum) / r[i * stride + i]);
             }
-            let length = norm(&column);
-            column.push((inner(normal, &unconstrained) - room) / size);
-            column.iter().map(|v| v / length).collect()
+            let column_norm = norm(&column);
+            column.push((inner(normal, &unconstrained) - room) / rhs_norm);
+            column.iter().map(|v| v / column_norm).collect()
         })
         .collect();
     let mut target = vec![0.0; k + 1];
     target[k] = 1.0;
     let weights = small::nonnegative_solution(&columns, &target);
-    let mut rest: Vec<f64> = target.iter().map(|v| -v).collect();
+    let mut remaining: Vec<f64> = target.iter().map(|v| -v).collect();
     for (column, weight) in columns.iter().zip(&weights) {
-        rest.iter_mut().zip(column).for_each(|(v, c)| *v += weight * c);
+        remaining.iter_mut().zip(column).for_each(|(v, c)| *v += weight * c);
     }
-    let shifted: Vec<f64> = rhs.iter().zip(&rest).map(|(b, v)| b - size * v / rest[k]).collect();
-    back_substitute(r, stride, &shifted)
+    let shifted_rhs: Vec<f64> = rhs.iter().zip(&remaining).map(|(b, v)| b - rhs_norm * v / remaining[k]).collect();
+    back_substitute(r, stride, &shifted_rhs)
 }
 
 /// Nonlinear least-squares problem.
@@ -461,50 +471,52 @@ impl Curvature {
         self.matrix[i * self.count + j]
     }
 
-    fn times(&self, step: &[f64]) -> Vec<f64> {
+    fn product(&self, step: &[f64]) -> Vec<f64> {
         self.matrix.chunks_exact(self.count.max(1)).map(|row| row.iter().zip(step).map(|(a, s)| a * s).sum()).collect()
     }
 
     /// Quadratic form sᵀ B s of this matrix B with a step s: second-order change of twice the cost.
     pub(crate) fn quadratic_form(&self, step: &[f64]) -> f64 {
-        self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
+        self.product(step).iter().zip(step).map(|(a, s)| a * s).sum()
     }
 
     /// Decide whether the next step uses the matrix.
     ///
-    /// `without` and `with` are the predicted relative decreases of the cost, and `fall` is the actual one.
-    pub(crate) fn select_model(&mut self, without: f64, with: f64, fall: f64) {
-        let (missed, missed_with) = ((without - fall).abs(), (with - fall).abs());
+    /// `gauss_newton_decrease` and `curvature_decrease` are the relative decreases of the cost that are predicted
+    /// without and with the matrix. `decrease` is the actual one.
+    pub(crate) fn select_model(&mut self, gauss_newton_decrease: f64, curvature_decrease: f64, decrease: f64) {
+        let (gauss_newton_error, curvature_error) =
+            ((gauss_newton_decrease - decrease).abs(), (curvature_decrease - decrease).abs());
         if self.is_used {
-            self.is_used = missed_with <= MIN_PREDICTION_IMPROVEMENT * missed;
+            self.is_used = curvature_error <= MIN_PREDICTION_IMPROVEMENT * gauss_newton_error;
         } else {
             self.is_used = self.has_update
-                && missed > PREDICTION_TOLERANCE * fall.abs()
-                && MIN_PREDICTION_IMPROVEMENT * missed_with < missed;
+                && gauss_newton_error > PREDICTION_TOLERANCE * decrease.abs()
+                && MIN_PREDICTION_IMPROVEMENT * curvature_error < gauss_newton_error;
         }
     }
 
     /// Update the matrix after a step.
     ///
     /// `change` is the change of the gradient, and `columns` is its part due to JᵀJ.
-    pub(crate) fn update(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
+    pub(crate) fn update(&mut self, step: &[f64], change: &[f64], gauss_newton_change: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-        let target: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
+        let target: Vec<f64> = change.iter().zip(gauss_newton_change).map(|(y, c)| y - c).collect();
         let scale = dot(change, step);
-        let size = dot(step, step).sqrt() * dot(change, change).sqrt();
-        if !(scale.is_finite() && scale.abs() > 1e-6 * size && size > 0.0) {
+        let norm_product = dot(step, step).sqrt() * dot(change, change).sqrt();
+        if !(scale.is_finite() && scale.abs() > 1e-6 * norm_product && norm_product > 0.0) {
             return;
         }
         // Sizing: earlier updates must not exceed the curvature observed along this step.
-        let before = self.quadratic_form(step);
-        let sizing = if before == 0.0 { 1.0 } else { (dot(step, &target) / before).abs().min(1.0) };
+        let previous_form = self.quadratic_form(step);
+        let sizing = if previous_form == 0.0 { 1.0 } else { (dot(step, &target) / previous_form).abs().min(1.0) };
         self.matrix.iter_mut().for_each(|v| *v *= sizing);
-        let missing: Vec<f64> = target.iter().zip(self.times(step)).map(|(w, s)| w - s).collect();
-        let twice = dot(&missing, step) / (scale * scale);
+        let residual: Vec<f64> = target.iter().zip(self.product(step)).map(|(w, s)| w - s).collect();
+        let correction = dot(&residual, step) / (scale * scale);
         for i in 0..self.count {
             for j in 0..self.count {
                 self.matrix[i * self.count + j] +=
-                    (missing[i] * change[j] + change[i] * missing[j]) / scale - twice * change[i] * change[j];
+                    (residual[i] * change[j] + change[i] * residual[j]) / scale - correction * change[i] * change[j];
             }
         }
         self.has_update = self.matrix.iter().all(|v| v.is_finite());
@@ -558,17 +570,17 @@ impl<P> ValleyExtrapolation<P> {
         {
             return None;
         }
-        let last = self.steps.split_off(self.steps.len() - EXTRAPOLATION_STEPS);
+        let last_steps = self.steps.split_off(self.steps.len() - EXTRAPOLATION_STEPS);
         self.steps.clear();
         let norm = |v: &[f64]| v.iter().map(|s| s * s).sum::<f64>().sqrt();
-        let sum: Vec<f64> = (0..last[0].len()).map(|i| last.iter().map(|step| step[i]).sum()).collect();
-        let straight = norm(&sum) >= MIN_STRAIGHTNESS * last.iter().map(|step| norm(step)).sum::<f64>();
-        straight.then(|| sum.iter().map(|s| self.factor * s).collect())
+        let sum: Vec<f64> = (0..last_steps[0].len()).map(|i| last_steps.iter().map(|step| step[i]).sum()).collect();
+        let is_straight = norm(&sum) >= MIN_STRAIGHTNESS * last_steps.iter().map(|step| norm(step)).sum::<f64>();
+        is_straight.then(|| sum.iter().map(|s| self.factor * s).collect())
     }
 
     /// Begin a trial extrapolation. Store the point before it, the cost and the number of evaluations.
-    pub(crate) fn begin_trial(&mut self, from: P, cost: f64, evaluations: usize) {
-        self.trial_start = Some((from, cost, evaluations));
+    pub(crate) fn begin_trial(&mut self, start: P, cost: f64, evaluations: usize) {
+        self.trial_start = Some((start, cost, evaluations));
     }
 
     /// Reject the trial extrapolation: halve the extrapolation factor, to 1 at least, and discard the recorded steps.
@@ -580,18 +592,18 @@ impl<P> ValleyExtrapolation<P> {
     /// Return the point before the trial extrapolation if the trial failed or the search ends during it, else None.
     ///
     /// After a decrease of the cost, the extrapolation factor is doubled.
-    pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
-        let (from, least, since) = self.trial_start.take()?;
-        if cost < least {
+    pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, is_final: bool) -> Option<P> {
+        let (start, start_cost, start_evaluations) = self.trial_start.take()?;
+        if cost < start_cost {
             self.factor = (2.0 * self.factor).min(MAX_EXTRAPOLATION_FACTOR);
             self.steps.clear();
             return None;
         }
-        if ends || evaluations >= since + MAX_TRIAL_EVALUATIONS {
+        if is_final || evaluations >= start_evaluations + MAX_TRIAL_EVALUATIONS {
             self.reject_trial();
-            return Some(from);
+            return Some(start);
         }
-        self.trial_start = Some((from, least, since));
+        self.trial_start = Some((start, start_cost, start_evaluations));
         None
     }
 }

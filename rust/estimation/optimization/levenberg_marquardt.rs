@@ -129,34 +129,34 @@ pub fn minimize<P: LeastSquaresProblem>(
     settings: MinimizationSettings,
 ) -> Result<Minimum<P::Point, P::Evaluation>> {
     let mut search =
-        Search { problem, settings, evaluations: 1, gain: f64::INFINITY, left_domain: false, fixes_kinks: false };
-    let mut at = search.start(start)?;
+        Search { problem, settings, evaluations: 1, gain: f64::INFINITY, has_left_domain: false, fixes_kinks: false };
+    let mut state = search.start(start)?;
     if settings.evaluations == 0 {
-        return Ok(at.into_minimum(1, Status::Exhausted));
+        return Ok(state.into_minimum(1, Status::Exhausted));
     }
-    at.jacobian = search.checked_jacobian(&at.point, &at.evaluation)?;
+    state.jacobian = search.checked_jacobian(&state.point, &state.evaluation)?;
     let mut valley = ValleyExtrapolation::new();
     loop {
-        let ended = match search.advance(&mut at)? {
+        let final_status = match search.advance(&mut state)? {
             Advance::Moved(step, gain) => {
                 valley.record_step(&step, gain);
                 None
             }
             Advance::Ended(status) => Some(status),
         };
-        if let Some(before) = valley.outcome(at.cost, search.evaluations, ended.is_some()) {
-            at = before;
+        if let Some(previous) = valley.outcome(state.cost, search.evaluations, final_status.is_some()) {
+            state = previous;
             search.reset_progress();
             continue;
         }
-        if let Some(status) = ended {
-            return Ok(at.into_minimum(search.evaluations, status));
+        if let Some(status) = final_status {
+            return Ok(state.into_minimum(search.evaluations, status));
         }
         let remaining = if problem.allows_extrapolation() { settings.evaluations - search.evaluations } else { 0 };
-        if let Some(leap) = valley.propose_step(remaining) {
-            if let Some(iterate) = search.evaluate_extrapolation(&at, &leap)? {
-                let from = at.cost;
-                valley.begin_trial(std::mem::replace(&mut at, iterate), from, search.evaluations);
+        if let Some(extrapolation_step) = valley.propose_step(remaining) {
+            if let Some(iterate) = search.evaluate_extrapolation(&state, &extrapolation_step)? {
+                let previous_cost = state.cost;
+                valley.begin_trial(std::mem::replace(&mut state, iterate), previous_cost, search.evaluations);
                 search.reset_progress();
             } else {
                 valley.reject_trial();
@@ -199,7 +199,7 @@ struct Search<'a, P> {
     /// Relative decrease of the cost by the last step.
     gain: f64,
     /// True if the last trial step left the domain of the problem.
-    left_domain: bool,
+    has_left_domain: bool,
     /// True if parameters with kinks are fixed.
     fixes_kinks: bool,
 }
@@ -234,19 +234,23 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
 
     /// Discard the gain of the last step and the flag of the domain limit.
     fn reset_progress(&mut self) {
-        (self.gain, self.left_domain) = (f64::INFINITY, false);
+        (self.gain, self.has_left_domain) = (f64::INFINITY, false);
     }
 
     /// Evaluate an extrapolation step. Return None if it leaves the domain of the problem.
-    fn evaluate_extrapolation(&mut self, from: &SearchState<P>, leap: &[f64]) -> Result<Option<SearchState<P>>> {
-        let next = self.problem.apply_step(&from.point, leap).0;
+    fn evaluate_extrapolation(
+        &mut self,
+        start: &SearchState<P>,
+        extrapolation_step: &[f64],
+    ) -> Result<Option<SearchState<P>>> {
+        let next_point = self.problem.apply_step(&start.point, extrapolation_step).0;
         self.evaluations += 1;
-        let outcome = self.start(next).and_then(|mut iterate| {
+        let outcome = self.start(next_point).and_then(|mut iterate| {
             iterate.jacobian = self.checked_jacobian(&iterate.point, &iterate.evaluation)?;
             Ok(iterate)
         });
         match outcome {
-            Ok(iterate) if iterate.cost.is_finite() && (iterate.is_admissible || !from.is_admissible) => {
+            Ok(iterate) if iterate.cost.is_finite() && (iterate.is_admissible || !start.is_admissible) => {
                 Ok(Some(iterate))
             }
             Ok(_) => Ok(None),
@@ -256,47 +260,48 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
     }
 
     /// Make one step that decreases the cost, or return the reason for termination.
-    fn advance(&mut self, at: &mut SearchState<P>) -> Result<Advance> {
+    fn advance(&mut self, state: &mut SearchState<P>) -> Result<Advance> {
         let (problem, settings) = (self.problem, self.settings);
         // Cosine of the gradient at convergence; its square is a relative decrease of the cost.
-        let flat = settings.tolerance.max(f64::EPSILON).sqrt();
+        let gradient_tolerance = settings.tolerance.max(f64::EPSILON).sqrt();
         loop {
             if self.evaluations >= settings.evaluations {
                 return Ok(Advance::Ended(Status::Exhausted));
             }
             let linear = LinearizedProblem::at(
                 problem,
-                &at.point,
-                &at.jacobian,
-                problem.residuals(&at.evaluation),
+                &state.point,
+                &state.jacobian,
+                problem.residuals(&state.evaluation),
                 self.fixes_kinks,
             );
-            if at.curvature.is_for(at.jacobian.len()) {
-                if let Some((step, gradient)) = at.previous_step_and_gradient.take() {
-                    let now = linear.gradient_by_parameter();
-                    let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
-                    at.curvature.update(&step, &change, &linear.columns_along(&step));
+            if state.curvature.is_for(state.jacobian.len()) {
+                if let Some((step, gradient)) = state.previous_step_and_gradient.take() {
+                    let next_gradient = linear.gradient_by_parameter();
+                    let change: Vec<f64> = next_gradient.iter().zip(&gradient).map(|(a, b)| a - b).collect();
+                    state.curvature.update(&step, &change, &linear.gauss_newton_product(&step));
                 }
             } else {
-                at.curvature = Curvature::new(at.jacobian.len());
+                state.curvature = Curvature::new(state.jacobian.len());
             }
             let slope = linear.max_gradient();
-            let level = slope <= flat * linear.norm;
+            let is_flat = slope <= gradient_tolerance * linear.norm;
             let (newton, decrease) = linear.damped_step_and_decrease(MIN_DAMPING);
-            let is_small_step = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
+            let is_small_step =
+                problem.apply_step(&state.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
             // In a valley, the minimum can be far away although the gradient is small. The predicted decrease is
             // therefore checked as well.
-            if is_small_step || (level && (decrease <= settings.tolerance || self.gain <= settings.tolerance)) {
+            if is_small_step || (is_flat && (decrease <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
-            if self.gain <= settings.tolerance && self.left_domain {
+            if self.gain <= settings.tolerance && self.has_left_domain {
                 return Ok(Advance::Ended(Status::DomainLimit));
             }
-            self.left_domain = false;
-            match self.find_descent_step(at, &linear, (slope, level))? {
+            self.has_left_domain = false;
+            match self.find_descent_step(state, &linear, (slope, is_flat))? {
                 Some(advance) => return Ok(advance),
                 // Fix the parameters with kinks and continue with the others.
-                None => (self.fixes_kinks, at.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
+                None => (self.fixes_kinks, state.damping, self.gain) = (true, INITIAL_DAMPING, f64::INFINITY),
             }
         }
     }
@@ -306,29 +311,30 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
     /// Return None if parameters with kinks must be fixed first.
     fn find_descent_step(
         &mut self,
-        at: &mut SearchState<P>,
+        state: &mut SearchState<P>,
         linear: &LinearizedProblem,
-        (slope, level): (f64, bool),
+        (slope, is_flat): (f64, bool),
     ) -> Result<Option<Advance>> {
         let (problem, settings) = (self.problem, self.settings);
         loop {
-            let curved = if at.curvature.is_used { linear.curved_step(at.damping, &at.curvature) } else { None };
-            if at.curvature.is_used && curved.is_none() && at.damping <= MAX_DAMPING {
-                at.damping *= DAMPING_FACTOR;
+            let curved_step =
+                if state.curvature.is_used { linear.curved_step(state.damping, &state.curvature) } else { None };
+            if state.curvature.is_used && curved_step.is_none() && state.damping <= MAX_DAMPING {
+                state.damping *= DAMPING_FACTOR;
                 continue;
             }
-            let first = if curved.is_some() { linear.eliminated_count } else { 0 };
-            let (step, decrease) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
+            let first_column = if curved_step.is_some() { linear.eliminated_count } else { 0 };
+            let (step, decrease) = curved_step.unwrap_or_else(|| linear.damped_step_and_decrease(state.damping));
             let steps = linear.to_coordinates(&step);
-            let (next, change) = problem.apply_step(&at.point, &steps);
-            if change <= settings.tolerance || at.damping > MAX_DAMPING {
+            let (next_point, change) = problem.apply_step(&state.point, &steps);
+            if change <= settings.tolerance || state.damping > MAX_DAMPING {
                 // No step decreases the cost. The point has converged, or is at rounding level, at the domain limit or
                 // at a kink.
-                return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
+                return Ok(if is_flat || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&state.evaluation) {
                     Some(Advance::Ended(Status::Converged))
-                } else if self.left_domain {
+                } else if self.has_left_domain {
                     Some(Advance::Ended(Status::DomainLimit))
-                } else if !self.fixes_kinks && (0..linear.scales.len()).any(|i| problem.has_kinks(&at.point, i)) {
+                } else if !self.fixes_kinks && (0..linear.scales.len()).any(|i| problem.has_kinks(&state.point, i)) {
                     None
                 } else {
                     Some(Advance::Ended(Status::Stalled))
@@ -338,40 +344,45 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 return Ok(Some(Advance::Ended(Status::Exhausted)));
             }
             self.evaluations += 1;
-            let is_admissible = problem.is_admissible(&next);
+            let is_admissible = problem.is_admissible(&next_point);
             // A step that does not decrease the cost or overflows is shortened.
-            let trial = problem.evaluate(&next).and_then(|trial_evaluation| {
-                let reached = cost(problem.residuals(&trial_evaluation));
-                if !reached.is_finite() || (at.is_admissible && !is_admissible) {
+            let trial = problem.evaluate(&next_point).and_then(|trial_evaluation| {
+                let trial_cost = cost(problem.residuals(&trial_evaluation));
+                if !trial_cost.is_finite() || (state.is_admissible && !is_admissible) {
                     return Err(Error::Diverged { what: "step".into(), index: 0 });
                 }
-                if reached >= at.cost {
+                if trial_cost >= state.cost {
                     return Ok(None);
                 }
-                let settled = problem.point_of_evaluation(&trial_evaluation, next.clone());
-                Ok(Some((self.checked_jacobian(&settled, &trial_evaluation)?, trial_evaluation, reached, settled)))
+                let trial_point = problem.point_of_evaluation(&trial_evaluation, next_point.clone());
+                Ok(Some((
+                    self.checked_jacobian(&trial_point, &trial_evaluation)?,
+                    trial_evaluation,
+                    trial_cost,
+                    trial_point,
+                )))
             });
             match trial {
-                Ok(Some((slopes, trial_evaluation, reached, next))) => {
-                    self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
-                    (at.point, at.evaluation, at.cost, at.jacobian, at.is_admissible) =
-                        (next, trial_evaluation, reached, slopes, is_admissible);
-                    let predicted = linear.predicted_decrease(&step, first);
+                Ok(Some((jacobian, trial_evaluation, trial_cost, next_point))) => {
+                    self.gain = (state.cost - trial_cost) / state.cost.max(f64::MIN_POSITIVE);
+                    (state.point, state.evaluation, state.cost, state.jacobian, state.is_admissible) =
+                        (next_point, trial_evaluation, trial_cost, jacobian, is_admissible);
+                    let predicted = linear.predicted_decrease(&step, first_column);
                     if !linear.is_constrained() {
-                        let with = predicted - linear.curvature_change(&step, &at.curvature);
-                        at.curvature.select_model(predicted, with, self.gain);
+                        let predicted_with_curvature = predicted - linear.curvature_change(&step, &state.curvature);
+                        state.curvature.select_model(predicted, predicted_with_curvature, self.gain);
                     }
-                    at.previous_step_and_gradient = Some((steps.clone(), linear.gradient_by_parameter()));
+                    state.previous_step_and_gradient = Some((steps.clone(), linear.gradient_by_parameter()));
                     if self.gain >= ACCEPTABLE_GAIN_RATIO * decrease {
-                        at.damping = (at.damping / DAMPING_FACTOR).max(MIN_DAMPING);
+                        state.damping = (state.damping / DAMPING_FACTOR).max(MIN_DAMPING);
                     }
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
-                Ok(None) => self.left_domain = false,
-                Err(error) if error.ends_simulation() => self.left_domain = true,
+                Ok(None) => self.has_left_domain = false,
+                Err(error) if error.ends_simulation() => self.has_left_domain = true,
                 Err(error) => return Err(error),
             }
-            at.damping *= DAMPING_FACTOR;
+            state.damping *= DAMPING_FACTOR;
         }
     }
 }
