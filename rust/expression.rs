@@ -290,7 +290,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_and_derivatives_are_those_of_differences() -> Result<()> {
+    fn expression_derivatives_match_differences() -> Result<()> {
         let product = vec![Channel(0), Power(3.0), Channel(1), Multiply, Constant(2.0), Add];
         let nested =
             [Channel(0), Apply(Function::Sin), Channel(1), Apply(Function::Exp), Multiply, Apply(Function::Tanh)];
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn programs_that_are_no_expression_are_refused() {
+    fn invalid_expressions_are_rejected() {
         for program in
             [vec![], vec![Add], vec![Channel(0), Channel(0)], vec![Channel(1)], vec![Constant(f64::NAN)], vec![Negate]]
         {

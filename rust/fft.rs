@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn long_plans_are_forgotten_that_nobody_asks_for() {
+    fn unused_long_plans_are_evicted() {
         let mut plans = Plans::new();
         let (short, long, next) = (64, MAX_CACHED_PLAN_POINTS / 2, MAX_CACHED_PLAN_POINTS / 2 + 2);
         let insert = |plans: &mut Plans, len| plans.insert(Plan::new(len)).1.len();
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn of_two_plans_of_a_length_the_first_is_kept() {
+    fn first_of_two_plans_of_a_length_is_kept() {
         let mut plans = Plans::new();
         let (first, _) = plans.insert(Plan::new(64));
         let (first_plan, dropped) = plans.insert(Plan::new(64));
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lock_that_is_never_given_back_stops_no_plan() {
+    fn locked_cache_does_not_block_plans() {
         for len in [90, MAX_PERMANENT_PLAN_POINTS + 2] {
             let (first, second) = SHARED_PLANS.hold_during(|| (plan(len), plan(len)));
             assert!(is_sound(&first));

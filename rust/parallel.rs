@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     #[allow(clippy::panic)]
-    fn a_lock_that_is_held_is_done_without() {
+    fn unavailable_lock_is_bypassed() {
         let shared = ForkSafeLock::new(3);
         assert_eq!(shared.with(|value| *value), Some(3));
         assert_eq!(shared.hold_during(|| shared.with(|value| *value)), None);

@@ -527,7 +527,7 @@ mod tests {
     }
 
     #[test]
-    fn slow_poles_keep_their_digits_beside_fast_ones() {
+    fn slow_poles_are_accurate_beside_fast_ones() {
         for fast in [1e1, 1e4, 1e8, 1e12] {
             for slow in [1.0, 1e-3, 1e-6] {
                 let root = f64::sqrt(fast * slow);
@@ -544,7 +544,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nilpotent_chain_has_powers_over_factorials() {
+    fn nilpotent_chain_has_powers_over_factorials() {
         let mut chain = vec![0.0; 16];
         (0..3).for_each(|i| chain[5 * i + 1] = 1.0);
         let entries = Transition::new(&chain, 4, 0.5).map(|t| [t.transition_increment[3], t.first[3], t.second[3]]);
@@ -553,13 +553,13 @@ mod tests {
     }
 
     #[test]
-    fn growth_beyond_the_range_of_numbers_has_no_transition() {
+    fn overflowing_transition_is_none() {
         assert!(Transition::new(&[1e3], 1, 1.0).is_none());
         assert!(Transition::new(&[-1e300], 1, 1.0).is_some());
         assert!(Transition::new(&[f64::INFINITY], 1, 1.0).is_none());
     }
     #[test]
-    fn a_stop_ends_the_recursion() {
+    fn stop_request_ends_the_recursion() {
         let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
         let samples = vec![1.0; 5];
         let ramp = [InputSignal { signal: 1, samples, intersample: Intersample::Hold, delay: 0.0, before: 0.0 }];

@@ -184,7 +184,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lock_that_is_never_given_back_stops_no_table() {
+    fn locked_cache_does_not_block_tables() {
         static SHARED_TABLE: ForkSafeLock<Values<usize>> = ForkSafeLock::new(None);
         thread_local!(static THREAD_TABLE: RefCell<Values<usize>> = const { RefCell::new(None) });
         let table = Table { shared: &SHARED_TABLE, thread_values: &THREAD_TABLE, make: |len| (0..len).collect() };

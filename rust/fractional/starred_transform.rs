@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_return_from_their_transform() {
+    fn transform_and_inverse_return_the_samples() {
         let samples: Vec<f64> = (0..77).map(|k| f64::from(k).sin()).collect();
         let transform = StarredTransform::new(77, 0.1);
         let back = transform.samples(transform.transform(samples.iter().copied()));

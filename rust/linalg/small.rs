@@ -568,7 +568,7 @@ mod tests {
     }
 
     #[test]
-    fn window_sums_give_the_steps_of_its_rows() -> Result<()> {
+    fn window_sums_match_naive_steps() -> Result<()> {
         let noise = |i: usize, j: usize| libm::sin((i * i + 7 * i * j + 3) as f64 * 0.7310 + j as f64);
         for (k, length, forgetting) in
             [(1, 1, 1.0), (3, 1, 0.95), (3, 2, 1.0), (4, 7, 0.9), (2, 20, 1.0), (5, 200, 0.99)]

@@ -301,7 +301,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn initial_values_leave_no_power_that_caputo_derivatives_lack() -> Result<()> {
+    fn initial_values_have_the_powers_of_caputo_derivatives() -> Result<()> {
         // D² y = −c D^0.6 y from y = 3 + 2 t: y is 3 + 2 t plus −c I^1.4 (y − 3), whose 3 t^1.4 cancels.
         let links = vec![vec![Link { output: 0, order: 0.6, integration: 1.4, coefficient: -0.7 }]];
         let taken = 0.7 * 3.0 / libm::tgamma(2.4);

@@ -278,7 +278,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_left_of_a_limit_is_never_below_nothing() {
+    fn remaining_limit_is_not_negative() {
         let mut budget = Budget::default();
         assert_eq!(budget.remaining_bytes(u64::MAX), u64::MAX);
         budget.add_layout(1000);

@@ -179,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn products_of_transforms_are_middle_products() {
+    fn transform_products_match_middle_products() {
         let term = |k: usize| f64::from(u32::try_from(k * k % 17).unwrap_or(0)) - 8.0;
         for length in [1, BLOCK_TERMS - 1, BLOCK_TERMS, BLOCK_TERMS + 1, 2 * BLOCK_TERMS - 1, 2 * BLOCK_TERMS] {
             let block: Vec<f64> = (0..BLOCK_TERMS).map(term).collect();

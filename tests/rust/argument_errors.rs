@@ -35,7 +35,7 @@ fn refused<T>(result: Result<T, Error>) {
 }
 
 #[test]
-fn lengths_beyond_memory() {
+fn lengths_above_memory_are_rejected() {
     for m in [MAX_POINTS + 1, 1 << 31, 1 << 60, usize::MAX] {
         refused(check_points("m", m));
         refused(check_dense(m));
@@ -50,7 +50,7 @@ fn lengths_beyond_memory() {
 }
 
 #[test]
-fn equations_that_miss_something() {
+fn incomplete_equations_are_rejected() {
     let s = structure(0, 2.0, &[(0, 1.0), (1, 0.0)]);
     refused(Equation::new(s.clone(), vec![1.0]));
     refused(Equation::new(s.clone(), vec![1.0, f64::NAN]));
@@ -85,7 +85,7 @@ fn equations_that_miss_something() {
 }
 
 #[test]
-fn regressions_that_cannot_be_made() {
+fn invalid_regressions_are_rejected() {
     let run = [record(0.1, vec![vec![0.5; 20], vec![1.0; 20]])];
     let there = structure(0, 1.0, &[(1, 0.0)]);
     refused(Regression::new(&run, &structure(0, 1.0, &[(7, 0.0)]), &[None], &Initial::Rest).map(|_| ()));
@@ -129,7 +129,7 @@ fn regressions_that_cannot_be_made() {
 }
 
 #[test]
-fn a_solution_of_another_regression() {
+fn solution_of_another_size_is_rejected() {
     let run = [record(0.1, vec![(0..20).map(f64::from).collect(), vec![1.0; 20]])];
     let initial = Initial::Powers(vec![0.0]);
     let regression = Regression::new(&run, &structure(0, 1.0, &[(1, 0.0)]), &[None], &initial).unwrap();
@@ -155,7 +155,7 @@ fn free_model(order: AffineOrder, own: AffineOrder, bounds: (f64, f64)) -> FreeM
 }
 
 #[test]
-fn free_orders_out_of_all_bounds() {
+fn free_orders_out_of_bounds_are_rejected() {
     let law = |constant, weights: &[f64]| AffineOrder { constant, weights: weights.to_vec() };
     let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
     let experiments = [Experiment::new(run, 1, vec![vec![0.0; 21]], vec![1.0]).unwrap()];
@@ -184,7 +184,7 @@ fn free_orders_out_of_all_bounds() {
 }
 
 #[test]
-fn a_joint_structure_of_signals_that_are_not_there() {
+fn joint_structure_with_missing_signals_is_rejected() {
     let made = |output, signal| {
         let order = joint::Order::number(0.0);
         let term =
@@ -203,7 +203,7 @@ fn a_joint_structure_of_signals_that_are_not_there() {
 }
 
 #[test]
-fn integrals_beyond_the_range_of_numbers() {
+fn overflowing_integrals_are_rejected() {
     let x = [1.0, -2.0, 3.0, 0.0, 1.0];
     for rule in [IntegralRule::BlockPulse, IntegralRule::Trapezoidal, IntegralRule::GrunwaldLetnikov] {
         for order in [1.5, 10.0] {
@@ -217,7 +217,7 @@ fn integrals_beyond_the_range_of_numbers() {
 }
 
 #[test]
-fn streams_that_cannot_run() {
+fn invalid_streams_are_rejected() {
     let s = structure(0, 1.0, &[(1, 0.0)]);
     let stream = |length, prior, s: &ftlm::equation::Structure, fixed: Option<f64>| {
         let options = StreamingOptions { length, prior: Prior::Absolute(prior), ..StreamingOptions::default() };
@@ -233,7 +233,7 @@ fn streams_that_cannot_run() {
 }
 
 #[test]
-fn experiments_that_cannot_be_compared() {
+fn incomparable_experiments_are_rejected() {
     let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
     let experiment =
         |every, samples: Vec<f64>, weight| Experiment::new(run.clone(), every, vec![samples], vec![weight]);
@@ -250,7 +250,7 @@ fn experiments_that_cannot_be_compared() {
 }
 
 #[test]
-fn numbers_that_are_none() {
+fn nan_arguments_are_rejected() {
     refused(pulse_means(&[0.0, f64::NAN], 2, Intersample::Linear));
     refused(delay_samples(&[0.0, f64::NAN], 1.0, 0.0));
     refused(delay_samples(&[0.0, 1.0], 1.0, f64::NAN));
@@ -291,7 +291,7 @@ fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
 }
 
 #[test]
-fn an_arm_that_cannot_be_stepped_is_refused() {
+fn arm_without_a_valid_step_is_rejected() {
     let made =
         |equations: Vec<Equation>, coulomb: [f64; 2]| Arm::new(&Parameters { equations, coulomb }, 0.002, 1e-4, 10.0);
     assert!(made(arm_equations(), [0.0; 2]).is_ok());
@@ -336,7 +336,7 @@ fn sensors() -> Sensors {
 }
 
 #[test]
-fn an_arm_that_would_never_end() {
+fn arm_simulation_without_an_end_is_rejected() {
     refused(arm(0.002, 1e-3, f64::NAN));
     refused(arm(0.002, 1e-3, f64::INFINITY));
     refused(arm(1.0, 1e-12, 5.0));

@@ -36,7 +36,7 @@ fn entries(text: &str) -> Vec<(String, String)> {
 }
 
 #[test]
-fn every_entry_goes_through_a_wrapper() {
+fn every_python_function_uses_a_wrapper() {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("rust/python");
     let mut count = 0;
     let searches = ["order_search/grid_search.rs", "order_search/stage.rs"];
@@ -60,7 +60,7 @@ fn every_entry_goes_through_a_wrapper() {
 }
 
 #[test]
-fn nothing_but_the_wrappers_lets_go_of_python_or_catches_panics() {
+fn only_wrappers_release_the_gil_and_catch_panics() {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("rust/python");
     for file in ["convert.rs", "estimation.rs", "mod.rs", "operators.rs", "simulation.rs", "virtual_arm.rs"] {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();

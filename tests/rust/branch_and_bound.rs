@@ -52,7 +52,7 @@ fn problem(random: &mut Random) -> (Vec<Record>, OrderGrid) {
 }
 
 #[test]
-fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
+fn box_bounds_do_not_exceed_candidate_scores() {
     let mut random = Random::new(901);
     let (mut boxes, mut telling, mut large, mut best) = (0, 0, 0, 0.0_f64);
     let (mut asked, mut open) = (0, 0);

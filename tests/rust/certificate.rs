@@ -111,7 +111,7 @@ fn problem(random: &mut Random, most: usize) -> Vec<Record> {
 }
 
 #[test]
-fn no_bound_of_a_cell_exceeds_what_any_of_its_orders_leave() {
+fn cell_bounds_do_not_exceed_residuals_of_their_orders() {
     let mut random = Random::new(1201);
     let (mut points, mut cells, mut telling, mut tight, mut most) = (0, 0, [0, 0], 0, [0.0_f64; 2]);
     for _ in 0..40 {
@@ -175,7 +175,7 @@ fn region() -> Region {
 }
 
 #[test]
-fn no_orders_of_a_region_do_better_than_is_proved() {
+fn certificate_bounds_all_orders_of_a_region() {
     let mut random = Random::new(1202);
     let (mut drawn, mut best_share) = (0, 0.0_f64);
     for case in 0..4 {
@@ -245,7 +245,7 @@ fn threads_change_no_bit_and_cells_that_are_not_allowed_are_said() {
 }
 
 #[test]
-fn what_is_no_region_is_refused() {
+fn invalid_regions_are_rejected() {
     let mut random = Random::new(1204);
     let records = problem(&mut random, 40);
     let of = |region: &Region, within: f64| {

@@ -92,7 +92,7 @@ fn dense_step(noisy: &Record, start: &[Equation; 2], fixed: &[Vec<Option<f64>>; 
 }
 
 #[test]
-fn one_step_of_both_equations_is_that_of_full_matrices() {
+fn one_step_of_both_equations_matches_full_matrices() {
     let (_, noisy) = measured(120, 0.02, &[vec![], vec![]], 3);
     let mut start = pair();
     for (k, factor) in [1.05, 0.93, 0.96].into_iter().enumerate() {
@@ -150,7 +150,7 @@ fn exact_data_of_several_records_with_initial_terms_is_a_fixed_point() {
 }
 
 #[test]
-fn where_the_steps_stand_still_the_likelihood_does_too() {
+fn likelihood_is_stationary_at_convergence() {
     let (_, noisy) = measured(900, 0.05, &[vec![], vec![]], 11);
     let noisy = projected(&noisy, true);
     let truth = pair();
@@ -192,7 +192,7 @@ fn where_the_steps_stand_still_the_likelihood_does_too() {
 }
 
 #[test]
-fn scores_have_the_spread_that_the_covariance_says() {
+fn scores_have_the_stated_covariance() {
     let truth = pair();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let mut scores = vec![Vec::new(); 6];
@@ -226,7 +226,7 @@ fn scores_have_the_spread_that_the_covariance_says() {
 }
 
 #[test]
-fn a_start_that_grows_is_left_alone() {
+fn unstable_start_is_unchanged() {
     let (_, noisy) = measured(400, 0.02, &[vec![], vec![]], 17);
     let truth = pair();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];

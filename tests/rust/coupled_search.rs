@@ -137,7 +137,7 @@ fn the_law_lattice_is_the_product_of_its_axes() {
 }
 
 #[test]
-fn tuples_that_make_no_equation_are_left_out() {
+fn tuples_without_a_valid_equation_are_omitted() {
     let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let accepted = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).count();
     // By hand: beta1 = a1 - a2 - g1 + b2 + m2 may not be negative; all else is in range on these axes.
@@ -158,7 +158,7 @@ fn tuples_that_make_no_equation_are_left_out() {
 }
 
 #[test]
-fn empty_and_oversized_law_lattices_are_refused() {
+fn empty_and_oversized_law_grids_are_rejected() {
     let mut none = axes();
     none[3].clear();
     match OrderLawGrid::new(&none, &two_link(), &INPUTS) {
@@ -273,7 +273,7 @@ fn random_laws(random: &mut Random, free: usize, outputs: &[usize]) -> Vec<LawEq
 }
 
 #[test]
-fn any_law_is_joined_as_it_is_enumerated() {
+fn join_of_any_order_law_matches_enumeration() {
     let mut random = Random::new(80);
     let (mut tuples, mut shared, mut worst) = (0, 0, 0.0_f64);
     for round in 0..90 {
@@ -363,7 +363,7 @@ fn early_stopping_and_threads_change_nothing() {
 }
 
 #[test]
-fn candidates_may_be_followed_in_any_pieces_and_order() {
+fn candidates_can_be_simulated_in_any_blocks_and_order() {
     let records = [data(128, 0.02, 6)];
     let lattice = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
     let (options, control) = (options(), Control::default());
@@ -403,7 +403,7 @@ fn candidates_may_be_followed_in_any_pieces_and_order() {
 }
 
 #[test]
-fn the_truth_is_found_under_its_law() {
+fn true_orders_are_found_under_their_law() {
     let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let found = run(&[data(600, 0.0, 70)], &lattice, &options());
     assert_eq!(found.rows[0].free, [2.0, 2.0, 0.95, 0.1, 0.85]);
@@ -457,7 +457,7 @@ fn singular_and_diverged_tuples_are_counted() {
 }
 
 #[test]
-fn a_stage_search_ends_when_told_to_and_checks_its_arguments() {
+fn coupled_search_ends_after_a_stop_request_and_checks_its_arguments() {
     let lattice = OrderLawGrid::new(&axes(), &two_link(), &INPUTS).unwrap();
     let records = [data(100, 0.01, 73)];
     let control = Control::default();

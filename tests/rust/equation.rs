@@ -13,7 +13,7 @@ fn checked(structure: &Structure) -> Result<(), Error> {
 }
 
 #[test]
-fn orders_that_make_an_equation_pass() {
+fn valid_orders_are_accepted() {
     for good in [
         structure(0, 2.0, &[(0, 1.9), (0, 0.0), (1, 2.0), (1, 0.0), (2, 0.0), (2, -3.0), (2, 2.0), (1, 2.9), (2, 2.9)]),
         structure(1, 3.0, &[(1, 2.99), (0, 3.0)]),
@@ -24,7 +24,7 @@ fn orders_that_make_an_equation_pass() {
 }
 
 #[test]
-fn orders_that_make_no_equation_are_named() {
+fn invalid_orders_are_reported() {
     let refused = |s: &Structure, name: &str, value: f64, range: &str| match checked(s) {
         Err(Error::OutOfRange { name: n, value: v, range: r, .. }) => {
             assert_eq!((n.as_str(), r.as_str()), (name, range));
@@ -55,7 +55,7 @@ fn orders_that_make_no_equation_are_named() {
 }
 
 #[test]
-fn orders_are_kept_to_the_grain() {
+fn orders_are_rounded_to_the_order_resolution() {
     assert_eq!(round_order(0.1 + 0.2).to_bits(), 0.3_f64.to_bits());
     assert_eq!(grains(1.95), 1_950_000_000);
     assert_eq!(grains(-0.05), -50_000_000);
@@ -94,7 +94,7 @@ fn from_one(m: usize) -> (Equation, ftlm::regressors::Record) {
 }
 
 #[test]
-fn an_offset_is_one_more_power_of_time_under_every_kind_of_initial_terms() {
+fn offset_adds_one_power_of_time_for_every_kind_of_initial_terms() {
     let plant = structure(0, 0.8, &[(0, 0.3), (2, 0.0)]);
     for (base, before) in
         [(Initial::Rest, vec![]), (Initial::Caputo, vec![0.0, 0.5]), (Initial::Powers(vec![0.0, 0.8]), vec![0.0, 0.8])]
@@ -116,7 +116,7 @@ fn an_offset_is_one_more_power_of_time_under_every_kind_of_initial_terms() {
 }
 
 #[test]
-fn a_record_not_from_rest_needs_the_fractional_initial_term() {
+fn nonzero_initial_state_needs_the_fractional_initial_term() {
     for m in [500, 2048] {
         let (model, record) = from_one(m);
         let size = deviation(record.signal(0)) * (m as f64).sqrt();
@@ -189,7 +189,7 @@ fn the_low_pass_has_its_exact_step_response() {
 }
 
 #[test]
-fn improper_filters_are_refused() {
+fn improper_filters_are_rejected() {
     let mut filter = low_pass();
     filter.numerator.push((1.0, 2.5));
     assert!(matches!(filter.series(10, 0.1), Err(Error::OutOfRange { value, .. }) if value == 2.5));
@@ -208,7 +208,7 @@ proptest! {
     #![proptest_config(cases(256))]
 
     #[test]
-    fn tidying_is_idempotent_and_near(order in -6.0..6.0_f64) {
+    fn rounding_of_orders_is_idempotent_and_close(order in -6.0..6.0_f64) {
         let tidied = round_order(order);
         prop_assert!((tidied - order).abs() <= 0.51e-9);
         prop_assert_eq!(round_order(tidied).to_bits(), tidied.to_bits());

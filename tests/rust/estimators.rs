@@ -54,7 +54,7 @@ fn coefficients_of_exact_data_are_recovered() {
 }
 
 #[test]
-fn fixed_coefficients_stay_and_help() {
+fn fixed_coefficients_stay_and_the_others_are_recovered() {
     let model = damped();
     let record = obeying(&model, 600, 0.01, &[], 0.0, 43);
     for fixed in [
@@ -122,7 +122,7 @@ fn a_record_through_a_sensor_filter_keeps_its_equation() {
 }
 
 #[test]
-fn the_regression_is_what_the_equation_says() {
+fn regression_matches_the_equation() {
     let model = damped();
     let records = [obeying(&model, 100, 0.01, &[], 0.1, 47), obeying(&model, 60, 0.02, &[], 0.1, 48)];
     let fixed = [None, Some(-10.0), None, None];
@@ -182,7 +182,7 @@ fn dependent_terms_are_named_and_dependent_initial_terms_dropped() {
 }
 
 #[test]
-fn what_cannot_be_fitted_is_refused() {
+fn unfittable_problems_are_rejected() {
     let model = damped();
     let record = obeying(&model, 50, 0.01, &[], 0.0, 50);
     let refused = Error::Length { name: "fixed coefficients".into(), expected: 4, found: 3 };
@@ -320,7 +320,7 @@ fn the_recursion_ends_at_the_closed_form() {
 }
 
 #[test]
-fn every_row_weighs_as_often_as_it_is_used() {
+fn row_weight_equals_its_number_of_uses() {
     let innovation = |length| Innovation { length, prior: Prior::Absolute(1.0), row_basis: RowBasis::Time };
     let weights = |length, m| (0..m).map(|i| innovation(length).weight(i, m)).collect::<Vec<_>>();
     assert_eq!(weights(1, 4), [1, 1, 1, 1]);
@@ -353,7 +353,7 @@ fn every_row_weighs_as_often_as_it_is_used() {
 }
 
 #[test]
-fn innovation_length_and_coordinates_are_all_one_without_a_prior() {
+fn estimate_without_prior_is_independent_of_innovation_length_and_coordinates() {
     let model = damped();
     let record = obeying(&model, 512, 0.01, &[], 0.02, 61);
     let records = std::slice::from_ref(&record);
@@ -423,7 +423,7 @@ fn banks_hold_the_integrals() {
 }
 
 #[test]
-fn a_bank_beyond_memory_is_refused_before_it_is_made() {
+fn bank_above_the_memory_limit_is_rejected_before_allocation() {
     let m = 1 << 20;
     let record = record(1.0, vec![vec![0.0; m]]);
     let mut index = Index::default();
@@ -523,7 +523,7 @@ impl simd::SimdKernel for Dot<'_> {
 }
 
 #[test]
-fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
+fn simd_lanes_are_independent_of_each_other_and_of_the_instruction_set() {
     let mut random = Random::new(65);
     for k in 1..9 {
         let mut systems: Vec<(Vec<f64>, Vec<f64>)> = (0..LANE_COUNT)

@@ -97,7 +97,7 @@ fn a_recording_gives_its_jumps_within_pulses() -> Result<(), Error> {
 }
 
 #[test]
-fn jumps_that_are_not_within_pulses_are_refused() -> Result<(), Error> {
+fn jumps_outside_pulses_are_rejected() -> Result<(), Error> {
     let plain = Record::new(0.1, PulseMeans::from_signals(vec![vec![0.0; 4]; 2]), None)?;
     let jump = |pulse, share| PulseJump { pulse, fraction: share, before: 0.0, after: 1.0 };
     for wrong in [

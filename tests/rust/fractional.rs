@@ -361,7 +361,7 @@ fn orders_zero_and_whole() {
 }
 
 #[test]
-fn a_riemann_liouville_derivative_is_infinite_where_it_is() {
+fn riemann_liouville_derivative_is_infinite_at_the_start() {
     let x = Function::Decay.samples(100);
     let found = fractional_derivative(&x, 0.5, 0.1, Derivative::RiemannLiouville, &[]).unwrap();
     assert!(found[0].is_infinite() && found[1..].iter().all(|v| v.is_finite()));
@@ -370,7 +370,7 @@ fn a_riemann_liouville_derivative_is_infinite_where_it_is() {
 }
 
 #[test]
-fn bad_arguments_are_refused_with_their_values() {
+fn invalid_arguments_are_rejected_with_their_values() {
     let x = [1.0, 2.0, 3.0, 4.0];
     let rule = IntegralRule::BlockPulse;
     for eta in [-0.1, 10.001, f64::NAN] {

@@ -37,7 +37,7 @@ fn assert_plain_sums(kernel: &ConvolutionKernel, signal: &[f64], tolerance: f64)
 }
 
 #[test]
-fn sums_over_the_past_are_the_plain_ones() {
+fn history_sums_match_plain_sums() {
     assert_plain_sums(&ConvolutionKernel::new(force(1000)), &force(1500).split_off(500), 1e-10);
     for order in [0.0, 1.0, 2.0, 3.0, 0.7] {
         let values = ftlm::fractional::kernels::kernel(order, 1000, 0.01);
@@ -140,7 +140,7 @@ fn slopes_of_a_pulse_are_those_of_differences() {
 }
 
 #[test]
-fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
+fn invalid_speed_is_rejected() -> Result<(), Error> {
     let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
     for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
         let mut wrong = body(1.8, 0.5);
@@ -154,7 +154,7 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
 }
 
 #[test]
-fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
+fn body_that_never_slides_stays_in_place() -> Result<(), Error> {
     let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 400], force(400)]), None)?;
     let motion = body(2.0, 2.5).run(&record, &[vec![(0.0, 0.7), (1.0, 0.7)]])?;
     assert!(motion.bodies[0].velocity.iter().all(|v| *v == 0.0));
@@ -163,7 +163,7 @@ fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
 }
 
 #[test]
-fn its_numbers_are_found_again() -> Result<(), Error> {
+fn parameters_are_recovered() -> Result<(), Error> {
     let m = 600;
     let record = Record::new(0.02, PulseMeans::from_signals(vec![vec![0.0; m], force(m)]), None)?;
     let truth = body(1.9, 0.8);
@@ -224,7 +224,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
 }
 
 #[test]
-fn what_has_no_velocity_is_refused() -> Result<(), Error> {
+fn friction_without_velocity_is_rejected() -> Result<(), Error> {
     let record = Record::new(0.01, PulseMeans::from_signals(vec![vec![0.0; 50], vec![1.0; 50]]), None)?;
     for wrong in [body(1.0, 0.5), body(2.3, 0.5), body(2.0, -0.5)] {
         assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
@@ -287,7 +287,7 @@ fn consistent(most: &[f64], p: &[f64], gains: &[f64]) -> Vec<Vec<f64>> {
 }
 
 #[test]
-fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
+fn exactly_one_combination_of_resting_bodies_is_consistent() {
     let mut random = Random::new(5);
     let (mut tried, mut kinds) = (0, std::collections::HashSet::new());
     while tried < 4000 {
@@ -327,7 +327,7 @@ fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
 }
 
 #[test]
-fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
+fn contact_solution_is_independent_of_its_start() {
     let mut random = Random::new(6);
     let mut seen = std::collections::HashSet::new();
     for case in 0..3000 {

@@ -71,7 +71,7 @@ fn a_limit_removes_only_what_exceeds_it_and_threads_change_no_bit() {
 }
 
 #[test]
-fn orders_that_make_no_equation_are_infinitely_bad_and_bad_numbers_are_refused() {
+fn invalid_orders_have_infinite_error_and_nan_is_rejected() {
     let (record, points) = setting(100);
     let mut fast = made(vec![record], Norm::L1);
     let mut wrong = vec![points[0].clone(), points[0].clone()];

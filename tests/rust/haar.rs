@@ -26,7 +26,7 @@ fn the_haar_matrix_is_orthogonal() {
 }
 
 #[test]
-fn the_haar_matrix_of_four_is_the_printed_one() {
+fn haar_matrix_of_four_matches_the_paper() {
     let r = 0.5_f64.sqrt();
     let printed = [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, -0.5, -0.5, r, -r, 0.0, 0.0, 0.0, 0.0, r, -r];
     assert!(distance(&operational_matrices::haar_matrix(4).unwrap(), &printed) < 1e-15);
@@ -50,7 +50,7 @@ fn the_fast_transform_is_the_matrix() {
 }
 
 #[test]
-fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
+fn lengths_that_are_no_power_of_two_are_reported_with_neighbors() {
     for (m, below, above) in [(12, 8, 16), (2047, 1024, 2048), (2049, 2048, 4096), (3, 2, 4)] {
         let error = Error::NotPowerOfTwo { m, below, above };
         let mut x = vec![1.0; m];
@@ -123,7 +123,7 @@ fn the_operational_matrix_integrates_haar_coefficients() {
 }
 
 #[test]
-fn operational_matrices_refuse_bad_arguments() {
+fn operational_matrices_reject_invalid_arguments() {
     for (eta, step) in [(-0.1, 0.1), (10.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
         for made in [
             operational_matrices::block_pulse_matrix(eta, 8, step),

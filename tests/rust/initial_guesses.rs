@@ -112,7 +112,7 @@ fn the_frequency_of_power_is_that_of_sums() {
 }
 
 #[test]
-fn starts_of_a_known_plant_hold_one_near_the_truth_whatever_the_threads() {
+fn initial_guesses_contain_the_truth_for_any_number_of_threads() {
     let source = runs();
     let one = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
     let two = found(structure(Order::free("alpha"), 0.0), &source, 2).unwrap();
@@ -160,7 +160,7 @@ fn delays_and_limits_are_tried() {
 }
 
 #[test]
-fn what_makes_no_start_is_refused() {
+fn structures_without_initial_guess_are_rejected() {
     let source = runs();
     let held = found(structure(Order::number(1.7), 2.2), &source, 1).unwrap_err();
     assert!(held.to_string().starts_with("order 2.2 of u is above alpha = 1.7 of y"), "{held}");
@@ -194,7 +194,7 @@ fn fast_swing() -> (Vec<f64>, Vec<f64>) {
 }
 
 #[test]
-fn a_long_fast_record_is_not_thinned_beyond_its_motion() {
+fn decimation_is_limited_by_the_bandwidth() {
     // Thinned to 1200 samples, it would be read every 0.5 s, a turn and a half; six samples in half a turn show it.
     let (y, u) = fast_swing();
     let parameter_set = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();

@@ -93,7 +93,7 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
 const LAWS: [(InputLaw, f64); 2] = [(InputLaw::Saturation, 1.3), (InputLaw::DeadZone, 0.4)];
 
 #[test]
-fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
+fn derivative_by_input_limit_matches_the_residuals() -> Result<(), Error> {
     let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     for (law, limit) in LAWS {
         let mut experiment = run(law, limit, 0.0, 3)?;
@@ -128,7 +128,7 @@ fn the_slope_towards_a_limit_is_that_of_the_residuals() -> Result<(), Error> {
 }
 
 #[test]
-fn a_limit_is_found_with_the_rest() -> Result<(), Error> {
+fn input_limit_is_estimated_with_the_other_parameters() -> Result<(), Error> {
     for (law, limit) in LAWS {
         let start = ParameterPoint { orders: vec![1.9], coefficients: vec![0.7, 1.2], inputs: vec![0.9] };
         let found =
@@ -146,7 +146,7 @@ fn a_limit_is_found_with_the_rest() -> Result<(), Error> {
 }
 
 #[test]
-fn what_is_no_limit_of_an_input_is_refused() -> Result<(), Error> {
+fn invalid_input_limits_are_rejected() -> Result<(), Error> {
     let experiment = run(InputLaw::Saturation, 1.0, 0.0, 3)?;
     let one = |signal: usize, bounds: (f64, f64)| FreeInput { signal, law: InputLaw::Saturation, bounds };
     for inputs in

@@ -53,7 +53,7 @@ fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &In
 }
 
 #[test]
-fn one_step_is_that_of_dense_algebra() {
+fn one_step_matches_dense_algebra() {
     let model = link();
     let (noisy, clean) = measured(&model, 150, &[], 0.01, 1);
     let m = noisy.m();
@@ -134,7 +134,7 @@ fn exact_data_is_a_fixed_point_from_any_number_of_records_and_initial_terms() {
 }
 
 #[test]
-fn noise_that_ruins_least_squares_leaves_the_truth_within_its_standard_errors() {
+fn colored_noise_leaves_the_truth_within_standard_errors() {
     let model = link();
     let count = 30;
     let (mut by_squares, mut scores) = (vec![0.0; 4], vec![Vec::new(); 4]);
@@ -215,7 +215,7 @@ fn units_do_not_matter() {
 }
 
 #[test]
-fn refining_one_equation_alone_ends_where_the_whole_does() {
+fn refinement_of_one_equation_matches_joint_refinement() {
     let model = link();
     let (noisy, _) = measured(&model, 512, &[], 0.002, 13);
     let whole = run(&[with_clean(&noisy, 0, &[1, 2])], &model, &FREE, &Initial::Rest);
@@ -247,7 +247,7 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
 }
 
 #[test]
-fn an_unstable_divisor_is_damped_and_a_stable_one_left_alone() {
+fn unstable_divisor_is_damped_and_stable_one_is_unchanged() {
     let m = 400;
     let stable = {
         let mut d: Vec<f64> = block_pulse_kernel(1.5, m, 0.02).iter().map(|v| 20.0 * v).collect();
@@ -267,7 +267,7 @@ fn an_unstable_divisor_is_damped_and_a_stable_one_left_alone() {
 }
 
 #[test]
-fn the_projection_keeps_what_inputs_excite_and_little_of_the_noise() {
+fn projection_keeps_excited_signal_and_removes_most_noise() {
     let model = link();
     let (_, clean) = measured(&model, 2000, &[], 0.0, 17);
     let kept = project(&clean, 0, &[1, 2], true).unwrap();
@@ -381,7 +381,7 @@ fn alike(apart: f64) -> Equation {
 }
 
 #[test]
-fn nearly_equal_regressors_cost_their_condition_once() {
+fn nearly_collinear_regressors_lose_their_condition_number_once() {
     for (apart, allowed) in [(0.1, 1e-12), (1e-3, 1e-9), (1e-4, 1e-7)] {
         let model = alike(apart);
         // One record, and two: a column over all of them for each term.
@@ -400,7 +400,7 @@ fn nearly_equal_regressors_cost_their_condition_once() {
 }
 
 #[test]
-fn an_unknown_that_one_record_alone_has_leaves_the_others_theirs() {
+fn unknown_of_one_record_does_not_change_the_others() {
     let model = link();
     let started = [(0.0, 0.4), (0.9, -0.2)];
     let (one, _) = measured(&model, 300, &started, 0.0, 63);
@@ -412,7 +412,7 @@ fn an_unknown_that_one_record_alone_has_leaves_the_others_theirs() {
 }
 
 #[test]
-fn instruments_that_say_nothing_are_refused() {
+fn uninformative_instruments_are_rejected() {
     let model = link();
     let (noisy, _) = measured(&model, 200, &[], 0.001, 19);
     let silent = with_signal(&with_signal(&noisy, 1, vec![0.0; 200]), 2, vec![0.0; 200]);
@@ -425,7 +425,7 @@ fn instruments_that_say_nothing_are_refused() {
 }
 
 #[test]
-fn scaled_inverse_is_the_inverse_whatever_the_units() {
+fn scaled_inverse_is_independent_of_units() {
     let mut random = Random::new(23);
     for k in 1..7 {
         let scales: Vec<f64> = (0..k).map(|i| 10.0_f64.powi(8 * (i % 3) - 8)).collect();
@@ -533,7 +533,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
 }
 
 #[test]
-fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_else() {
+fn only_candidates_above_the_threshold_are_excluded() {
     let model = equation(0, 1.8, &[(0, 0.9, -3.0), (0, 0.0, -40.0), (1, 0.0, 4.0)]);
     let values = |low: f64, count: i32| -> Vec<f64> { (0..count).map(|i| low + 0.2 * f64::from(i)).collect() };
     let axis = |signal, values: Vec<f64>| TermAxis { signal, values, interchangeable: signal == 0 };

@@ -104,7 +104,7 @@ const END_TOLERANCE: f64 = 1e-5;
 const COLOR_TOLERANCE: f64 = 0.1;
 
 #[test]
-fn the_end_of_a_fit_is_that_of_another_implementation() {
+fn optimum_matches_another_implementation() {
     let told = reference("joint_fit");
     let (problem, stop, start) = (three_terms(), Stop::default(), numbers(&told["start"]));
     for case in list(&told["cases"]) {
@@ -158,13 +158,13 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
 }
 
 #[test]
-fn the_correction_of_a_long_record_for_its_step_ends_where_finer_grids_do() {
+fn step_correction_of_a_long_record_agrees_with_finer_grids() {
     // Of the second record the grid is off by half of the noise.
-    correction_ends_where_finer_grids_do(0.015);
-    correction_ends_where_finer_grids_do(0.01);
+    correction_agrees_with_finer_grids(0.015);
+    correction_agrees_with_finer_grids(0.01);
 }
 
-fn correction_ends_where_finer_grids_do(size: f64) {
+fn correction_agrees_with_finer_grids(size: f64) {
     let (step, decay, rows) = (0.05, (-0.1_f64).exp(), 33_000);
     let mut random = Random::new(3);
     let u = random.steps(rows, 15);
@@ -208,7 +208,7 @@ fn correction_ends_where_finer_grids_do(size: f64) {
 }
 
 #[test]
-fn the_correction_of_nonlinear_terms_for_the_step_ends_where_finer_grids_do() {
+fn step_correction_of_nonlinear_terms_agrees_with_finer_grids() {
     // y′ = u − y², of which tanh is the step response: exact from sample to sample.
     let (step, rows, size) = (0.1, 500, 2e-3);
     let mut random = Random::new(5);
@@ -267,7 +267,7 @@ fn first_order() -> (Problem, Recordings) {
 }
 
 #[test]
-fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
+fn alternative_start_replaces_a_stalled_one_if_its_cost_is_lower() {
     let ((problem, source), stop) = (first_order(), Stop::default());
     let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let at = |a: f64, b: f64| place(&[], &[a, b]);
@@ -286,7 +286,7 @@ fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
 }
 
 #[test]
-fn who_grows_takes_no_place_where_that_may_not_be() {
+fn stability_constraint_excludes_unstable_steps() {
     let ((problem, source), stop) = (first_order(), Stop::default());
     let free = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let steady = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), true).unwrap();
@@ -304,7 +304,7 @@ fn who_grows_takes_no_place_where_that_may_not_be() {
 }
 
 #[test]
-fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
+fn stop_request_and_invalid_arguments_are_reported() {
     let ((problem, source), stop) = (first_order(), Stop::default());
     let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let start = place(&[], &[1.0, 1.0]);

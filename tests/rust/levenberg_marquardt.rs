@@ -43,7 +43,7 @@ fn settings(evaluations: usize) -> MinimizationSettings {
 }
 
 #[test]
-fn the_bottom_of_rosenbrocks_valley_is_found() {
+fn minimum_of_rosenbrocks_function_is_found() {
     let problem = Closed {
         residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
         jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
@@ -55,7 +55,7 @@ fn the_bottom_of_rosenbrocks_valley_is_found() {
 }
 
 #[test]
-fn a_linear_problem_is_solved_like_its_normal_equations() {
+fn linear_problem_has_the_solution_of_its_normal_equations() {
     let mut random = Random::new(501);
     let (n, k) = (40, 4);
     let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(n)).collect();
@@ -76,7 +76,7 @@ fn a_linear_problem_is_solved_like_its_normal_equations() {
 }
 
 #[test]
-fn a_problem_whose_slopes_lie_stalls() {
+fn wrong_derivatives_cause_a_stall() {
     // The derivative has the wrong sign: every step, however short, raises the cost.
     let problem =
         Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
@@ -86,7 +86,7 @@ fn a_problem_whose_slopes_lie_stalls() {
 }
 
 #[test]
-fn steps_into_where_nothing_is_defined_are_shortened() {
+fn steps_outside_the_domain_are_shortened() {
     // ln x − 3 from x = 1: the full step is past nothing, but from x = 0.01 Gauss–Newton's is.
     let problem = Closed {
         residuals: |x: &[f64]| {
@@ -102,7 +102,7 @@ fn steps_into_where_nothing_is_defined_are_shortened() {
 }
 
 #[test]
-fn few_evaluations_and_bad_columns_are_said() {
+fn few_evaluations_and_bad_columns_are_reported() {
     let rosenbrock = Closed {
         residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
         jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
@@ -168,7 +168,7 @@ impl LeastSquaresProblem for Boxed {
 const OPEN: Boxed = Boxed { bounds: (-10.0, 10.0), wall: 20.0, corner: false };
 
 #[test]
-fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
+fn active_bound_does_not_prevent_convergence_of_other_parameters() {
     for (bounds, x) in [((-10.0, 10.0), 3.0), ((-10.0, 1.0), 1.0), ((4.0, 10.0), 4.0), ((0.5, 0.5), 0.5)] {
         let start = [0.0_f64.clamp(bounds.0, bounds.1), -7.0];
         let found =
@@ -181,14 +181,14 @@ fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
 }
 
 #[test]
-fn a_start_on_a_bound_leaves_it_where_the_slope_leads_inside() {
+fn start_on_a_bound_moves_inside_along_the_gradient() {
     let found = minimize(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], MinimizationSettings::default()).unwrap();
     assert_eq!(found.status, Status::Converged);
     check("minimum inside", (found.point[0] - 3.0).abs(), 1e-4);
 }
 
 #[test]
-fn a_minimum_behind_a_wall_is_no_minimum() {
+fn point_at_the_domain_limit_has_not_converged() {
     let found =
         minimize(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], MinimizationSettings { evaluations: 500, tolerance: 1e-9 });
     let found = found.unwrap();
@@ -197,7 +197,7 @@ fn a_minimum_behind_a_wall_is_no_minimum() {
 }
 
 #[test]
-fn a_corner_of_the_cost_is_a_minimum_where_the_rest_lies_flat() {
+fn minimization_converges_at_a_kink_of_the_cost() {
     let corner = Boxed { corner: true, ..OPEN };
     let found = minimize(&corner, [0.0, 0.0], MinimizationSettings { evaluations: 500, tolerance: 1e-9 }).unwrap();
     assert_eq!(found.status, Status::Converged);
@@ -216,7 +216,7 @@ fn a_short_step_is_no_minimum() {
 /// The problem of Brown & Dennis: residuals of some hundred each at its minimum of 85822.2, where Gauss–Newton creeps
 /// (Moré, Garbow & Hillstrom, doi:10.1145/355934.355936, problem 16).
 #[test]
-fn large_residuals_bend_the_steps() {
+fn large_residuals_use_secant_curvature() {
     let time = |i: usize| (i + 1) as f64 / 5.0;
     let parts = move |x: &[f64], i: usize| {
         let t = time(i);
@@ -250,7 +250,7 @@ fn large_residuals_bend_the_steps() {
 /// Along y = x² the way to x = 12 is long beside what a step may leave the bottom, as with numbers that data hardly tell
 /// apart. Step by step, 2000 evaluations end at x = 9.6.
 #[test]
-fn leaps_shorten_the_way_along_a_curved_valley() {
+fn extrapolation_steps_save_evaluations_in_a_curved_valley() {
     let problem = Closed {
         residuals: |x: &[f64]| Ok(vec![50.0 * (x[1] - x[0] * x[0]), 0.1 * (x[0] - 12.0), 3.0]),
         jacobian: |x: &[f64]| vec![vec![-100.0 * x[0], 0.1, 0.0], vec![50.0, 0.0, 0.0]],
@@ -264,7 +264,7 @@ fn leaps_shorten_the_way_along_a_curved_valley() {
 
 /// A leap that ends higher is taken back: residuals that grow beyond any bound wherever it may land.
 #[test]
-fn a_leap_that_leads_nowhere_is_taken_back() {
+fn failed_extrapolation_step_is_rejected() {
     let tried = std::cell::RefCell::new(Vec::new());
     let problem = Closed {
         residuals: |x: &[f64]| {

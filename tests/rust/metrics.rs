@@ -4,7 +4,7 @@ use ftlm::error::{check_finite, check_length, check_step, Error, Kind};
 use ftlm::signal::metrics::{correlation, covariances, covariances_naive, metrics};
 
 #[test]
-fn the_four_figures_of_a_small_case() {
+fn metrics_of_a_small_case() {
     let found = metrics(&[1.0, 3.0, 1.0, 3.0], &[0.5, -0.5, 0.5, -0.5]).unwrap();
     assert_eq!((found.error, found.rmse, found.nr, found.fit_percent), (2.0, 0.5, 0.5, 50.0));
     let perfect = metrics(&[1.0, 2.0], &[0.0, 0.0]).unwrap();
@@ -14,7 +14,7 @@ fn the_four_figures_of_a_small_case() {
 }
 
 #[test]
-fn a_diverged_response_has_no_finite_figures() {
+fn diverged_response_has_no_finite_metrics() {
     for bad in [f64::NAN, f64::INFINITY, 1e200] {
         let found = metrics(&[1.0, 2.0, 3.0], &[0.0, bad, 0.0]).unwrap();
         assert!(found.rmse.is_infinite() && found.nr.is_infinite(), "{bad}: {found:?}");
@@ -24,7 +24,7 @@ fn a_diverged_response_has_no_finite_figures() {
 }
 
 #[test]
-fn checks_report_what_they_found() {
+fn checks_report_the_found_values() {
     assert_eq!(check_finite("u", &[1.0, 2.0]), Ok(()));
     let refused = Error::NotFinite { name: "u".into(), index: 1, count: 2 };
     assert_eq!(check_finite("u", &[1.0, f64::NAN, 2.0, f64::NEG_INFINITY]), Err(refused.clone()));
@@ -41,7 +41,7 @@ fn checks_report_what_they_found() {
 }
 
 #[test]
-fn every_error_has_its_family() {
+fn every_error_has_its_kind() {
     let families = [
         (Error::NotFinite { name: "u".into(), index: 0, count: 1 }, Kind::Data),
         (Error::Length { name: "u".into(), expected: 1, found: 2 }, Kind::Data),
@@ -76,7 +76,7 @@ fn white(n: usize, seed: u64) -> Vec<f64> {
 }
 
 #[test]
-fn covariances_by_spectra_are_those_by_definition() {
+fn covariances_by_spectra_match_the_definition() {
     for (n, lags) in [(1, 0), (2, 1), (7, 3), (100, 25), (1025, 64), (3000, 2999)] {
         let (x, y) = (white(n, 1), white(n, 2));
         let (fast, naive) = (covariances(&x, &y, lags), covariances_naive(&x, &y, lags));
@@ -95,7 +95,7 @@ fn covariances_by_spectra_are_those_by_definition() {
 }
 
 #[test]
-fn figures_of_nothing_are_refused() {
+fn metrics_without_samples_are_rejected() {
     assert_eq!(metrics(&[], &[]), Err(Error::Length { name: "measured".into(), expected: 1, found: 0 }));
     assert_eq!(metrics(&[1.0], &[]), Err(Error::Length { name: "residuals".into(), expected: 1, found: 0 }));
 }

@@ -18,7 +18,7 @@ proptest! {
     #![proptest_config(cases(40))]
 
     #[test]
-    fn a_cubic_is_read_exactly(seed in 0u64..1_000_000, m in 4usize..30) {
+    fn cubic_is_interpolated_exactly(seed in 0u64..1_000_000, m in 4usize..30) {
         let mut random = Random::new(seed);
         let c = [random.normal(), random.normal(), 0.1 * random.normal(), 0.01 * random.normal()];
         let means: Vec<f64> = (0..m).map(|k| mean_of(&c, k)).collect();
@@ -33,7 +33,7 @@ proptest! {
 
 /// I^η of jumps at places of their own, read near and far from them, beside the definition.
 #[test]
-fn corners_are_those_of_the_definition() {
+fn kinks_match_the_definition() {
     let (m, step) = (60, 0.05);
     let (at, sizes) = ([0.0, 3.3, 9.0, 9.9], [1.0, -2.0, 0.5, 1.5]);
     let places: Vec<f64> = (0..150).map(|i| 0.1 * f64::from(i)).collect();
@@ -55,7 +55,7 @@ fn corners_are_those_of_the_definition() {
 }
 
 #[test]
-fn readings_that_cannot_be_are_refused() {
+fn impossible_readings_are_rejected() {
     assert!(matches!(SampleInterpolation::new(vec![1.0], 3), Err(Error::Length { .. })));
     assert!(matches!(SampleInterpolation::new(vec![f64::NAN], 9), Err(Error::NotFinite { .. })));
     for place in [-0.1, 9.1] {

@@ -238,7 +238,7 @@ fn estimates_from_noise_are_as_near_as_their_deviations_say() {
 }
 
 #[test]
-fn bounds_hold_and_the_best_inside_them_is_found() {
+fn optimum_within_bounds_is_found() {
     let mut model = two_link(true, Initial::Rest);
     // The true 0.1 of β₂ is out of reach.
     model.order_bounds[1] = (0.2, 0.5);
@@ -255,7 +255,7 @@ fn bounds_hold_and_the_best_inside_them_is_found() {
 }
 
 #[test]
-fn what_cannot_be_started_is_refused() {
+fn problems_without_initial_guess_are_rejected() {
     let model = two_link(true, Initial::Rest);
     let experiments = [run(100, 2, &[], 0.01, 431)];
     let start = |orders: &[f64], coefficients: &[f64]| {
@@ -293,7 +293,7 @@ fn what_cannot_be_started_is_refused() {
 }
 
 #[test]
-fn few_evaluations_are_said_to_be_too_few() {
+fn exhausted_evaluations_are_reported() {
     let model = two_link(true, Initial::Rest);
     let experiments = [run(200, 1, &[], 0.01, 433)];
     let mut last = f64::INFINITY;
@@ -352,7 +352,7 @@ fn with_delay(coupled: bool) -> FreeModel {
 }
 
 #[test]
-fn the_slope_towards_a_delay_is_that_of_the_residuals() {
+fn derivative_by_delay_matches_the_residuals() {
     for coupled in [true, false] {
         let (model, experiments) = (with_delay(coupled), [late(0.057, 2, 0.02, 500)]);
         let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
@@ -370,7 +370,7 @@ fn the_slope_towards_a_delay_is_that_of_the_residuals() {
 }
 
 #[test]
-fn a_delay_is_found_with_the_rest() {
+fn delay_is_estimated_with_the_other_parameters() {
     for (coupled, every, delay) in [(true, 1, 0.05), (true, 2, 0.033), (false, 1, 0.11), (true, 1, 0.0), (true, 1, 0.2)]
     {
         let model = with_delay(coupled);
@@ -384,7 +384,7 @@ fn a_delay_is_found_with_the_rest() {
 }
 
 #[test]
-fn a_delay_is_estimated_as_well_as_its_slope_says() {
+fn delay_estimate_agrees_with_its_standard_error() {
     let (model, delay) = (with_delay(true), 0.047);
     let start = ParameterPoint { inputs: vec![0.08], ..point(&START.0, &START.1) };
     let mut scores = Vec::new();
@@ -429,7 +429,7 @@ fn at_once(coupled: bool, initial: Initial, inputs: Vec<FreeInput>) -> FreeModel
 }
 
 #[test]
-fn what_feeds_through_has_the_slope_of_its_residuals() {
+fn feedthrough_derivative_matches_the_residuals() {
     let coefficients = [1.5, 0.4, 0.7, 0.9, -0.3, 0.5];
     let delayed = || vec![FreeInput { signal: 2, law: InputLaw::Delay, bounds: (0.0, 0.2) }];
     for (name, model) in [
@@ -471,7 +471,7 @@ fn what_feeds_through_has_the_slope_of_its_residuals() {
 }
 
 #[test]
-fn a_gain_is_the_gain_at_the_instant_of_the_sample() {
+fn direct_feedthrough_acts_at_the_sample_time() {
     // y = 0.4 x + 0.7 u and x = -0.3 y + 0.5 u at once: with no other term the samples are those of the two by two.
     let mut model = at_once(true, Initial::Rest, Vec::new());
     model.equations.iter_mut().for_each(|e| {
@@ -501,7 +501,7 @@ fn a_gain_is_the_gain_at_the_instant_of_the_sample() {
 }
 
 #[test]
-fn a_fit_that_its_grid_stops_says_so() {
+fn fit_at_the_limit_of_its_pulse_grid_reports_it() {
     // y' = -c y + c u of data in which y = u: they ask for a pole beyond what the grid sees.
     let input = Random::new(703).steps(200, 5);
     let record = record(0.1, vec![vec![0.0; 200], input.clone()]);
@@ -527,7 +527,7 @@ fn a_fit_that_its_grid_stops_says_so() {
 }
 
 #[test]
-fn no_evaluation_is_residuals_without_slopes() {
+fn zero_evaluations_give_residuals_without_derivatives() {
     let experiments = [run(100, 1, &[], 0.05, 431)];
     let model = two_link(true, Initial::Caputo);
     let there = at(&model, &experiments, &START.0, &START.1);
@@ -538,7 +538,7 @@ fn no_evaluation_is_residuals_without_slopes() {
 }
 
 #[test]
-fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
+fn fixed_coefficient_stays_and_the_others_are_optimal() {
     let experiments = [run(200, 1, &[], 0.05, 430)];
     let free = two_link(true, Initial::Rest);
     let whole = fit(&free, &experiments, &point(&START.0, &START.1), MinimizationSettings::default()).unwrap();
@@ -583,7 +583,7 @@ fn with_known_orders(model: &FreeModel, orders: &[f64]) -> FreeModel {
 }
 
 #[test]
-fn whole_orders_that_are_known_give_what_the_same_orders_give_where_they_may_move() {
+fn fixed_integer_orders_match_free_orders_at_the_same_values() {
     // Known, they are solved by running sums; where they may move, by transforms.
     let whole = [1.0, 0.0, 1.0];
     let mut cases = variants();
@@ -651,7 +651,7 @@ fn driven() -> (FreeModel, Vec<Experiment>) {
 }
 
 #[test]
-fn what_drives_is_solved_for_as_dense_least_squares_does() {
+fn input_coefficients_match_dense_least_squares() {
     let (mut model, experiments) = driven();
     let once = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     let residuals = |b: f64, c: f64| fit(&model, &experiments, &point(&[], &[-3.0, b, c]), once).unwrap().residuals;
@@ -675,7 +675,7 @@ fn what_drives_is_solved_for_as_dense_least_squares_does() {
 }
 
 #[test]
-fn where_what_drives_starts_does_not_matter() {
+fn optimum_is_independent_of_initial_input_coefficients() {
     let (model, experiments) = driven();
     let settings = MinimizationSettings { evaluations: 15, tolerance: 1e-12 };
     let ends: Vec<OutputErrorFit> = [[3.0, 0.5], [-3.0, -0.5], [1e4, -1e-4]]
@@ -690,7 +690,7 @@ fn where_what_drives_starts_does_not_matter() {
 }
 
 #[test]
-fn what_nothing_excites_stays_where_it_was() {
+fn unexcited_parameters_keep_their_values() {
     let (model, experiments) = driven();
     let still = |e: &Experiment| {
         let signals = with_signal(&e.record, 2, vec![0.0; e.record.m()]);
@@ -710,7 +710,7 @@ fn agree(name: &str, found: &OutputErrorFit, alone: &OutputErrorFit) {
 }
 
 #[test]
-fn runs_on_one_grid_share_what_does_not_depend_on_the_run() {
+fn runs_on_one_grid_share_kernels() {
     let still = [vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]];
     // The first is alone on its grid, and so is the last, which is too short to share.
     let runs = [
@@ -739,7 +739,7 @@ fn runs_on_one_grid_share_what_does_not_depend_on_the_run() {
 }
 
 #[test]
-fn a_filter_that_all_outputs_pass_may_come_first() {
+fn filter_of_all_outputs_can_be_applied_to_the_inputs() {
     let still = [vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]];
     for (name, coupled, initial) in [
         ("coupled", true, Initial::Caputo),

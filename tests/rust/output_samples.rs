@@ -41,7 +41,7 @@ fn unit_responses_add_up_to_the_simulation() {
 }
 
 #[test]
-fn exact_unit_responses_follow_the_samples_from_rest() {
+fn exact_unit_responses_follow_the_rest_samples() {
     let simulation = simulation(1.0, 100);
     let separate = InitialTerms::UnitResponses { exponents: vec![vec![0.0]] };
     let separate = simulation.exact_samples(&separate, &Stop::default()).unwrap().unwrap().outputs;

@@ -54,7 +54,7 @@ fn means_match_naive_integration() {
 }
 
 #[test]
-fn on_its_own_grid_a_hold_is_its_samples_and_a_line_its_midpoints() {
+fn pulse_means_on_the_sample_grid_are_samples_or_midpoints() {
     let mut random = Random::new(31);
     let samples = random.signal(500);
     assert_eq!(pulse_means(&samples, 499, Intersample::Hold).unwrap().values(), &samples[..499]);
@@ -63,7 +63,7 @@ fn on_its_own_grid_a_hold_is_its_samples_and_a_line_its_midpoints() {
 }
 
 #[test]
-fn refining_keeps_the_signal() {
+fn refinement_preserves_the_signal() {
     let mut random = Random::new(32);
     let samples = random.signal(60);
     for times in [1, 2, 3, 8] {
@@ -82,7 +82,7 @@ fn refining_keeps_the_signal() {
 }
 
 #[test]
-fn too_little_is_refused() {
+fn too_few_samples_are_rejected() {
     for intersample in BOTH {
         for samples in [&[][..], &[1.0]] {
             let refused = Error::Length { name: "samples".into(), expected: 2, found: samples.len() };
@@ -112,7 +112,7 @@ fn delays_move_samples() {
 }
 
 #[test]
-fn a_delayed_command_has_the_means_of_the_late_hold() {
+fn delayed_command_has_the_means_of_the_delayed_hold() {
     // The hold sampled a thousand times finer and shifted there, against the mix of two neighbours.
     let mut random = Random::new(33);
     let u = random.signal(40);
@@ -152,7 +152,7 @@ proptest! {
     #![proptest_config(cases(128))]
 
     #[test]
-    fn the_integral_is_kept(n in 2usize..200, m in 1usize..400, seed in any::<u64>()) {
+    fn integral_is_preserved(n in 2usize..200, m in 1usize..400, seed in any::<u64>()) {
         let samples = Random::new(seed).signal(n);
         let intervals = (n - 1) as f64;
         let hold: f64 = samples[..n - 1].iter().sum();

@@ -29,7 +29,7 @@ fn settings() -> GuardSettings {
 }
 
 #[test]
-fn a_million_commands_write_nothing_outside_the_limits() {
+fn a_million_commands_stay_within_the_limits() {
     let s = settings();
     let mut guard = Guard::new(s.clone()).unwrap();
     let mut random = Random::new(7);
@@ -69,7 +69,7 @@ fn a_command_that_is_not_finite_latches_zero() {
 }
 
 #[test]
-fn the_first_fault_stays() {
+fn first_fault_is_latched() {
     let mut guard = Guard::new(settings()).unwrap();
     let mut reading = Reading { switches: [1; 4], ..Reading::default() };
     guard.rest(&reading);
@@ -82,7 +82,7 @@ fn the_first_fault_stays() {
 }
 
 #[test]
-fn settings_that_mean_nothing_are_refused() {
+fn invalid_settings_are_rejected() {
     for change in [
         |s: &mut GuardSettings| s.step = 0.0,
         |s: &mut GuardSettings| s.slew[1] = f64::NAN,

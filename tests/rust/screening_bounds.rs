@@ -36,7 +36,7 @@ fn unruly(random: &mut Random, m: usize) -> Record {
 }
 
 /// y = 0.
-fn equation_of_nothing() -> Equation {
+fn equation_without_terms_is_rejected() -> Equation {
     equation(0, 1.0, &[(1, 0.0, 0.0)])
 }
 
@@ -55,7 +55,7 @@ fn random_equation(random: &mut Random, own: usize, scale: f64) -> Equation {
 }
 
 #[test]
-fn no_zero_of_a_divisor_proves_more_than_is_true() {
+fn divisor_zeros_give_valid_bounds() {
     let mut random = Random::new(77);
     let (mut proved, mut large, mut stable) = (0, 0, 0);
     for case in 0..400 {
@@ -71,7 +71,7 @@ fn no_zero_of_a_divisor_proves_more_than_is_true() {
                 "case {case}: {exact:e}"
             );
         }
-        let size = score(&record, &equation_of_nothing(), norm);
+        let size = score(&record, &equation_without_terms_is_rejected(), norm);
         let beyond = exact > 1e4 * size;
         let told = has_unstable_zeros(&record, &equation, norm, size).unwrap();
         proved += usize::from(told && beyond);
@@ -84,7 +84,7 @@ fn no_zero_of_a_divisor_proves_more_than_is_true() {
 }
 
 #[test]
-fn a_limit_that_is_no_number_and_coefficients_beyond_all_prove_nothing() {
+fn nan_limit_and_huge_coefficients_exclude_no_candidate() {
     let mut random = Random::new(3);
     let record = unruly(&mut random, 300);
     for huge in [1e160, 1e300, f64::MAX, f64::NAN, f64::INFINITY] {
@@ -107,7 +107,7 @@ fn a_limit_that_is_no_number_and_coefficients_beyond_all_prove_nothing() {
 }
 
 #[test]
-fn no_test_vector_that_follows_coefficients_proves_more_than_is_true() {
+fn linearized_test_vectors_give_valid_bounds() {
     let mut random = Random::new(78);
     let (mut asked, mut close, mut closer, mut cut) = (0, 0, 0, 0);
     for case in 0..150 {
@@ -138,7 +138,7 @@ fn no_test_vector_that_follows_coefficients_proves_more_than_is_true() {
 }
 
 #[test]
-fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
+fn test_vector_bounds_hold_for_the_next_candidate() {
     let mut random = Random::new(79);
     let (mut asked, mut told, mut close) = (0, 0, 0);
     for case in 0..60 {
@@ -177,7 +177,7 @@ fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
 }
 
 #[test]
-fn proofs_keep_the_table_of_brute_force() {
+fn certificates_keep_the_table_of_brute_force() {
     let mut random = Random::new(5);
     let record = unruly(&mut random, 96);
     let step = 0.05;

@@ -99,7 +99,7 @@ fn enumerated(output: usize, alphas: &[f64], axes: &[TermAxis], input: usize) ->
 }
 
 #[test]
-fn lattices_hold_every_structure_once() {
+fn order_grids_contain_every_structure_once() {
     let own = range(0.0, 1.8, 0.3);
     for (alphas, axes) in [
         (vec![1.0, 1.5], vec![axis(0, &own, false)]),
@@ -138,7 +138,7 @@ fn terms_with_different_axes_swap_only_where_both_may() {
 }
 
 #[test]
-fn empty_and_oversized_lattices_say_why() {
+fn empty_and_oversized_order_grids_report_the_reason() {
     let reason = |alphas: &[f64], axes: &[TermAxis]| match OrderGrid::new(0, alphas, axes, |_| false) {
         Err(Error::EmptyOrderGrid { reason }) => reason,
         other => panic!("{other:?}"),
@@ -305,7 +305,7 @@ fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Estimate), Fa
 }
 
 #[test]
-fn a_search_that_is_told_to_stop_does_not_finish_its_set_up() {
+fn stop_request_ends_the_setup_of_a_search() {
     // Candidates are counted once what they share has been made.
     let made = |told: bool| {
         let problem = random_problem(100);
@@ -350,7 +350,7 @@ fn early_stopping_and_threads_change_nothing() {
 }
 
 #[test]
-fn stretches_of_one_term_rank_as_brute_force_does() {
+fn blocks_of_one_term_rank_like_brute_force() {
     let (mut bounded, mut candidates) = (0, 0);
     for seed in 300..312 {
         let mut problem = random_problem(seed);
@@ -521,7 +521,7 @@ fn a_leading_zero_makes_a_candidate_singular() {
 }
 
 #[test]
-fn settings_out_of_range_are_refused() {
+fn settings_out_of_range_are_rejected() {
     let mut random = Random::new(244);
     let records = vec![data(&mut random, 100, 0.02, 0.0)];
     let lattice = OrderGrid::new(0, &[1.0], &[axis(0, &[0.0], false)], |_| false).unwrap();
@@ -551,7 +551,7 @@ fn settings_out_of_range_are_refused() {
 }
 
 #[test]
-fn kernels_that_overflow_are_a_reason_on_every_row() {
+fn overflowing_kernels_are_reported_on_every_row() {
     let mut random = Random::new(62);
     // h^2 is beyond floating point.
     let record = record(1e200, vec![random.signal(64), random.signal(64)]);
@@ -576,7 +576,7 @@ fn kernels_that_overflow_are_a_reason_on_every_row() {
 }
 
 #[test]
-fn candidates_that_explode_in_their_first_block_are_a_reason_on_their_rows() {
+fn candidates_that_diverge_in_the_first_block_are_reported() {
     let mut random = Random::new(63);
     let record = record(0.1, vec![random.signal(64), random.signal(64)]);
     let terms = [axis(0, &[0.0], false), axis(1, &[0.0, 0.1, 0.2], false)];
@@ -602,7 +602,7 @@ fn long_problem(last: f64) -> Problem {
 }
 
 #[test]
-fn a_search_ends_when_told_to() {
+fn search_ends_after_a_stop_request() {
     let problem = long_problem(2.0);
     let control = Control::default();
     control.stop.set();
@@ -652,7 +652,7 @@ fn random_candidate(random: &mut Random) -> (Record, Equation) {
 }
 
 #[test]
-fn the_bound_is_tight_where_the_error_is_a_test_vector_would_see() {
+fn bound_is_tight_for_errors_along_a_test_vector() {
     // A wrong gain under a square wave: the bound must see a good part of the error, or it would exclude nothing.
     let mut random = Random::new(246);
     let current: Vec<f64> = (0..1024).map(|k| if k / 100 % 2 == 0 { 0.3 } else { -0.3 }).collect();
@@ -701,7 +701,7 @@ fn the_bound_never_exceeds_the_error() {
 }
 
 #[test]
-fn a_vector_made_for_one_equation_proves_nothing_wrong_of_another_and_all_of_its_own() {
+fn test_vector_bounds_hold_for_other_equations_and_are_tight_for_its_own() {
     let mut random = Random::new(252);
     let (mut telling, mut own, mut finite) = (0, 0, 0);
     for _ in 0..1500 {
@@ -732,7 +732,7 @@ fn a_vector_made_for_one_equation_proves_nothing_wrong_of_another_and_all_of_its
 }
 
 #[test]
-fn no_score_within_reach_is_excluded() {
+fn no_score_below_the_threshold_is_excluded() {
     let mut random = Random::new(249);
     let (mut excluded, mut finite) = (0, 0);
     for _ in 0..1500 {
@@ -765,7 +765,7 @@ fn silent(equation: &Equation) -> Equation {
 }
 
 #[test]
-fn bounds_refuse_what_is_no_equation() {
+fn bounds_reject_invalid_equations() {
     let mut random = Random::new(248);
     let record = data(&mut random, 50, 0.02, 0.0);
     let mut short = truth();
@@ -803,7 +803,7 @@ proptest! {
     #![proptest_config(cases(24))]
 
     #[test]
-    fn keeping_more_rows_keeps_the_fewer(seed in 300u64..10_000, fewer in 1usize..10) {
+    fn larger_top_contains_the_smaller_one(seed in 300u64..10_000, fewer in 1usize..10) {
         let problem = random_problem(seed);
         let few = problem.run(|o| o.top = fewer);
         let many = problem.run(|o| o.top = fewer + 15);
@@ -812,7 +812,7 @@ proptest! {
     }
 
     #[test]
-    fn a_larger_lattice_is_no_worse(seed in 300u64..10_000) {
+    fn larger_order_grid_has_no_higher_error(seed in 300u64..10_000) {
         let mut random = Random::new(seed);
         let records = vec![data(&mut random, 150, 0.02, 0.05)];
         let values = range(0.0, 2.0, 0.2);
@@ -830,7 +830,7 @@ proptest! {
 }
 
 #[test]
-fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
+fn block_of_candidates_resumes_from_any_checkpoint() {
     use ftlm::order_search::batches::BatchEvaluator;
     use ftlm::order_search::control::Checkpoint;
     use ftlm::order_search::result::Part;

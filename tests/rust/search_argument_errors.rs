@@ -35,7 +35,7 @@ fn run(fixed: &[Option<f64>], options: &Options) -> Result<()> {
 }
 
 #[test]
-fn lattices_refuse_orders_that_are_no_numbers() {
+fn order_grids_reject_nonfinite_orders() {
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
         let found = OrderGrid::new(0, &[1.0, bad], &[axis(0, &[0.0])], |_| false);
         assert!(matches!(found, Err(Error::NotFinite { index: 1, .. })));
@@ -48,7 +48,7 @@ fn lattices_refuse_orders_that_are_no_numbers() {
 }
 
 #[test]
-fn lattices_refuse_more_terms_than_can_be_counted() {
+fn order_grids_reject_too_many_terms() {
     let terms = |count: usize| vec![axis(0, &[0.0]); count];
     // 34 terms of one signal are looked at (and do not fit on one order), 35 are refused.
     assert!(matches!(OrderGrid::new(0, &[1.0], &terms(34), |_| false), Err(Error::EmptyOrderGrid { .. })));
@@ -62,7 +62,7 @@ fn lattices_refuse_more_terms_than_can_be_counted() {
 }
 
 #[test]
-fn a_structure_beyond_the_last_is_the_last() {
+fn index_after_the_last_structure_gives_the_last() {
     let lattice = small();
     assert_eq!(lattice.structure(u64::MAX), lattice.structure(lattice.count() - 1));
 }
@@ -76,7 +76,7 @@ fn one_law() -> LawEquation {
 }
 
 #[test]
-fn law_lattices_refuse_what_their_laws_cannot_mean() {
+fn law_grids_reject_invalid_laws() {
     let made = |axes: &[Vec<f64>], change: &dyn Fn(&mut LawEquation)| {
         let mut equation = one_law();
         change(&mut equation);
@@ -94,7 +94,7 @@ fn law_lattices_refuse_what_their_laws_cannot_mean() {
 }
 
 #[test]
-fn searches_refuse_settings_out_of_range() {
+fn searches_reject_settings_out_of_range() {
     let with = |options: Options| run(&[None; 2], &options);
     assert!(with(Options::default()).is_ok());
     assert!(matches!(with(Options { top: 0, ..Options::default() }), Err(Error::OutOfRange { .. })));
@@ -119,7 +119,7 @@ fn searches_refuse_settings_out_of_range() {
 }
 
 #[test]
-fn searches_refuse_records_without_their_signals() {
+fn searches_reject_records_without_their_signals() {
     let lattice = OrderGrid::new(0, &[1.0], &[axis(2, &[0.0])], |_| false).unwrap();
     let found = search(&[data()], &lattice, &[None], &Options::default(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
@@ -137,7 +137,7 @@ fn searches_refuse_records_without_their_signals() {
 }
 
 #[test]
-fn rounds_refuse_what_belongs_to_another_search() {
+fn batches_reject_state_of_another_search() {
     let (lattice, options, control, pool) = (small(), Options::default(), Control::default(), pool(1).unwrap());
     let ready = BatchEvaluator::new(&[data()], Cow::Borrowed(&lattice), &[None; 2], &options, &pool, &control).unwrap();
     let refused = |first, last, seed: &[(u64, f64)], from| {
@@ -182,7 +182,7 @@ fn rounds_refuse_what_belongs_to_another_search() {
 }
 
 #[test]
-fn stages_refuse_scales_spans_and_verdicts_that_are_not_theirs() {
+fn stages_reject_scales_ranges_and_verdicts_of_others() {
     let (options, control, pool) = (Options::default(), Control::default(), pool(1).unwrap());
     let lattice = |values: &[f64]| OrderLawGrid::new(&[values.to_vec()], &[one_law()], &[false, true]).unwrap();
     let made = |lattice: OrderLawGrid, scale: f64| {

@@ -130,7 +130,7 @@ fn quotient_by_unstable_divisors_is_the_naive_quotient() {
 }
 
 #[test]
-fn quotients_past_the_range_of_floating_point_are_not_finite_and_not_wrong_before() {
+fn overflowing_quotients_are_exact_before_overflow() {
     let m = 2048;
     let d = divisor(&[(1e5, 2.0)], m, 0.004);
     let n = power_means(0.0, m, 0.004);
@@ -157,7 +157,7 @@ fn divisor_times_quotient_is_the_numerator() {
 }
 
 #[test]
-fn a_zero_at_the_start_of_a_divisor_is_refused() {
+fn divisor_with_leading_zero_is_rejected() {
     for d in [[0.0, 1.0, 2.0], [f64::NAN, 1.0, 2.0], [f64::INFINITY, 1.0, 2.0]] {
         for divided in [series::divide(&[1.0, 2.0, 3.0], &d), series::divide_naive(&[1.0, 2.0, 3.0], &d)] {
             match divided {
@@ -171,7 +171,7 @@ fn a_zero_at_the_start_of_a_divisor_is_refused() {
 }
 
 #[test]
-fn an_empty_division() {
+fn empty_division_is_empty() {
     assert_eq!(series::divide(&[], &[1.0]), Ok(vec![]));
     assert!(matches!(series::divide(&[], &[]), Err(Error::LeadingZero { .. })));
     assert!(matches!(series::divide_naive(&[], &[]), Err(Error::LeadingZero { .. })));
@@ -180,7 +180,7 @@ fn an_empty_division() {
 }
 
 #[test]
-fn lengths_that_do_not_match_are_refused() {
+fn mismatched_lengths_are_rejected() {
     let one = vec![1.0, 0.5, 0.25];
     let length = |e| matches!(e, Err(Error::Length { .. }));
     assert!(length(series::divide(&[1.0; 4], &one).map(|_| ())));
@@ -272,7 +272,7 @@ fn uncoupled_systems_are_divisions() {
 }
 
 #[test]
-fn a_solver_gives_what_solving_anew_gives() {
+fn solver_agrees_with_a_new_solution() {
     let mut random = Random::new(12);
     for m in [1, 64, 65, 300, 2049] {
         let matrix = vec![
@@ -298,7 +298,7 @@ fn a_solver_gives_what_solving_anew_gives() {
 }
 
 #[test]
-fn a_sum_of_products_is_the_sum_of_the_products() {
+fn sum_of_products_matches_separate_products() {
     let mut random = Random::new(13);
     let mut buffers = Buffers::default();
     // Long and short in turn: the buffers are shared.
@@ -332,7 +332,7 @@ fn a_singular_leading_matrix_is_refused() {
 }
 
 #[test]
-fn a_kernel_may_be_applied_again_and_again() {
+fn kernel_can_be_applied_repeatedly() {
     let mut random = Random::new(9);
     let mut buffers = Buffers::default();
     let kernels: Vec<(Vec<f64>, Kernel)> = [700, 64, 2048, 1]
@@ -360,7 +360,7 @@ fn a_kernel_may_be_applied_again_and_again() {
 }
 
 #[test]
-fn a_division_under_way_gives_the_quotient_block_by_block() {
+fn blockwise_division_gives_the_quotient() {
     let mut random = Random::new(10);
     for m in [1, 64, 100, 1000, 2049] {
         let mut division = Division::new(1, m);
@@ -489,7 +489,7 @@ proptest! {
     }
 
     #[test]
-    fn a_late_input_gives_a_late_output(f in signal(500..501), late in 0usize..500, eta in 0.05..3.0_f64, c in -50.0..5.0_f64) {
+    fn delayed_input_gives_a_delayed_output(f in signal(500..501), late in 0usize..500, eta in 0.05..3.0_f64, c in -50.0..5.0_f64) {
         let m = f.len();
         let shifted: Vec<f64> = std::iter::repeat_n(0.0, late).chain(f.iter().copied()).take(m).collect();
         let kernel = block_pulse_kernel(eta, m, 0.01);
@@ -591,7 +591,7 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
 }
 
 #[test]
-fn running_sums_that_cannot_be() {
+fn invalid_running_sums_are_rejected() {
     assert!(matches!(RunningSumSystem::new(1, 1, 0.1, &[(0, 0, 2, 1.0)]), Err(Error::Structure { .. })));
     assert!(matches!(RunningSumSystem::new(1, MAX_SUMS + 1, 0.1, &[]), Err(Error::Structure { .. })));
     // 1 − c·h/2 = 0.

@@ -98,7 +98,7 @@ fn coupled_equations_match_the_dense_solution() {
 }
 
 #[test]
-fn a_coupled_run_solves_each_equation_alone() {
+fn coupled_simulation_satisfies_each_equation() {
     // Fed back as measured coupling, the coupled outputs are each equation's own response, and its exact data.
     let model = stage();
     for m in [100, 1000, 2049] {
@@ -134,7 +134,7 @@ fn initial_terms_belong_to_their_equation() {
 }
 
 #[test]
-fn models_that_cannot_be_solved_are_refused() {
+fn unsolvable_models_are_rejected() {
     let record = driven(50, 0.01, 75);
     let twice = [stage()[0].clone(), stage()[0].clone()];
     match respond(&twice, &record, &[]) {
@@ -166,7 +166,7 @@ fn models_that_cannot_be_solved_are_refused() {
 }
 
 #[test]
-fn an_unstable_model_leaves_the_range_without_a_word() {
+fn unstable_model_overflows_without_an_error() {
     let record = record(0.1, vec![vec![0.0; 2000], vec![1.0; 2000]]);
     let model = equation(0, 2.0, &[(0, 0.0, 400.0), (1, 0.0, 1.0)]);
     let found = respond(one(&model), &record, &[]).unwrap();
@@ -249,7 +249,7 @@ fn the_equation_error_is_what_remains() {
 }
 
 #[test]
-fn euler_steps_the_analytic_cases() {
+fn euler_matches_analytic_cases() {
     let (h, rows) = (0.01, 400);
     let step = vec![1.0; rows];
     // D y = −3 y + 2 u: y_k = 2/3 (1 − (1 − 3h)^k).
@@ -282,7 +282,7 @@ fn euler_steps_the_analytic_cases() {
 }
 
 #[test]
-fn euler_refuses_orders_that_it_cannot_step() {
+fn euler_rejects_unsupported_orders() {
     let signals = vec![vec![0.0; 5]; 3];
     let good = equation(0, 2.0, &[(0, 1.0, 1.0)]);
     for (bad, position) in [
@@ -363,7 +363,7 @@ fn the_margin_is_the_divisor_at_the_nyquist_frequency() {
 }
 
 #[test]
-fn the_scheme_grows_where_its_margin_is_not_positive() {
+fn scheme_is_unstable_without_positive_margin() {
     // D^α y = −c y + u: below the limit of c the alternating mode dies out, above it the response grows without bound.
     for alpha in [1.4, 1.8, 2.0] {
         let step = 0.01;
@@ -398,7 +398,7 @@ proptest! {
     #![proptest_config(cases(32))]
 
     #[test]
-    fn runs_are_linear_in_inputs_and_deaf_to_the_past(seed in any::<u64>(), c in -3.0..3.0_f64, late in 1usize..200) {
+    fn simulation_is_linear_in_inputs_and_causal(seed in any::<u64>(), c in -3.0..3.0_f64, late in 1usize..200) {
         let model = stage();
         let m = 300;
         let (first, second) = (driven(m, 0.01, seed), driven(m, 0.01, seed ^ 1));
@@ -418,7 +418,7 @@ proptest! {
     }
 
     #[test]
-    fn a_longer_record_begins_like_a_shorter_one(seed in any::<u64>(), m in 2usize..600) {
+    fn longer_record_begins_with_the_shorter_one(seed in any::<u64>(), m in 2usize..600) {
         let model = stage();
         let long = driven(600, 0.01, seed);
         let short = record(0.01, (0..3).map(|s| long.signal(s)[..m].to_vec()).collect());
@@ -429,7 +429,7 @@ proptest! {
     }
 
     #[test]
-    fn what_a_fit_says_a_run_does(seed in any::<u64>()) {
+    fn fit_response_matches_simulation(seed in any::<u64>()) {
         let truth = equation(0, 1.6, &[(0, 0.5, -4.0), (0, 0.0, -6.0), (2, 0.0, 5.0)]);
         let record = closed(one(&truth), &driven(256, 0.02, seed), &[]);
         let s = structure(0, 1.6, &[(0, 0.5), (0, 0.0), (2, 0.0)]);
@@ -442,7 +442,7 @@ proptest! {
 }
 
 #[test]
-fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
+fn unit_responses_match_simulations_of_single_initial_terms() {
     let terms = |output: usize, other: usize| {
         vec![
             Term { signal: output, order: 0.0 },
@@ -526,7 +526,7 @@ fn singular_powers_drive_filtered_equations_to_second_order() {
 }
 
 #[test]
-fn a_derivative_above_its_equations_order_is_of_what_a_signal_is_above_its_level() {
+fn improper_term_differentiates_the_deviation_from_the_level() {
     let (m, step, level) = (200, 0.02, 0.7);
     let mut random = Random::new(11);
     let input: Vec<f64> = random.signal(m).iter().map(|v| level + 0.3 * v).collect();
@@ -565,7 +565,7 @@ fn a_derivative_above_its_equations_order_is_of_what_a_signal_is_above_its_level
 }
 
 #[test]
-fn what_a_sensor_held_moves_its_output_alone() {
+fn sensor_transient_affects_its_output_alone() {
     let (m, step) = (120, 0.05);
     let lag = Filter { numerator: vec![(4.0, 0.0)], denominator: vec![(1.0, 2.0), (3.0, 1.0), (4.0, 0.0)] }
         .series(m, step)

@@ -57,7 +57,7 @@ fn compare(name: &str, equations: &[(Orders, Terms<'_>)], values: &[f64]) {
 }
 
 #[test]
-fn products_of_a_law_are_the_powers_of_time_that_their_orders_make_them() {
+fn products_of_a_law_have_consistent_powers_of_time() {
     let none: Orders = (0.0, [0.0, 0.0]);
     compare(
         "each alone",
@@ -74,7 +74,7 @@ fn products_of_a_law_are_the_powers_of_time_that_their_orders_make_them() {
 }
 
 #[test]
-fn a_number_before_terms_of_several_orders_keeps_its_own_unit_and_so_do_its_companions() {
+fn coefficient_of_several_orders_keeps_its_unit() {
     let none: Orders = (0.0, [0.0, 0.0]);
     let terms: Terms<'_> = &[(0, MU, &[(0, 1)]), (1, none, &[(1, 1)]), (1, MU, &[(1, 1), (0, 1)])];
     let clock = TimeScaling::from_runs(&problem(&[(ALPHA, terms)], 2), &SPANS);

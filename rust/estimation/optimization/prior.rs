@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_prior_is_a_further_observation() -> Result<()> {
+    fn prior_is_equivalent_to_an_observation() -> Result<()> {
         // Without the prior, x = 2 and y = 1, both with variance 1/2. The prior x = 5 has the same variance.
         let priors = [Prior { parameter: 0, mean: 5.0, deviation: 0.5_f64.sqrt() }];
         let value = |point: &[f64; 2], parameter: usize| point[parameter];

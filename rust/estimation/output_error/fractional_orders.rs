@@ -674,7 +674,7 @@ mod tests {
     }
 
     #[test]
-    fn integer_orders_have_the_samples_and_derivatives_of_their_states() -> Result<()> {
+    fn integer_orders_match_the_state_space_samples_and_derivatives() -> Result<()> {
         let (experiments, point) = ([experiment(1)?], point(2.0));
         for initial in [Initial::Rest, Initial::Caputo] {
             let model = model((2.0, 2.0), 1.0, initial);
@@ -693,7 +693,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_limits_of_differences() -> Result<()> {
+    fn derivatives_match_differences() -> Result<()> {
         let (experiments, point, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
         let orders = require(FractionalOrders::new(&model, &experiments, &point))?;
         let evaluation = orders.evaluate(&model, &experiments, &point, &[])?;
@@ -715,7 +715,7 @@ mod tests {
     }
 
     #[test]
-    fn pulses_have_the_same_limit() -> Result<()> {
+    fn block_pulses_converge_to_the_exact_samples() -> Result<()> {
         let (point, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
         let (experiments, fine_experiments) = ([experiment(1)?], [experiment(8)?]);
         let orders = require(FractionalOrders::new(&model, &experiments, &point))?;

@@ -340,7 +340,7 @@ mod tests {
     use crate::regressors::Record;
 
     #[test]
-    fn boxes_are_used_where_they_exclude_candidates_and_nowhere_else() -> Result<()> {
+    fn boxes_are_used_only_where_they_exclude_candidates() -> Result<()> {
         let input: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -0.5 }).collect();
         let answer = Record::from_rows(0.05, vec![input.clone()], None)?.integral(0, 0.8);
         let size: f64 = answer.iter().map(|y| y.abs()).sum();

@@ -442,7 +442,7 @@ mod tests {
     }
 
     #[test]
-    fn no_candidate_is_farther_from_bilinear_than_its_box_allows() -> Result<()> {
+    fn bilinear_deviation_is_within_the_box_bound() -> Result<()> {
         let mut nearest: Vec<[f64; 2]> = Vec::new();
         for case in 0..40 {
             let (record, grid) = problem(case)?;

@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_within_a_limit_is_excluded_however_alike_the_columns() {
+    fn candidates_within_the_limit_remain_for_collinear_columns() {
         let state = &mut 5;
         let (mut proved, mut open_count, mut none) = (0, 0, 0);
         for case in 0..240_u32 {

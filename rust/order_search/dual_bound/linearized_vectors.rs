@@ -553,7 +553,7 @@ mod tests {
     use super::largest;
 
     #[test]
-    fn the_largest_modulus_keeps_a_nan() {
+    fn largest_modulus_propagates_nan() {
         assert!((largest(&[1.0, -3.0, 2.0]) - 3.0).abs() < f64::EPSILON);
         for values in [[f64::NAN, 1.0, 2.0], [3.0, f64::NAN, 1.0], [1.0, 2.0, f64::NAN]] {
             assert!(largest(&values).is_nan());

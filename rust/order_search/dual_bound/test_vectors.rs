@@ -551,7 +551,7 @@ mod tests {
 
     #[test]
     #[allow(clippy::cast_precision_loss)]
-    fn a_few_at_a_time_are_what_each_is_alone() -> crate::error::Result<()> {
+    fn batched_test_vectors_match_single_ones() -> crate::error::Result<()> {
         // Long enough for three batches of sixteen vectors.
         let (m, count) = (VECTOR_SPECTRA_BYTES / 32 / 6, 2 * LANE_COUNT);
         let record = Record::from_rows(1e-3, vec![(0..m).map(|k| libm::sin(k as f64 * 0.01)).collect()], None)?;
@@ -593,7 +593,7 @@ mod tests {
     }
 
     #[test]
-    fn who_was_told_to_stop_makes_no_more_columns_and_holds_no_more_vectors() -> crate::error::Result<()> {
+    fn stop_request_ends_column_computation_and_frees_vectors() -> crate::error::Result<()> {
         let m = 64;
         let record = Record::from_rows(0.1, vec![vec![1.0; m]], None)?;
         let mut index = Index::default();
@@ -621,7 +621,7 @@ mod tests {
     }
 
     #[test]
-    fn ways_are_no_shorter_than_what_lies_between() -> crate::error::Result<()> {
+    fn path_lengths_are_at_least_the_distances() -> crate::error::Result<()> {
         let (m, count) = (96, LANE_COUNT);
         let record = Record::from_rows(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
         let mut index = Index::default();

@@ -268,7 +268,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_failures_are_listed_in_any_order_of_arrival() {
+    fn first_failures_are_independent_of_arrival_order() {
         // Index k of the permutation 0..2000 with the multiplier 1103, which is coprime to 2000.
         for begin in [0, 500, 1999] {
             let mut failures = FirstFailures::new();

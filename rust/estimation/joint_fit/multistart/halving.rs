@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn candidates_stop_only_beside_an_optimum_that_leaves_noise() {
+    fn candidates_stop_only_beside_an_optimum_at_the_noise_floor() {
         let candidate_with_status = |cost: f64, status| {
             let mut candidate = candidate_at(cost, 1.0);
             candidate.result.status = status;
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn candidate_beyond_the_limit_hides_no_later_one() {
+    fn candidate_above_the_limit_does_not_exclude_later_ones() {
         // The sequence is that of a finer grid. The cost of the last candidate is within the ratio nevertheless.
         let candidates = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];
         let orders: Vec<f64> = select_survivors(&candidates).iter().map(|r| r.result.iterate.point.orders[0]).collect();

@@ -195,7 +195,7 @@ mod tests {
     use crate::signal::block_pulse::Intersample;
 
     #[test]
-    fn coefficients_of_a_sliding_body_are_found_with_their_signs() -> Result<()> {
+    fn coefficients_of_a_sliding_body_have_physical_signs() -> Result<()> {
         // D² y = −2 D y + 3 u − 0.5 sgn(D y).
         let (rows, step) = (801, 0.01);
         let u: Vec<f64> = (0..rows).map(|k| if (k / 130) % 2 == 0 { 1.0 } else { -1.0 }).collect();
