@@ -14,15 +14,16 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Over all records, one after the other.
-fn whole(records: &[Record], of: impl Fn(&Record) -> Vec<f64>) -> Vec<f64> {
+fn concatenate_records(records: &[Record], of: impl Fn(&Record) -> Vec<f64>) -> Vec<f64> {
     records.iter().flat_map(of).collect()
 }
 
 /// Σ of the squares that least squares leave, by orthogonal columns, twice made so; and the size of all terms, in that of
 /// the output.
-fn left(records: &[Record], output: usize, terms: &[(usize, f64)]) -> (f64, f64) {
-    let target = whole(records, |r| r.signal(output).to_vec());
-    let columns: Vec<Vec<f64>> = terms.iter().map(|&(s, eta)| whole(records, |r| r.integral(s, eta))).collect();
+fn residual_squares(records: &[Record], output: usize, terms: &[(usize, f64)]) -> (f64, f64) {
+    let target = concatenate_records(records, |r| r.signal(output).to_vec());
+    let columns: Vec<Vec<f64>> =
+        terms.iter().map(|&(s, eta)| concatenate_records(records, |r| r.integral(s, eta))).collect();
     let (mut made, mut shares, mut rest): (Vec<Vec<f64>>, Vec<Vec<f64>>, Vec<f64>) = Default::default();
     for column in columns.iter().chain([&target]) {
         rest.clone_from(column);
@@ -51,13 +52,13 @@ fn left(records: &[Record], output: usize, terms: &[(usize, f64)]) -> (f64, f64)
 }
 
 /// Σ of the squares that coefficients of at most this size leave, nearly the best of these: shrunk until they are.
-fn left_by_small(records: &[Record], output: usize, terms: &[(usize, f64)], largest: f64) -> f64 {
-    let target = whole(records, |r| r.signal(output).to_vec());
+fn bounded_residual_squares(records: &[Record], output: usize, terms: &[(usize, f64)], largest: f64) -> f64 {
+    let target = concatenate_records(records, |r| r.signal(output).to_vec());
     let size = dot(&target, &target).sqrt();
     let columns: Vec<Vec<f64>> = terms
         .iter()
         .map(|&(s, eta)| {
-            let column = whole(records, |r| r.integral(s, eta));
+            let column = concatenate_records(records, |r| r.integral(s, eta));
             let inverse = size / dot(&column, &column).sqrt();
             column.into_iter().map(|x| x * inverse).collect()
         })
@@ -127,7 +128,7 @@ fn cell_bounds_do_not_exceed_residuals_of_their_orders() {
                 .collect();
             let middles: Vec<(usize, f64)> = terms.iter().map(|&(s, middle, _)| (s, middle)).collect();
             let largest = 10.0_f64.powf(random.uniform(0.3, 3.0));
-            let goal = left(&records, 0, &middles).0 * random.uniform(0.1, 1.0);
+            let goal = residual_squares(&records, 0, &middles).0 * random.uniform(0.1, 1.0);
             let (any, small) = cell_bounds(&records, 0, &terms, (largest, goal)).unwrap();
             let mut least = [f64::INFINITY; 2];
             for point in 0..12 {
@@ -141,7 +142,8 @@ fn cell_bounds_do_not_exceed_residuals_of_their_orders() {
                     (signal, middle + share * half)
                 };
                 let at: Vec<(usize, f64)> = terms.iter().map(|term| inside(&mut random, term)).collect();
-                let (exact, limited) = (left(&records, 0, &at).0, left_by_small(&records, 0, &at, largest));
+                let (exact, limited) =
+                    (residual_squares(&records, 0, &at).0, bounded_residual_squares(&records, 0, &at, largest));
                 assert!(any <= exact, "{terms:?} at {at:?}: {any:e} above {exact:e}");
                 assert!(small <= limited, "{terms:?} at {at:?} of {largest}: {small:e} above {limited:e}");
                 least = [least[0].min(exact), least[1].min(limited)];
@@ -160,7 +162,7 @@ fn cell_bounds_do_not_exceed_residuals_of_their_orders() {
     assert!(telling[1] > 300 && most[1] > 0.8, "{telling:?}, {most:?}");
 }
 
-fn asked(within: f64) -> CertificateOptions {
+fn options_within(within: f64) -> CertificateOptions {
     CertificateOptions { tolerance: within, max_coefficient: 1e3, max_cells: 400_000, threads: 2, memory: 1 << 29 }
 }
 
@@ -182,12 +184,12 @@ fn certificate_bounds_all_orders_of_a_region() {
         let records = problem(&mut random, 60);
         let region = region();
         let within = [0.05, 0.2, 0.5, 0.02][case];
-        let found = certify(&records, &region, &asked(within), &Control::default()).unwrap();
+        let found = certify(&records, &region, &options_within(within), &Control::default()).unwrap();
         let samples: usize = records.iter().map(Record::m).sum();
         let rmse = |alpha: f64, orders: &[f64]| {
             let terms: Vec<(usize, f64)> =
                 region.terms.iter().zip(orders).map(|(t, order)| (t.signal, alpha - order)).collect();
-            let (squares, size) = left(&records, 0, &terms);
+            let (squares, size) = residual_squares(&records, 0, &terms);
             ((squares / samples as f64).sqrt(), size)
         };
         println!("{found:?}");
@@ -232,7 +234,7 @@ fn threads_change_no_bit_and_cells_that_are_not_allowed_are_said() {
         certify(
             &records,
             &region(),
-            &CertificateOptions { threads, max_cells: cells, ..asked(0.3) },
+            &CertificateOptions { threads, max_cells: cells, ..options_within(0.3) },
             &Control::default(),
         )
     };
@@ -249,7 +251,7 @@ fn invalid_regions_are_rejected() {
     let mut random = Random::new(1204);
     let records = problem(&mut random, 40);
     let of = |region: &Region, within: f64| {
-        certify(&records, region, &asked(within), &Control::default()).unwrap_err().to_string()
+        certify(&records, region, &options_within(within), &Control::default()).unwrap_err().to_string()
     };
     for within in [0.0, 1.0, -0.1, f64::NAN, f64::INFINITY] {
         assert!(of(&region(), within).contains("tolerance"));
@@ -261,7 +263,7 @@ fn invalid_regions_are_rejected() {
         let error = certify(
             &records,
             &region(),
-            &CertificateOptions { max_coefficient: largest, ..asked(0.1) },
+            &CertificateOptions { max_coefficient: largest, ..options_within(0.1) },
             &Control::default(),
         )
         .unwrap_err();
@@ -276,10 +278,10 @@ fn invalid_regions_are_rejected() {
     assert!(of(&terms(Range { signal: 1, lowest: f64::NAN, highest: 0.0 }), 0.1).contains("interval of a term"));
     assert!(of(&terms(Range { signal: 0, lowest: 1.85, highest: 2.0 }), 0.1).contains("no orders in these intervals"));
     assert!(of(&Region { terms: vec![], ..region() }, 0.1).contains("0 terms"));
-    let error = certify(&[], &region(), &asked(0.1), &Control::default()).unwrap_err().to_string();
+    let error = certify(&[], &region(), &options_within(0.1), &Control::default()).unwrap_err().to_string();
     assert!(error.contains("no record"), "{error}");
     let silent = record(0.1, vec![vec![1.0; 50], vec![0.0; 50]]);
     let region = terms(Range { signal: 1, lowest: 0.0, highest: 1.0 });
-    let error = certify(&[silent], &region, &asked(0.1), &Control::default()).unwrap_err().to_string();
+    let error = certify(&[silent], &region, &options_within(0.1), &Control::default()).unwrap_err().to_string();
     assert!(error.contains("signal 1"), "{error}");
 }

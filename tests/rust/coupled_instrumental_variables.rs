@@ -11,7 +11,7 @@ use ftlm::simulate;
 use crate::common::{check, dense_solve, deviation, equation, record, relative_distance, with_signal, Random};
 
 /// Two outputs that drive each other, one input.
-fn pair() -> [Equation; 2] {
+fn coupled_equations() -> [Equation; 2] {
     [
         equation(0, 1.6, &[(0, 0.0, -20.0), (1, 0.2, 3.0), (2, 0.0, 10.0)]),
         equation(1, 2.0, &[(1, 1.0, -2.0), (1, 0.0, -90.0), (0, 0.5, 6.0)]),
@@ -19,10 +19,10 @@ fn pair() -> [Equation; 2] {
 }
 
 /// Clean and noisy record; noise in shares of each output's deviation.
-fn measured(m: usize, noise: f64, initial: &[Vec<(f64, f64)>], seed: u64) -> (Record, Record) {
+fn simulate_measurement(m: usize, noise: f64, initial: &[Vec<(f64, f64)>], seed: u64) -> (Record, Record) {
     let mut random = Random::new(seed);
     let rest = record(0.01, vec![vec![0.0; m], vec![0.0; m], random.steps(m, 60)]);
-    let outputs = simulate::respond(&pair(), &rest, initial).unwrap();
+    let outputs = simulate::respond(&coupled_equations(), &rest, initial).unwrap();
     let (mut clean, mut noisy) = (rest.clone(), rest);
     for (i, output) in outputs.iter().enumerate() {
         let sigma = noise * deviation(output);
@@ -32,7 +32,7 @@ fn measured(m: usize, noise: f64, initial: &[Vec<(f64, f64)>], seed: u64) -> (Re
     (clean, noisy)
 }
 
-fn projected(noisy: &Record, at_rest: bool) -> Record {
+fn project_record(noisy: &Record, at_rest: bool) -> Record {
     let substitutes =
         (0..3).map(|s| if s < 2 { project(noisy, s, &[2], at_rest).unwrap() } else { noisy.signal(s).to_vec() });
     noisy.clone().with_clean(substitutes.map(PulseMeans::new).collect()).unwrap()
@@ -93,8 +93,8 @@ fn dense_step(noisy: &Record, start: &[Equation; 2], fixed: &[Vec<Option<f64>>; 
 
 #[test]
 fn one_step_of_both_equations_matches_full_matrices() {
-    let (_, noisy) = measured(120, 0.02, &[vec![], vec![]], 3);
-    let mut start = pair();
+    let (_, noisy) = simulate_measurement(120, 0.02, &[vec![], vec![]], 3);
+    let mut start = coupled_equations();
     for (k, factor) in [1.05, 0.93, 0.96].into_iter().enumerate() {
         start[0].coefficients[k] *= factor;
         start[1].coefficients[k] /= factor;
@@ -130,9 +130,9 @@ fn exact_data_of_several_records_with_initial_terms_is_a_fixed_point() {
     let records: Vec<Record> = [(500, 5), (420, 6)]
         .into_iter()
         .zip(&starts)
-        .map(|((m, seed), initial)| projected(&measured(m, 0.0, initial, seed).1, false))
+        .map(|((m, seed), initial)| project_record(&simulate_measurement(m, 0.0, initial, seed).1, false))
         .collect();
-    let truth = pair();
+    let truth = coupled_equations();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let initial = Initial::Powers(vec![0.0, 1.0]);
     let found =
@@ -151,9 +151,9 @@ fn exact_data_of_several_records_with_initial_terms_is_a_fixed_point() {
 
 #[test]
 fn likelihood_is_stationary_at_convergence() {
-    let (_, noisy) = measured(900, 0.05, &[vec![], vec![]], 11);
-    let noisy = projected(&noisy, true);
-    let truth = pair();
+    let (_, noisy) = simulate_measurement(900, 0.05, &[vec![], vec![]], 11);
+    let noisy = project_record(&noisy, true);
+    let truth = coupled_equations();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let settings = InstrumentalSettings { iterations: 40, tolerance: 1e-10 };
     let found =
@@ -193,12 +193,12 @@ fn likelihood_is_stationary_at_convergence() {
 
 #[test]
 fn scores_have_the_stated_covariance() {
-    let truth = pair();
+    let truth = coupled_equations();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let mut scores = vec![Vec::new(); 6];
     for seed in 0..30 {
-        let (_, noisy) = measured(900, 0.05, &[vec![], vec![]], 100 + seed);
-        let noisy = projected(&noisy, true);
+        let (_, noisy) = simulate_measurement(900, 0.05, &[vec![], vec![]], 100 + seed);
+        let noisy = project_record(&noisy, true);
         let found = fit(
             &[noisy],
             &structures,
@@ -227,8 +227,8 @@ fn scores_have_the_stated_covariance() {
 
 #[test]
 fn unstable_start_is_unchanged() {
-    let (_, noisy) = measured(400, 0.02, &[vec![], vec![]], 17);
-    let truth = pair();
+    let (_, noisy) = simulate_measurement(400, 0.02, &[vec![], vec![]], 17);
+    let truth = coupled_equations();
     let structures = [truth[0].structure.clone(), truth[1].structure.clone()];
     let (one, exponents, excluded_terms) = (std::slice::from_ref(&noisy), [vec![], vec![]], [vec![], vec![]]);
     let fixed = [vec![None; 3], vec![None; 3]];

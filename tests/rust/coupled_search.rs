@@ -89,7 +89,7 @@ fn options() -> Options {
     }
 }
 
-fn free() -> Vec<Vec<Option<f64>>> {
+fn free_coefficients() -> Vec<Vec<Option<f64>>> {
     vec![vec![None; 4]; 2]
 }
 
@@ -100,7 +100,7 @@ fn scales(records: &[Record]) -> Vec<f64> {
 
 fn run(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> StageOutcome {
     let control = Control::default();
-    let found = search(records, lattice, &free(), &scales(records), options, &control).unwrap();
+    let found = search(records, lattice, &free_coefficients(), &scales(records), options, &control).unwrap();
     let counts = found.counts;
     let sum = counts.table_rows
         + counts.beaten
@@ -153,7 +153,7 @@ fn tuples_without_a_valid_equation_are_omitted() {
     let narrow = vec![vec![2.0], vec![2.0], vec![0.5], vec![0.8], vec![0.8]];
     let lattice = OrderLawGrid::new(&narrow, &two_link(), &INPUTS).unwrap();
     assert_eq!(lattice.structures(0), None);
-    let found = search(&[data(50, 0.0, 1)], &lattice, &free(), &[1.0; 2], &options(), &Control::default());
+    let found = search(&[data(50, 0.0, 1)], &lattice, &free_coefficients(), &[1.0; 2], &options(), &Control::default());
     assert!(matches!(found, Err(Error::EmptyOrderGrid { .. })));
 }
 
@@ -171,7 +171,7 @@ fn empty_and_oversized_law_grids_are_rejected() {
 }
 
 /// Every tuple by the plain way: each equation fitted and run on its own.
-fn enumerated(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> Vec<(f64, u64)> {
+fn enumerate_tuples(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> Vec<(f64, u64)> {
     let scales = scales(records);
     let mut all = Vec::new();
     for index in 0..lattice.product() {
@@ -223,7 +223,7 @@ fn the_joined_tables_are_the_enumeration() {
         (&one, Options { initial: Initial::Powers(vec![0.0, 1.0]), ..options() }),
         (&two, Options { norm: Norm::L2, initial: Initial::Caputo, ..options() }),
     ] {
-        let naive = enumerated(records, &lattice, &change);
+        let naive = enumerate_tuples(records, &lattice, &change);
         let found = run(records, &lattice, &change);
         assert_eq!(found.counts.candidates, naive.len() as u64);
         for (row, (score, _)) in found.rows.iter().zip(&naive) {
@@ -295,7 +295,7 @@ fn join_of_any_order_law_matches_enumeration() {
         let (found, brute) = (of(&options).unwrap(), of(&Options { pruning: false, ..options.clone() }).unwrap());
         assert_eq!(found.counts.candidates, valid);
         assert_eq!(found.rows, brute.rows);
-        let naive = enumerated(&records, &lattice, &options);
+        let naive = enumerate_tuples(&records, &lattice, &options);
         let finite = |row: &&(f64, u64)| row.0.is_finite();
         for (row, (score, _)) in found.rows.iter().zip(naive.iter().filter(finite)) {
             let (own, _) = naive.iter().find(|(_, index)| *index == row.index).unwrap();
@@ -371,7 +371,8 @@ fn candidates_can_be_simulated_in_any_blocks_and_order() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
     let make = || {
         let lattice = std::borrow::Cow::Borrowed(&lattice);
-        CoupledSearch::new(&records, lattice, &free(), &scales(&records), &options, &pool, &control).unwrap()
+        CoupledSearch::new(&records, lattice, &free_coefficients(), &scales(&records), &options, &pool, &control)
+            .unwrap()
     };
     let ((stage, mut course), (elsewhere, _)) = (make(), make());
     let (mut waves, mut followed) = (0, 0);
@@ -419,7 +420,9 @@ fn equations_of_very_different_weight_are_joined() {
     for scales in [[1e20, 1.0], [1.0, 1e20], [1e-20, 1.0]] {
         for keep in [1, 5] {
             let change = Options { top: keep, ..options() };
-            let of = |o: &Options| search(&records, &lattice, &free(), &scales, o, &Control::default()).unwrap();
+            let of = |o: &Options| {
+                search(&records, &lattice, &free_coefficients(), &scales, o, &Control::default()).unwrap()
+            };
             let brute = of(&Options { pruning: false, ..change.clone() });
             assert_eq!(of(&change).rows, brute.rows, "scales {scales:?}");
         }
@@ -433,7 +436,7 @@ fn singular_and_diverged_tuples_are_counted() {
     let base = data(2000, 0.01, 72);
     // A current that never flows.
     let silent = with_signal(&base, 2, vec![0.0; 2000]);
-    let found = search(&[silent], &lattice, &free(), &[1.0; 2], &options(), &Control::default()).unwrap();
+    let found = search(&[silent], &lattice, &free_coefficients(), &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.singular, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
     let accepted: Vec<u64> = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).collect();
     let listed: Vec<(u64, Failure)> = accepted.iter().map(|&i| (i, Failure::Singular)).collect();
@@ -442,13 +445,19 @@ fn singular_and_diverged_tuples_are_counted() {
     let fine = OrderLawGrid::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
     for threads in [1, 3] {
         let options = Options { threads, ..options() };
-        let found =
-            search(&[with_signal(&base, 2, vec![0.0; 2000])], &fine, &free(), &[1.0; 2], &options, &Control::default());
+        let found = search(
+            &[with_signal(&base, 2, vec![0.0; 2000])],
+            &fine,
+            &free_coefficients(),
+            &[1.0; 2],
+            &options,
+            &Control::default(),
+        );
         let first = (0..fine.product()).filter(|&i| fine.structures(i).is_some()).take(100);
         assert_eq!(found.unwrap().failures, first.map(|i| (i, Failure::Singular)).collect::<Vec<_>>());
     }
     // Known coefficients with which every run explodes.
-    let mut fixed = free();
+    let mut fixed = free_coefficients();
     (fixed[1][0], fixed[1][2]) = (Some(2e3), Some(0.0));
     let found = search(&[base], &lattice, &fixed, &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.diverged, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
@@ -462,16 +471,19 @@ fn coupled_search_ends_after_a_stop_request_and_checks_its_arguments() {
     let records = [data(100, 0.01, 73)];
     let control = Control::default();
     control.stop.set();
-    let found = search(&records, &lattice, &free(), &[1.0; 2], &options(), &control);
+    let found = search(&records, &lattice, &free_coefficients(), &[1.0; 2], &options(), &control);
     assert_eq!(found, Err(Error::Interrupted));
     let run = |fixed: &[Vec<Option<f64>>], scales: &[f64], options: &Options| {
         search(&records, &lattice, fixed, scales, options, &Control::default()).unwrap_err()
     };
-    assert!(matches!(run(&free()[..1], &[1.0; 2], &options()), Error::Length { .. }));
+    assert!(matches!(run(&free_coefficients()[..1], &[1.0; 2], &options()), Error::Length { .. }));
     assert!(matches!(run(&[vec![None; 4], vec![None; 3]], &[1.0; 2], &options()), Error::Length { .. }));
-    assert!(matches!(run(&free(), &[1.0], &options()), Error::Length { .. }));
-    assert!(matches!(run(&free(), &[1.0; 2], &Options { threads: 0, ..options() }), Error::OutOfRange { .. }));
-    assert!(matches!(run(&free(), &[1.0; 2], &Options { top: 0, ..options() }), Error::OutOfRange { .. }));
-    let none = search(&[], &lattice, &free(), &[1.0; 2], &options(), &Control::default());
+    assert!(matches!(run(&free_coefficients(), &[1.0], &options()), Error::Length { .. }));
+    assert!(matches!(
+        run(&free_coefficients(), &[1.0; 2], &Options { threads: 0, ..options() }),
+        Error::OutOfRange { .. }
+    ));
+    assert!(matches!(run(&free_coefficients(), &[1.0; 2], &Options { top: 0, ..options() }), Error::OutOfRange { .. }));
+    let none = search(&[], &lattice, &free_coefficients(), &[1.0; 2], &options(), &Control::default());
     assert!(matches!(none, Err(Error::Length { .. })));
 }

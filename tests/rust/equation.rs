@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use crate::common::{cases, check, check_between, deviation, distance, equation, norm, orders, record, structure};
 
 /// Signals 0 and 1 are outputs, 2 is an input.
-fn checked(structure: &Structure) -> Result<(), Error> {
+fn check_structure(structure: &Structure) -> Result<(), Error> {
     structure.check(3, |s| s == 2)
 }
 
@@ -19,13 +19,13 @@ fn valid_orders_are_accepted() {
         structure(1, 3.0, &[(1, 2.99), (0, 3.0)]),
         structure(0, 0.05, &[]),
     ] {
-        assert_eq!(checked(&good), Ok(()));
+        assert_eq!(check_structure(&good), Ok(()));
     }
 }
 
 #[test]
 fn invalid_orders_are_reported() {
-    let refused = |s: &Structure, name: &str, value: f64, range: &str| match checked(s) {
+    let refused = |s: &Structure, name: &str, value: f64, range: &str| match check_structure(s) {
         Err(Error::OutOfRange { name: n, value: v, range: r, .. }) => {
             assert_eq!((n.as_str(), r.as_str()), (name, range));
             assert!(v == value || v.is_nan() && value.is_nan());
@@ -45,7 +45,7 @@ fn invalid_orders_are_reported() {
         refused(&structure(0, 2.0, &[(2, order)]), "order of term 0", order, "[-3, 3)");
     }
     for missing in [structure(3, 2.0, &[]), structure(0, 2.0, &[(3, 0.0)])] {
-        match checked(&missing) {
+        match check_structure(&missing) {
             Err(error @ Error::Structure { .. }) => {
                 assert!(error.to_string().starts_with("the equation contains signal 3, but the record has 3 signals"));
             }
@@ -63,8 +63,8 @@ fn orders_are_rounded_to_the_order_resolution() {
     assert_eq!(s.integration(0).to_bits(), 0.05_f64.to_bits());
     assert_eq!(s.integration(1), 0.0);
     // Equal within the grain is equal: an other-signal term may have alpha's order.
-    assert_eq!(checked(&structure(0, 1.95, &[(1, 1.95 + 1e-12)])), Ok(()));
-    assert!(checked(&structure(0, 1.95, &[(0, 1.95 - 1e-12)])).is_err());
+    assert_eq!(check_structure(&structure(0, 1.95, &[(1, 1.95 + 1e-12)])), Ok(()));
+    assert!(check_structure(&structure(0, 1.95, &[(0, 1.95 - 1e-12)])).is_err());
 }
 
 #[test]
@@ -84,7 +84,7 @@ fn initial_exponents_are_those_of_caputo() {
 }
 
 /// D^1.8 y + 2 D^0.9 y + y = 0 from y(0) = 1, y'(0) = 0, on m pulses of [0, 10].
-fn from_one(m: usize) -> (Equation, ftlm::regressors::Record) {
+fn relaxation_from_one(m: usize) -> (Equation, ftlm::regressors::Record) {
     let model = equation(0, 1.8, &[(0, 0.9, -2.0), (0, 0.0, -1.0)]);
     let rest = record(10.0 / m as f64, vec![vec![0.0; m]]);
     // Caputo: y = y(0) − 2 I^0.9 (y − y(0)) − I^1.8 y, and I^0.9 1 = t^0.9/Γ(1.9).
@@ -118,7 +118,7 @@ fn offset_adds_one_power_of_time_for_every_kind_of_initial_terms() {
 #[test]
 fn nonzero_initial_state_needs_the_fractional_initial_term() {
     for m in [500, 2048] {
-        let (model, record) = from_one(m);
+        let (model, record) = relaxation_from_one(m);
         let size = deviation(record.signal(0)) * (m as f64).sqrt();
         let nr = |powers: &[f64]| {
             let initial = Initial::Powers(powers.to_vec());

@@ -21,7 +21,7 @@ use crate::common::{
 };
 
 /// A record whose signal 0 obeys the equation exactly, driven by two random inputs, with this much noise added.
-fn obeying(
+fn simulate_record(
     model: &ftlm::equation::Equation,
     m: usize,
     step: f64,
@@ -36,7 +36,7 @@ fn obeying(
     with_signal(&rest, 0, y)
 }
 
-fn damped() -> ftlm::equation::Equation {
+fn damped_equation() -> ftlm::equation::Equation {
     equation(0, 1.8, &[(0, 0.9, -3.0), (0, 0.0, -10.0), (1, 0.0, 4.0), (2, 0.3, 0.7)])
 }
 
@@ -45,8 +45,8 @@ const FREE: [Option<f64>; 4] = [None; 4];
 #[test]
 fn coefficients_of_exact_data_are_recovered() {
     for (seed, m) in [(40, 300), (41, 1024), (42, 2500)] {
-        let model = damped();
-        let record = obeying(&model, m, 0.01, &[], 0.0, seed);
+        let model = damped_equation();
+        let record = simulate_record(&model, m, 0.01, &[], 0.0, seed);
         let found = least_squares::fit(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         check("recovered coefficients", relative_distance(&found.coefficients, &model.coefficients), 1e-12);
         assert_eq!((found.initial, found.exponents, found.excluded_terms), (vec![vec![]], vec![], vec![]));
@@ -55,8 +55,8 @@ fn coefficients_of_exact_data_are_recovered() {
 
 #[test]
 fn fixed_coefficients_stay_and_the_others_are_recovered() {
-    let model = damped();
-    let record = obeying(&model, 600, 0.01, &[], 0.0, 43);
+    let model = damped_equation();
+    let record = simulate_record(&model, 600, 0.01, &[], 0.0, 43);
     for fixed in [
         [Some(-3.0), None, None, None],
         [None, Some(-10.0), Some(4.0), None],
@@ -78,14 +78,14 @@ fn fixed_coefficients_stay_and_the_others_are_recovered() {
 
 #[test]
 fn records_keep_their_own_length_step_and_initial_terms() {
-    let model = damped();
+    let model = damped_equation();
     let initial: [&[(f64, f64)]; 3] =
         [&[(0.0, 0.5), (0.9, 1.5), (1.0, -0.3)], &[], &[(0.0, -1.0), (0.9, -3.0), (1.0, 2.0)]];
     let records: Vec<Record> = [(400, 0.01), (256, 0.02), (777, 0.004)]
         .into_iter()
         .zip(initial)
         .zip(44..)
-        .map(|(((m, step), initial), seed)| obeying(&model, m, step, initial, 0.0, seed))
+        .map(|(((m, step), initial), seed)| simulate_record(&model, m, step, initial, 0.0, seed))
         .collect();
     let powers = Initial::Powers(vec![0.0, 0.9, 1.0]);
     let found = least_squares::fit(&records, &model.structure, &FREE, &powers).unwrap();
@@ -104,10 +104,10 @@ fn records_keep_their_own_length_step_and_initial_terms() {
 #[test]
 fn a_record_through_a_sensor_filter_keeps_its_equation() {
     // Series commute: filtered signals obey the equation of the unfiltered ones, with filtered initial terms.
-    let model = damped();
+    let model = damped_equation();
     let initial = [(0.0, 0.5), (0.9, 1.5), (1.0, -0.3)];
     let m = 500;
-    let plain = obeying(&model, m, 0.01, &initial, 0.0, 65);
+    let plain = simulate_record(&model, m, 0.01, &initial, 0.0, 65);
     let filter: Vec<f64> = (0..m).map(|k| 0.2 * 0.8_f64.powi(i32::try_from(k).unwrap())).collect();
     let signals = (0..3).map(|s| series::multiply_naive(&filter, plain.signal(s), m)).collect();
     let filtered = Record::new(0.01, PulseMeans::from_signals(signals), Some(filter.clone())).unwrap();
@@ -123,8 +123,8 @@ fn a_record_through_a_sensor_filter_keeps_its_equation() {
 
 #[test]
 fn regression_matches_the_equation() {
-    let model = damped();
-    let records = [obeying(&model, 100, 0.01, &[], 0.1, 47), obeying(&model, 60, 0.02, &[], 0.1, 48)];
+    let model = damped_equation();
+    let records = [simulate_record(&model, 100, 0.01, &[], 0.1, 47), simulate_record(&model, 60, 0.02, &[], 0.1, 48)];
     let fixed = [None, Some(-10.0), None, None];
     let regression = Regression::new(&records, &model.structure, &fixed, &Initial::Caputo).unwrap();
     // Caputo: 1, t and t^0.9 of the output, t^1.5 of the second input, for each record.
@@ -150,8 +150,8 @@ fn regression_matches_the_equation() {
 
 #[test]
 fn dependent_terms_are_named_and_dependent_initial_terms_dropped() {
-    let model = damped();
-    let base = obeying(&model, 300, 0.01, &[], 0.01, 49);
+    let model = damped_equation();
+    let base = simulate_record(&model, 300, 0.01, &[], 0.01, 49);
     // The second input is three times the first, and both enter at one order.
     let copied = with_signal(&base, 2, base.signal(1).iter().map(|v| 3.0 * v).collect());
     let doubled = structure(0, 1.8, &[(0, 0.9), (1, 0.0), (0, 0.0), (2, 0.0)]);
@@ -183,8 +183,8 @@ fn dependent_terms_are_named_and_dependent_initial_terms_dropped() {
 
 #[test]
 fn unfittable_problems_are_rejected() {
-    let model = damped();
-    let record = obeying(&model, 50, 0.01, &[], 0.0, 50);
+    let model = damped_equation();
+    let record = simulate_record(&model, 50, 0.01, &[], 0.0, 50);
     let refused = Error::Length { name: "fixed coefficients".into(), expected: 4, found: 3 };
     let fit = |records: &[Record], fixed: &[Option<f64>]| {
         least_squares::fit(records, &model.structure, fixed, &Initial::Rest)
@@ -192,7 +192,7 @@ fn unfittable_problems_are_rejected() {
     assert_eq!(fit(std::slice::from_ref(&record), &[None; 3]), Err(refused));
     assert!(matches!(fit(&[], &FREE), Err(Error::Length { .. })));
     // Fewer rows than coefficients.
-    let short = obeying(&model, 3, 0.01, &[], 0.0, 51);
+    let short = simulate_record(&model, 3, 0.01, &[], 0.0, 51);
     assert!(matches!(fit(&[short], &FREE), Err(Error::Singular { .. })));
     let innovation = Innovation { length: 1, prior: Prior::Absolute(1.0), row_basis: RowBasis::Haar };
     for bad in [
@@ -211,9 +211,9 @@ fn unfittable_problems_are_rejected() {
 
 #[test]
 fn least_squares_is_the_same_in_haar_coordinates() {
-    let model = damped();
+    let model = damped_equation();
     for seed in 52..56 {
-        let record = obeying(&model, 1024, 0.01, &[], 0.02, seed);
+        let record = simulate_record(&model, 1024, 0.01, &[], 0.02, seed);
         let time = least_squares::fit(std::slice::from_ref(&record), &model.structure, &FREE, &Initial::Rest).unwrap();
         let mut regression = Regression::new(&[record], &model.structure, &FREE, &Initial::Rest).unwrap();
         for series in regression.columns.iter_mut().chain([&mut regression.target]) {
@@ -225,7 +225,7 @@ fn least_squares_is_the_same_in_haar_coordinates() {
 }
 
 /// The recursion (44) in its covariance form, by dense solves: K ← K − K Q (I + QᵀKQ)⁻¹ QᵀK, X ← X + K Q (m − QᵀX).
-fn published(columns: &[Vec<f64>], target: &[f64], p: usize, prior: f64) -> Vec<f64> {
+fn published_recursion(columns: &[Vec<f64>], target: &[f64], p: usize, prior: f64) -> Vec<f64> {
     let k = columns.len();
     let mut x = vec![0.0; k];
     let mut covariance = vec![0.0; k * k];
@@ -264,8 +264,8 @@ fn published(columns: &[Vec<f64>], target: &[f64], p: usize, prior: f64) -> Vec<
 
 #[test]
 fn the_recursion_is_the_published_one() {
-    let model = damped();
-    let record = obeying(&model, 128, 0.02, &[], 0.02, 56);
+    let model = damped_equation();
+    let record = simulate_record(&model, 128, 0.02, &[], 0.02, 56);
     for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 2, 5, 200] {
             let innovation = Innovation { length, prior: Prior::Absolute(10.0), row_basis: rows };
@@ -277,7 +277,7 @@ fn the_recursion_is_the_published_one() {
                     operational_matrices::haar_transform(series).unwrap();
                 }
             }
-            let oracle = published(&regression.columns, &regression.target, length, 10.0);
+            let oracle = published_recursion(&regression.columns, &regression.target, length, 10.0);
             check(
                 &format!("recursion, p = {length}, {rows:?}"),
                 relative_distance(&found.coefficients, &oracle),
@@ -289,9 +289,9 @@ fn the_recursion_is_the_published_one() {
 
 #[test]
 fn the_recursion_ends_at_the_closed_form() {
-    let model = damped();
-    let one = [obeying(&model, 512, 0.01, &[], 0.02, 57)];
-    let two = [obeying(&model, 256, 0.01, &[], 0.02, 58), obeying(&model, 128, 0.02, &[], 0.02, 59)];
+    let model = damped_equation();
+    let one = [simulate_record(&model, 512, 0.01, &[], 0.02, 57)];
+    let two = [simulate_record(&model, 256, 0.01, &[], 0.02, 58), simulate_record(&model, 128, 0.02, &[], 0.02, 59)];
     let fixed = [None, None, Some(4.0), None];
     let mut worst = 0.0_f64;
     for (records, fixed, initial) in [
@@ -327,8 +327,8 @@ fn row_weight_equals_its_number_of_uses() {
     assert_eq!(weights(3, 6), [3, 3, 3, 3, 2, 1]);
     assert_eq!(weights(9, 4), [4, 3, 2, 1]);
     // The closed form against the normal equations written out with these weights.
-    let model = damped();
-    let record = obeying(&model, 64, 0.03, &[], 0.05, 60);
+    let model = damped_equation();
+    let record = simulate_record(&model, 64, 0.03, &[], 0.05, 60);
     for rows in [RowBasis::Haar, RowBasis::Time] {
         for length in [1, 4, 64, 100] {
             let innovation = Innovation { length, prior: Prior::Absolute(50.0), row_basis: rows };
@@ -354,8 +354,8 @@ fn row_weight_equals_its_number_of_uses() {
 
 #[test]
 fn estimate_without_prior_is_independent_of_innovation_length_and_coordinates() {
-    let model = damped();
-    let record = obeying(&model, 512, 0.01, &[], 0.02, 61);
+    let model = damped_equation();
+    let record = simulate_record(&model, 512, 0.01, &[], 0.02, 61);
     let records = std::slice::from_ref(&record);
     let of = |length, prior_covariance, rows| {
         let innovation = Innovation { length, prior: Prior::Absolute(prior_covariance), row_basis: rows };
@@ -378,9 +378,9 @@ fn estimate_without_prior_is_independent_of_innovation_length_and_coordinates() 
 
 #[test]
 fn banks_hold_the_integrals() {
-    let model = damped();
+    let model = damped_equation();
     for filter in [false, true] {
-        let base = obeying(&model, 200, 0.02, &[], 0.1, 62);
+        let base = simulate_record(&model, 200, 0.02, &[], 0.1, 62);
         let series: Vec<f64> = (0..200).map(|k| 0.5_f64.powi(k + 1)).collect();
         let signals = (0..3).map(|s| base.signal(s).to_vec()).collect();
         let record = Record::new(0.02, PulseMeans::from_signals(signals), filter.then_some(series)).unwrap();
@@ -621,8 +621,8 @@ proptest! {
 
     #[test]
     fn scaling_a_signal_scales_its_coefficient(factor in 1e-6..1e6_f64, seed in 0u64..50) {
-        let model = damped();
-        let base = obeying(&model, 200, 0.02, &[], 0.05, seed);
+        let model = damped_equation();
+        let base = simulate_record(&model, 200, 0.02, &[], 0.05, seed);
         let scaled = with_signal(&base, 1, base.signal(1).iter().map(|v| factor * v).collect());
         let of = |record: Record, s: &Structure| least_squares::fit(&[record], s, &FREE, &Initial::Rest).unwrap().coefficients;
         let (plain, mut other) = (of(base, &model.structure), of(scaled, &model.structure));

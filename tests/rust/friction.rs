@@ -245,7 +245,7 @@ fn friction_without_velocity_is_rejected() -> Result<(), Error> {
 }
 
 /// Of bodies at rest with Coulomb friction, every combination of sliding to either side and resting that is consistent.
-fn consistent(most: &[f64], p: &[f64], gains: &[f64]) -> Vec<Vec<f64>> {
+fn consistent_forces(most: &[f64], p: &[f64], gains: &[f64]) -> Vec<Vec<f64>> {
     let n = most.len();
     let mut found = Vec::new();
     for code in 0..3_usize.pow(n as u32) {
@@ -312,7 +312,7 @@ fn exactly_one_combination_of_resting_bodies_is_consistent() {
         tried += 1;
         let most: Vec<f64> = (0..n).map(|_| random.uniform(0.1, 2.0)).collect();
         let p: Vec<f64> = (0..n).map(|_| random.uniform(-2.0, 2.0)).collect();
-        let all = consistent(&most, &p, &gains);
+        let all = consistent_forces(&most, &p, &gains);
         assert_eq!(all.len(), 1, "{gains:?} {p:?}");
         let laws = most.iter().map(|f| FrictionLaw::coulomb(*f)).collect();
         let problem = FrictionProblem::new(laws, gains).expect("a P-matrix");

@@ -27,7 +27,7 @@ fn setting(m: usize) -> (ftlm::regressors::Record, Vec<Point>) {
     (record(0.01, signals), points(&mut random, 60))
 }
 
-fn made(records: Vec<ftlm::regressors::Record>, norm: Norm) -> Points {
+fn build_points(records: Vec<ftlm::regressors::Record>, norm: Norm) -> Points {
     Points::new(records, 0, SIGNALS.to_vec(), vec![false, false, true], norm).unwrap()
 }
 
@@ -35,7 +35,7 @@ fn made(records: Vec<ftlm::regressors::Record>, norm: Norm) -> Points {
 fn scores_are_those_of_the_naive_division() {
     let (record, points) = setting(300);
     let naive: Vec<f64> = points.iter().map(|p| score_naive(&record, 0, &SIGNALS, p)).collect();
-    let mut fast = made(vec![record.clone(), record.clone()], Norm::L1);
+    let mut fast = build_points(vec![record.clone(), record.clone()], Norm::L1);
     for _ in 0..2 {
         // The second time all regressors are kept ones.
         let found = fast.scores(&points, f64::INFINITY, 2, &Control::default()).unwrap();
@@ -50,7 +50,8 @@ fn scores_are_those_of_the_naive_division() {
         check("points that grow against naive, relative", worst(false), 1e-4);
         assert!(naive.iter().filter(|n| bounded(**n)).count() > 15);
     }
-    let squares = made(vec![record.clone()], Norm::L2).scores(&points, f64::INFINITY, 1, &Control::default()).unwrap();
+    let squares =
+        build_points(vec![record.clone()], Norm::L2).scores(&points, f64::INFINITY, 1, &Control::default()).unwrap();
     for (rmse, sum) in squares.iter().zip(&naive) {
         assert!(*rmse >= sum / 300.0, "{rmse:e} {:e}", sum / 300.0);
     }
@@ -59,12 +60,14 @@ fn scores_are_those_of_the_naive_division() {
 #[test]
 fn a_limit_removes_only_what_exceeds_it_and_threads_change_no_bit() {
     let (record, points) = setting(500);
-    let all = made(vec![record.clone()], Norm::L1).scores(&points, f64::INFINITY, 1, &Control::default()).unwrap();
+    let all =
+        build_points(vec![record.clone()], Norm::L1).scores(&points, f64::INFINITY, 1, &Control::default()).unwrap();
     let mut sorted = all.clone();
     sorted.sort_by(f64::total_cmp);
     let limit = sorted[20];
     for threads in [1, 2, 3, 8] {
-        let found = made(vec![record.clone()], Norm::L1).scores(&points, limit, threads, &Control::default()).unwrap();
+        let found =
+            build_points(vec![record.clone()], Norm::L1).scores(&points, limit, threads, &Control::default()).unwrap();
         let wanted: Vec<f64> = all.iter().map(|&s| if s <= limit { s } else { f64::INFINITY }).collect();
         assert_eq!(bits(&found), bits(&wanted));
     }
@@ -73,7 +76,7 @@ fn a_limit_removes_only_what_exceeds_it_and_threads_change_no_bit() {
 #[test]
 fn invalid_orders_have_infinite_error_and_nan_is_rejected() {
     let (record, points) = setting(100);
-    let mut fast = made(vec![record], Norm::L1);
+    let mut fast = build_points(vec![record], Norm::L1);
     let mut wrong = vec![points[0].clone(), points[0].clone()];
     wrong[0].orders[1] = wrong[0].order;
     wrong[1].orders[0] = wrong[1].order + 0.1;

@@ -76,7 +76,7 @@ fn structure(alpha: Order, beta: f64) -> ParametricStructure {
     }
 }
 
-fn found(structure: ParametricStructure, source: &Recordings, threads: usize) -> Result<Vec<Candidate>> {
+fn initial_guesses_of(structure: ParametricStructure, source: &Recordings, threads: usize) -> Result<Vec<Candidate>> {
     OrderGrids::new(source, threads, BANK_LIMIT, &Stop::default()).candidates(&ParameterSet::from_structure(structure)?)
 }
 
@@ -114,8 +114,8 @@ fn the_frequency_of_power_is_that_of_sums() {
 #[test]
 fn initial_guesses_contain_the_truth_for_any_number_of_threads() {
     let source = runs();
-    let one = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
-    let two = found(structure(Order::free("alpha"), 0.0), &source, 2).unwrap();
+    let one = initial_guesses_of(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
+    let two = initial_guesses_of(structure(Order::free("alpha"), 0.0), &source, 2).unwrap();
     let values = |all: &[Candidate]| all.iter().flat_map(|r| bits(&r.result.values())).collect::<Vec<_>>();
     assert_eq!(values(&one), values(&two));
     assert!(one.iter().zip(&two).all(|(a, b)| a.origin == b.origin));
@@ -148,7 +148,7 @@ fn delays_and_limits_are_tried() {
         // What is free is left to the fit, but not where it starts.
         let at = |value: f64| source.records(100, &[value]).unwrap()[0].signal(1).to_vec();
         assert_ne!(bits(&at(bounds.0)), bits(&at(bounds.1)), "{name}");
-        let all = found(structure_with_input, &source, 1).unwrap();
+        let all = initial_guesses_of(structure_with_input, &source, 1).unwrap();
         let mut tried: Vec<f64> = all.iter().map(|r| r.result.iterate.point.inputs[0]).collect();
         tried.dedup();
         assert!(all[0].origin.contains(words), "{}", all[0].origin);
@@ -162,11 +162,11 @@ fn delays_and_limits_are_tried() {
 #[test]
 fn structures_without_initial_guess_are_rejected() {
     let source = runs();
-    let held = found(structure(Order::number(1.7), 2.2), &source, 1).unwrap_err();
+    let held = initial_guesses_of(structure(Order::number(1.7), 2.2), &source, 1).unwrap_err();
     assert!(held.to_string().starts_with("order 2.2 of u is above alpha = 1.7 of y"), "{held}");
     let mut narrow = structure(Order::number(1.0), 0.0);
     narrow.bounds.insert("nu".into(), (1.5, 1.9));
-    let empty = found(narrow, &source, 1).unwrap_err();
+    let empty = initial_guesses_of(narrow, &source, 1).unwrap_err();
     assert!(empty.to_string().contains("no orders of signal 'y' fit below alpha = 1"), "{empty}");
     let stop = Stop::default();
     stop.set();
@@ -175,7 +175,7 @@ fn structures_without_initial_guess_are_rejected() {
 }
 
 /// Samples of y″ + 2 y′ + 400 y = u, which swings with 20 rad/s, and an input that changes every 50 of 60 000 samples.
-fn fast_swing() -> (Vec<f64>, Vec<f64>) {
+fn fast_oscillation() -> (Vec<f64>, Vec<f64>) {
     let (step, rows) = (0.01, 60_000);
     let mut random = Random::new(1);
     let u: Vec<f64> = random.signal(rows / 50).iter().flat_map(|v| std::iter::repeat_n(v.signum(), 50)).collect();
@@ -196,7 +196,7 @@ fn fast_swing() -> (Vec<f64>, Vec<f64>) {
 #[test]
 fn decimation_is_limited_by_the_bandwidth() {
     // Thinned to 1200 samples, it would be read every 0.5 s, a turn and a half; six samples in half a turn show it.
-    let (y, u) = fast_swing();
+    let (y, u) = fast_oscillation();
     let parameter_set = ParameterSet::from_structure(structure(Order::free("alpha"), 0.0)).unwrap();
     let sampling = |y: &[f64]| {
         let runs = Recordings::new(vec![recording(0.01, y.to_vec(), u.clone())]).unwrap();

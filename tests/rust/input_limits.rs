@@ -25,7 +25,7 @@ fn command(seed: u64) -> Vec<f64> {
 }
 
 /// What acts, by hand.
-fn acting(command: &[f64], law: InputLaw, limit: f64) -> Vec<f64> {
+fn apply_law_naively(command: &[f64], law: InputLaw, limit: f64) -> Vec<f64> {
     let bent = |v: f64| match law {
         InputLaw::Saturation if v > limit => limit,
         InputLaw::Saturation if v < -limit => -limit,
@@ -54,7 +54,7 @@ fn equation() -> FreeEquation {
     }
 }
 
-fn limited(law: InputLaw) -> Vec<FreeInput> {
+fn limited_inputs(law: InputLaw) -> Vec<FreeInput> {
     vec![FreeInput { signal: 1, law, bounds: (0.0, 3.0) }]
 }
 
@@ -63,14 +63,14 @@ fn linear(law: InputLaw) -> FreeModel {
         equations: vec![equation()],
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 2],
-        inputs: limited(law),
+        inputs: limited_inputs(law),
         coupled: false,
         priors: Vec::new(),
         initial: Initial::Rest,
     }
 }
 
-fn rubbing(law: InputLaw) -> NonlinearModel {
+fn friction_model(law: InputLaw) -> NonlinearModel {
     let model = FreeModel { coordinates: vec![Coordinate::Plain; 3], coupled: true, ..linear(law) };
     let frictions = vec![(0, FreeFrictionLaw::coulomb(free(2, 1.0)))];
     NonlinearModel { model, derived: vec![], frictions, filtered: vec![] }
@@ -84,7 +84,8 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let structure = Structure { output: 0, order: 1.8, terms };
     let equation = Equation { structure, coefficients: vec![-1.0, 1.5] };
     let body = NonlinearSystem::with_friction(vec![equation], vec![(0, FrictionLaw::coulomb(f))], 2);
-    let record = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; M], acting(&u, law, limit)]), None)?;
+    let record =
+        Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; M], apply_law_naively(&u, law, limit)]), None)?;
     let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let record = Record::new(STEP, PulseMeans::from_signals(vec![output.clone(), u]), None)?;
     Experiment::new(record, 1, vec![point_samples(&output)], vec![1.0])
@@ -118,7 +119,7 @@ fn derivative_by_input_limit_matches_the_residuals() -> Result<(), Error> {
                 inputs: vec![value],
                 states: vec![],
             };
-            nonlinear::fit(&rubbing(law), std::slice::from_ref(&experiment), &start, settings, &Stop::default())
+            nonlinear::fit(&friction_model(law), std::slice::from_ref(&experiment), &start, settings, &Stop::default())
         };
         let (at, up, down) = (here(1.0)?, here(1.000_001)?, here(0.999_999)?);
         let slope: Vec<f64> = up.residuals.iter().zip(&down.residuals).map(|(u, d)| (u - d) / 2e-6).collect();
@@ -138,7 +139,8 @@ fn input_limit_is_estimated_with_the_other_parameters() -> Result<(), Error> {
         let start =
             InitialGuess { orders: vec![1.9], coefficients: vec![0.7, 1.2, 0.3], inputs: vec![0.9], states: vec![] };
         let settings = MinimizationSettings { evaluations: 300, tolerance: 1e-14 };
-        let found = nonlinear::fit(&rubbing(law), &[run(law, limit, 0.5, 7)?], &start, settings, &Stop::default())?;
+        let found =
+            nonlinear::fit(&friction_model(law), &[run(law, limit, 0.5, 7)?], &start, settings, &Stop::default())?;
         assert!((found.inputs[0] - limit).abs() < 1e-4, "{law:?} {:?} {:?}", found.inputs, found.coefficients);
         assert!((found.coefficients[2] - 0.5).abs() < 1e-4, "{law:?} {:?}", found.coefficients);
     }
@@ -154,12 +156,12 @@ fn invalid_input_limits_are_rejected() -> Result<(), Error> {
     {
         let model = FreeModel { inputs: inputs.clone(), ..linear(InputLaw::Saturation) };
         assert!(matches!(model.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
-        let mut model = rubbing(InputLaw::Saturation);
+        let mut model = friction_model(InputLaw::Saturation);
         model.model.inputs = inputs;
         assert!(matches!(model.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
     }
     let late = |bounds: (f64, f64)| {
-        let mut model = rubbing(InputLaw::Saturation);
+        let mut model = friction_model(InputLaw::Saturation);
         model.model.inputs = vec![FreeInput { signal: 1, law: InputLaw::Delay, bounds }];
         model
     };

@@ -30,7 +30,7 @@ fn link() -> Equation {
 
 const FREE: [Option<f64>; 4] = [None; 4];
 
-fn measured(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed: u64) -> (Record, Record) {
+fn simulate_measurement(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed: u64) -> (Record, Record) {
     let mut random = Random::new(seed);
     let rest = record(0.01, vec![vec![0.0; m], random.steps(m, 37), random.steps(m, 23)]);
     let clean = simulate::respond(std::slice::from_ref(model), &rest, &[initial.to_vec()]).unwrap().remove(0);
@@ -39,7 +39,7 @@ fn measured(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed
 }
 
 /// Records with substitutes for their outputs.
-fn with_clean(record: &Record, output: usize, inputs: &[usize]) -> Record {
+fn with_clean_signals(record: &Record, output: usize, inputs: &[usize]) -> Record {
     let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
     signals[output] = project(record, output, inputs, true).unwrap();
     record.clone().with_clean(PulseMeans::from_signals(signals)).unwrap()
@@ -55,7 +55,7 @@ fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &In
 #[test]
 fn one_step_matches_dense_algebra() {
     let model = link();
-    let (noisy, clean) = measured(&model, 150, &[], 0.01, 1);
+    let (noisy, clean) = simulate_measurement(&model, 150, &[], 0.01, 1);
     let m = noisy.m();
     let kernel = |k: usize| block_pulse_kernel(model.structure.integration(k), m, noisy.step());
     let kernels: Vec<Vec<f64>> = (0..4).map(kernel).collect();
@@ -115,7 +115,7 @@ fn exact_data_is_a_fixed_point_from_any_number_of_records_and_initial_terms() {
     let terms: [&[(f64, f64)]; 2] = [&[(0.0, 0.5), (0.9, 1.5), (1.0, -0.3)], &[(0.0, -0.2), (0.9, 0.1), (1.0, 2.0)]];
     let records: Vec<Record> = [(700, terms[0], 2), (512, terms[1], 3)]
         .into_iter()
-        .map(|(m, initial, seed)| measured(&model, m, initial, 0.0, seed).0)
+        .map(|(m, initial, seed)| simulate_measurement(&model, m, initial, 0.0, seed).0)
         .collect();
     let initial = Initial::Powers(vec![0.0, 0.9, 1.0]);
     let structures = std::slice::from_ref(&model.structure);
@@ -139,12 +139,12 @@ fn colored_noise_leaves_the_truth_within_standard_errors() {
     let count = 30;
     let (mut by_squares, mut scores) = (vec![0.0; 4], vec![Vec::new(); 4]);
     for seed in 0..count {
-        let (noisy, clean) = measured(&model, 1024, &[], 0.0, 100 + seed);
+        let (noisy, clean) = simulate_measurement(&model, 1024, &[], 0.0, 100 + seed);
         let sigma = 0.15 * deviation(clean.signal(0));
         let mut random = Random::new(1000 + seed);
         let y: Vec<f64> = clean.signal(0).iter().map(|v| v + sigma * random.normal()).collect();
         let noisy = with_signal(&noisy, 0, y);
-        let records = [with_clean(&noisy, 0, &[1, 2])];
+        let records = [with_clean_signals(&noisy, 0, &[1, 2])];
         let squares = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
         by_squares.iter_mut().zip(&squares.coefficients).for_each(|(s, c)| *s += c / 30.0);
         let structures = std::slice::from_ref(&model.structure);
@@ -200,7 +200,7 @@ fn coupled_equations_are_simulated_from_the_input_alone() {
 #[test]
 fn units_do_not_matter() {
     let model = link();
-    let (noisy, _) = measured(&model, 600, &[], 0.001, 11);
+    let (noisy, _) = simulate_measurement(&model, 600, &[], 0.001, 11);
     let scaled = |f: [f64; 3]| {
         record(noisy.step(), (0..3).map(|s| noisy.signal(s).iter().map(|v| v * f[s]).collect()).collect())
     };
@@ -217,8 +217,8 @@ fn units_do_not_matter() {
 #[test]
 fn refinement_of_one_equation_matches_joint_refinement() {
     let model = link();
-    let (noisy, _) = measured(&model, 512, &[], 0.002, 13);
-    let whole = run(&[with_clean(&noisy, 0, &[1, 2])], &model, &FREE, &Initial::Rest);
+    let (noisy, _) = simulate_measurement(&model, 512, &[], 0.002, 13);
+    let whole = run(&[with_clean_signals(&noisy, 0, &[1, 2])], &model, &FREE, &Initial::Rest);
     let kernels: Vec<Vec<f64>> =
         (0..2).map(|k| block_pulse_kernel(model.structure.integration(k), noisy.m(), noisy.step())).collect();
     let columns: Vec<Kernel> = (0..4)
@@ -269,7 +269,7 @@ fn unstable_divisor_is_damped_and_stable_one_is_unchanged() {
 #[test]
 fn projection_keeps_excited_signal_and_removes_most_noise() {
     let model = link();
-    let (_, clean) = measured(&model, 2000, &[], 0.0, 17);
+    let (_, clean) = simulate_measurement(&model, 2000, &[], 0.0, 17);
     let kept = project(&clean, 0, &[1, 2], true).unwrap();
     check("what the projection loses", distance(&kept, clean.signal(0)) / norm(clean.signal(0)), 0.1);
     let mut random = Random::new(18);
@@ -298,7 +298,7 @@ fn projection_keeps_excited_signal_and_removes_most_noise() {
 #[test]
 fn the_projection_of_noise_does_not_depend_on_how_columns_are_rounded() {
     for (m, seed) in [(260, 31), (1000, 32), (2000, 33)] {
-        let (_, clean) = measured(&link(), m, &[], 0.0, seed);
+        let (_, clean) = simulate_measurement(&link(), m, &[], 0.0, seed);
         let mut random = Random::new(seed);
         let noise: Vec<f64> = (0..m).map(|_| random.normal()).collect();
         let only = with_signal(&clean, 0, noise.clone());
@@ -360,7 +360,7 @@ fn project_naive(record: &Record, signal: usize, inputs: &[usize]) -> Vec<f64> {
 #[test]
 fn the_projection_is_that_in_plain_sums() {
     for (m, seed, inputs) in [(60, 41, &[1, 2][..]), (260, 42, &[1, 2]), (260, 43, &[2]), (1000, 44, &[1])] {
-        let (noisy, _) = measured(&link(), m, &[], 0.5, seed);
+        let (noisy, _) = simulate_measurement(&link(), m, &[], 0.5, seed);
         let kept = project(&noisy, 0, inputs, true).unwrap();
         let naive = project_naive(&noisy, 0, inputs);
         check(&format!("{m} pulses, inputs {inputs:?}"), distance(&kept, &naive) / norm(&naive), 1e-6);
@@ -376,17 +376,18 @@ fn the_band_of_a_sine_is_its_frequency() {
 
 /// Three terms of one input whose orders lie this far apart, and an own one: regressors and instruments that are nearly
 /// alike.
-fn alike(apart: f64) -> Equation {
+fn similar_orders_equation(apart: f64) -> Equation {
     equation(0, 1.5, &[(0, 0.0, -9.0), (1, 0.3, 2.0), (1, 0.3 + apart, -1.0), (1, 0.3 + 2.0 * apart, 0.5)])
 }
 
 #[test]
 fn nearly_collinear_regressors_lose_their_condition_number_once() {
     for (apart, allowed) in [(0.1, 1e-12), (1e-3, 1e-9), (1e-4, 1e-7)] {
-        let model = alike(apart);
+        let model = similar_orders_equation(apart);
         // One record, and two: a column over all of them for each term.
         for seeds in [&[61][..], &[61, 62]] {
-            let records: Vec<Record> = seeds.iter().map(|&seed| measured(&model, 400, &[], 0.0, seed).1).collect();
+            let records: Vec<Record> =
+                seeds.iter().map(|&seed| simulate_measurement(&model, 400, &[], 0.0, seed).1).collect();
             let settings = InstrumentalSettings { iterations: 1, tolerance: 0.0 };
             let structures = std::slice::from_ref(&model.structure);
             let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, settings).unwrap();
@@ -403,8 +404,8 @@ fn nearly_collinear_regressors_lose_their_condition_number_once() {
 fn unknown_of_one_record_does_not_change_the_others() {
     let model = link();
     let started = [(0.0, 0.4), (0.9, -0.2)];
-    let (one, _) = measured(&model, 300, &started, 0.0, 63);
-    let (two, _) = measured(&model, 260, &[], 0.0, 64);
+    let (one, _) = simulate_measurement(&model, 300, &started, 0.0, 63);
+    let (two, _) = simulate_measurement(&model, 260, &[], 0.0, 64);
     let together = run(&[one.clone(), two.clone()], &model, &FREE, &Initial::Powers(vec![0.0, 0.9]));
     check("two records, one of them in motion", relative_distance(&together, &model.coefficients), 1e-8);
     let other = run(&[two, one], &model, &FREE, &Initial::Powers(vec![0.0, 0.9]));
@@ -414,7 +415,7 @@ fn unknown_of_one_record_does_not_change_the_others() {
 #[test]
 fn uninformative_instruments_are_rejected() {
     let model = link();
-    let (noisy, _) = measured(&model, 200, &[], 0.001, 19);
+    let (noisy, _) = simulate_measurement(&model, 200, &[], 0.001, 19);
     let silent = with_signal(&with_signal(&noisy, 1, vec![0.0; 200]), 2, vec![0.0; 200]);
     let structures = std::slice::from_ref(&model.structure);
     let records = [silent];
@@ -462,7 +463,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     let clean = simulate::respond(std::slice::from_ref(&model), &rest, &[vec![]]).unwrap().remove(0);
     let sigma = 0.02 * deviation(&clean);
     let noisy = with_signal(&rest, 0, clean.iter().map(|v| v + sigma * random.normal()).collect());
-    let noisy = with_clean(&noisy, 0, &[1]);
+    let noisy = with_clean_signals(&noisy, 0, &[1]);
     let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
     let terms = [axis(0, &[0.7, 0.9, 1.1]), axis(0, &[0.0, 0.2]), axis(1, &[0.0, 0.1])];
     let lattice = OrderGrid::new(0, &[1.6, 1.8, 2.0], &terms, |s| s == 1).unwrap();
@@ -553,7 +554,7 @@ fn only_candidates_above_the_threshold_are_excluded() {
                 let clean = simulate::respond(std::slice::from_ref(&model), &rest, &[vec![]]).unwrap().remove(0);
                 let sigma = 0.01 * deviation(&clean);
                 let noisy = with_signal(&rest, 0, clean.iter().map(|v| v + sigma * random.normal()).collect());
-                with_clean(&noisy, 0, &[1])
+                with_clean_signals(&noisy, 0, &[1])
             })
             .collect();
         let run = |threads, early_stopping| {

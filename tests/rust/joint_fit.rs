@@ -33,19 +33,23 @@ fn problem(equation: FreeEquation, order_bounds: &[(f64, f64)], coefficients: us
     Problem::new(vec!["y".into()], model, Vec::new()).unwrap()
 }
 
-fn alone(coefficient: usize) -> Monomial {
+fn single_coefficient(coefficient: usize) -> Monomial {
     Monomial { factor: 1.0, powers: vec![(coefficient, 1)] }
 }
 
 /// D^alpha y = d D^mu y + a y + b u, from rest; y is signal 0.
 fn three_terms() -> Problem {
     let none = || order(0.0, &[0.0, 0.0]);
-    let terms = vec![(0, order(0.0, &[0.0, 1.0]), alone(0)), (0, none(), alone(1)), (1, none(), alone(2))];
+    let terms = vec![
+        (0, order(0.0, &[0.0, 1.0]), single_coefficient(0)),
+        (0, none(), single_coefficient(1)),
+        (1, none(), single_coefficient(2)),
+    ];
     let equation = FreeEquation { output: 0, order: order(0.0, &[1.0, 0.0]), terms };
     problem(equation, &[(0.05, 3.0), (0.0, 3.0)], 3, Initial::Rest)
 }
 
-fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Recordings {
+fn sample_recordings(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Recordings {
     let run = |(y, u): (&Vec<f64>, &Vec<f64>)| {
         let y = Channel::new("y", y.clone(), Role::Output);
         let u = Channel::new("u", u.clone(), Role::Input(Intersample::Hold));
@@ -54,7 +58,7 @@ fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Recordings {
     Recordings::new(outputs.iter().zip(inputs).map(run).collect()).unwrap()
 }
 
-fn place(orders: &[f64], coefficients: &[f64]) -> Iterate {
+fn iterate_at(orders: &[f64], coefficients: &[f64]) -> Iterate {
     let point = ParameterPoint { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() };
     Iterate { point, states: Vec::new() }
 }
@@ -63,7 +67,7 @@ fn sampling(every: usize, decimation: usize) -> Sampling {
     Sampling { pulses_per_sample: every, decimation, leading_intervals: None }
 }
 
-fn weighing(weight: f64) -> Weights {
+fn output_weights(weight: f64) -> Weights {
     Weights { outputs: vec![weight], robust_weights: None }
 }
 
@@ -111,9 +115,9 @@ fn optimum_matches_another_implementation() {
         let name = case["name"].as_str().unwrap();
         let loss = if case["loss"] == "huber" { Loss::Huber } else { Loss::Squares };
         let (inputs, outputs) = (table(&case["inputs"]), table(&case["outputs"]));
-        let source = sampled(number(&told["step"]), &outputs, &inputs);
-        let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-        let (best, grid) = fit_reweighted(&place(&start[..2], &start[2..]), grid, loss).unwrap();
+        let source = sample_recordings(number(&told["step"]), &outputs, &inputs);
+        let grid = Objective::new((&problem, &source, &stop), output_weights(100.0), sampling(1, 1), false).unwrap();
+        let (best, grid) = fit_reweighted(&iterate_at(&start[..2], &start[2..]), grid, loss).unwrap();
         close(&format!("{name}: settled"), &best.values(), &numbers(&case["settled"]["values"]), END_TOLERANCE);
         close(&format!("{name}: weights"), &grid.weights.outputs, &numbers(&case["settled"]["weights"]), END_TOLERANCE);
         close(&format!("{name}: cost"), &[best.cost], &[number(&case["settled"]["cost"])], END_TOLERANCE);
@@ -181,14 +185,14 @@ fn correction_agrees_with_finer_grids(size: f64) {
         })
         .collect();
     let none = || order(0.0, &[0.0]);
-    let terms = vec![(0, none(), alone(0)), (1, none(), alone(1))];
+    let terms = vec![(0, none(), single_coefficient(0)), (1, none(), single_coefficient(1))];
     let equation = FreeEquation { output: 0, order: order(0.0, &[1.0]), terms };
     let problem = problem(equation, &[(0.05, 3.0)], 2, Initial::Rest);
     let (y, u) = (Channel::new("y", y, Role::Output), Channel::new("u", u, Role::Input(Intersample::Linear)));
     let run = Recording::new("run", step, None, vec![y, u], vec![0]).unwrap();
     let (source, stop) = (Recordings::new(vec![run]).unwrap(), Stop::default());
-    let grid = Objective::new((&problem, &source, &stop), weighing(1.0 / size), sampling(1, 1), false).unwrap();
-    let (best, grid) = fit_reweighted(&place(&[1.1], &[-2.2, 2.2]), grid, Loss::Squares).unwrap();
+    let grid = Objective::new((&problem, &source, &stop), output_weights(1.0 / size), sampling(1, 1), false).unwrap();
+    let (best, grid) = fit_reweighted(&iterate_at(&[1.1], &[-2.2, 2.2]), grid, Loss::Squares).unwrap();
     let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
     let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
     assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
@@ -224,14 +228,14 @@ fn step_correction_of_nonlinear_terms_agrees_with_finer_grids() {
     let equation = FreeEquation {
         output: 0,
         order: order(0.0, &[1.0]),
-        terms: vec![(2, none(), alone(0)), (1, none(), alone(1))],
+        terms: vec![(2, none(), single_coefficient(0)), (1, none(), single_coefficient(1))],
     };
     let square = Expression::new(vec![Instruction::Channel(0), Instruction::Power(2.0)], 1).unwrap();
     let square = DerivedSignal::new(square, vec![(0, 0.0)]).unwrap();
     let problem = problem(equation, &[(0.5, 1.5)], 2, Initial::Rest).with_derived(vec![square]);
-    let (source, stop) = (sampled(step, &[y], &[u]), Stop::default());
-    let grid = Objective::new((&problem, &source, &stop), weighing(1.0 / size), sampling(1, 1), false).unwrap();
-    let (best, grid) = fit_reweighted(&place(&[1.0], &[-1.0, 1.0]), grid, Loss::Squares).unwrap();
+    let (source, stop) = (sample_recordings(step, &[y], &[u]), Stop::default());
+    let grid = Objective::new((&problem, &source, &stop), output_weights(1.0 / size), sampling(1, 1), false).unwrap();
+    let (best, grid) = fit_reweighted(&iterate_at(&[1.0], &[-1.0, 1.0]), grid, Loss::Squares).unwrap();
     let corrected = correct_step(&best, &grid, Loss::Squares).unwrap().unwrap().into_statistics();
     let refined = refine_step(best.clone(), grid, Loss::Squares, &[]).unwrap().into_statistics();
     assert!(corrected.step_converged && corrected.pulses_per_sample == 1 && refined.pulses_per_sample > 1);
@@ -261,16 +265,19 @@ fn first_order() -> (Problem, Recordings) {
     }
     let none = || order(0.0, &[]);
     let own = Monomial { factor: -1.0, powers: vec![(0, 1)] };
-    let equation =
-        FreeEquation { output: 0, order: order(1.0, &[]), terms: vec![(0, none(), own), (1, none(), alone(1))] };
-    (problem(equation, &[], 2, Initial::Caputo), sampled(step, &[states], &[u]))
+    let equation = FreeEquation {
+        output: 0,
+        order: order(1.0, &[]),
+        terms: vec![(0, none(), own), (1, none(), single_coefficient(1))],
+    };
+    (problem(equation, &[], 2, Initial::Caputo), sample_recordings(step, &[states], &[u]))
 }
 
 #[test]
 fn alternative_start_replaces_a_stalled_one_if_its_cost_is_lower() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-    let at = |a: f64, b: f64| place(&[], &[a, b]);
+    let grid = Objective::new((&problem, &source, &stop), output_weights(100.0), sampling(1, 1), false).unwrap();
+    let at = |a: f64, b: f64| iterate_at(&[], &[a, b]);
     let stuck = grid.evaluate(&at(1.0, 1.0)).unwrap().unwrap();
     let (best, there) = best_alternative(&stuck, &grid, &[at(3.0, 1.0)], Loss::Squares).unwrap().unwrap();
     close("coefficients", &best.values(), &[2.0, 2.0], 0.03);
@@ -288,16 +295,17 @@ fn alternative_start_replaces_a_stalled_one_if_its_cost_is_lower() {
 #[test]
 fn stability_constraint_excludes_unstable_steps() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let free = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-    let steady = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), true).unwrap();
+    let free = Objective::new((&problem, &source, &stop), output_weights(100.0), sampling(1, 1), false).unwrap();
+    let steady = Objective::new((&problem, &source, &stop), output_weights(100.0), sampling(1, 1), true).unwrap();
     assert!(
-        problem.is_unstable(&place(&[], &[-2.0, 1.0]).point) && !problem.is_unstable(&place(&[], &[2.0, 1.0]).point)
+        problem.is_unstable(&iterate_at(&[], &[-2.0, 1.0]).point)
+            && !problem.is_unstable(&iterate_at(&[], &[2.0, 1.0]).point)
     );
-    let stuck = steady.evaluate(&place(&[], &[1.0, 1.0])).unwrap().unwrap();
-    let (best, _) = best_alternative(&stuck, &steady, &[place(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
+    let stuck = steady.evaluate(&iterate_at(&[], &[1.0, 1.0])).unwrap().unwrap();
+    let (best, _) = best_alternative(&stuck, &steady, &[iterate_at(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
     assert!(best.values()[0] > 0.0);
     // On a steady grid a descent from where it dies away stays there.
-    let start = place(&[], &[0.01, 1e-9]);
+    let start = iterate_at(&[], &[0.01, 1e-9]);
     let found = steady.minimize(&start, 60).unwrap();
     assert!(!problem.is_unstable(&found.iterate.point));
     assert!(free.minimize(&start, 60).unwrap().cost <= found.cost * (1.0 + 1e-9));
@@ -306,8 +314,8 @@ fn stability_constraint_excludes_unstable_steps() {
 #[test]
 fn stop_request_and_invalid_arguments_are_reported() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Objective::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
-    let start = place(&[], &[1.0, 1.0]);
+    let grid = Objective::new((&problem, &source, &stop), output_weights(100.0), sampling(1, 1), false).unwrap();
+    let start = iterate_at(&[], &[1.0, 1.0]);
     let two = Weights { outputs: vec![1.0, 1.0], robust_weights: None };
     assert!(matches!(
         Objective::new((&problem, &source, &stop), two, sampling(1, 1), false).map(|_| ()),

@@ -61,7 +61,7 @@ fn every_error_has_its_kind() {
 }
 
 /// White numbers, uniform over (−1/2, 1/2), by splitmix64.
-fn white(n: usize, seed: u64) -> Vec<f64> {
+fn white_noise(n: usize, seed: u64) -> Vec<f64> {
     let mut state = seed.wrapping_mul(0xD1B5_4A32_D192_ED03);
     (0..n)
         .map(|_| {
@@ -78,7 +78,7 @@ fn white(n: usize, seed: u64) -> Vec<f64> {
 #[test]
 fn covariances_by_spectra_match_the_definition() {
     for (n, lags) in [(1, 0), (2, 1), (7, 3), (100, 25), (1025, 64), (3000, 2999)] {
-        let (x, y) = (white(n, 1), white(n, 2));
+        let (x, y) = (white_noise(n, 1), white_noise(n, 2));
         let (fast, naive) = (covariances(&x, &y, lags), covariances_naive(&x, &y, lags));
         assert_eq!(fast.len(), 2 * lags + 1);
         for (a, b) in fast.iter().zip(&naive) {
@@ -86,7 +86,7 @@ fn covariances_by_spectra_match_the_definition() {
         }
     }
     // The sign of a lag: x follows y by two samples.
-    let y = white(50, 3);
+    let y = white_noise(50, 3);
     let mut x = vec![0.0; 50];
     x[2..].copy_from_slice(&y[..48]);
     let found = covariances(&x, &y, 4);
@@ -115,8 +115,8 @@ fn correlations_of_independent_signals_have_the_stated_variance() {
         let (mut squares, mut stated) = (0.0, 0.0);
         let repeats = 400;
         for seed in 0..repeats {
-            let x = filtered(&white(1000, 2 * seed + 11), pole_x);
-            let y = filtered(&white(1000, 2 * seed + 12), pole_y);
+            let x = filtered(&white_noise(1000, 2 * seed + 11), pole_x);
+            let y = filtered(&white_noise(1000, 2 * seed + 12), pole_y);
             let found = correlation(&[x], &[y], 0).expect("lengths agree");
             squares += found.values[0] * found.values[0];
             stated += found.variance;
@@ -138,7 +138,7 @@ fn the_variance_never_falls_below_that_of_white_noise() {
 
 #[test]
 fn correlations_are_pooled_over_runs_and_normalised() {
-    let (a, b) = (white(300, 5), white(200, 6));
+    let (a, b) = (white_noise(300, 5), white_noise(200, 6));
     let shifted: Vec<f64> = b.iter().map(|v| 10.0 + v).collect();
     let found = correlation(&[a.clone(), shifted.clone()], &[a.clone(), shifted], 3).expect("lengths agree");
     assert!((found.values[3] - 1.0).abs() < 1e-12);

@@ -328,7 +328,7 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
 }
 
 /// A run whose input acts `delay` seconds late; the record has it as it was given.
-fn late(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
+fn delayed_experiment(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
     let mut experiment = run(220, every, &[], 0.0, seed);
     let given = experiment.record.clone();
     let arrived = delay_samples(given.signal(2), delay / given.step(), 0.0).unwrap();
@@ -354,7 +354,7 @@ fn with_delay(coupled: bool) -> FreeModel {
 #[test]
 fn derivative_by_delay_matches_the_residuals() {
     for coupled in [true, false] {
-        let (model, experiments) = (with_delay(coupled), [late(0.057, 2, 0.02, 500)]);
+        let (model, experiments) = (with_delay(coupled), [delayed_experiment(0.057, 2, 0.02, 500)]);
         let settings = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
         let here = |delay: f64| {
             let start = ParameterPoint { inputs: vec![delay], ..point(&START.0, &START.1) };
@@ -375,7 +375,8 @@ fn delay_is_estimated_with_the_other_parameters() {
     {
         let model = with_delay(coupled);
         let start = ParameterPoint { inputs: vec![0.08], ..point(&START.0, &START.1) };
-        let found = fit(&model, &[late(delay, every, 0.0, 510)], &start, MinimizationSettings::default()).unwrap();
+        let found = fit(&model, &[delayed_experiment(delay, every, 0.0, 510)], &start, MinimizationSettings::default())
+            .unwrap();
         let miss = (found.point.inputs[0] - delay).abs();
         assert!(miss < 1e-6, "delay {delay}: {} s", found.point.inputs[0]);
         check("orders beside a delay", relative_distance(&found.point.orders, &ORDERS), 1e-5);
@@ -390,7 +391,8 @@ fn delay_estimate_agrees_with_its_standard_error() {
     let mut scores = Vec::new();
     for seed in 0..40 {
         let found =
-            fit(&model, &[late(delay, 1, 0.02, 600 + 2 * seed)], &start, MinimizationSettings::default()).unwrap();
+            fit(&model, &[delayed_experiment(delay, 1, 0.02, 600 + 2 * seed)], &start, MinimizationSettings::default())
+                .unwrap();
         let normal: Vec<f64> = (0..9)
             .flat_map(|i| (0..9).map(move |j| (i, j)))
             .map(|(i, j)| found.jacobian[i].iter().zip(&found.jacobian[j]).map(|(a, b)| a * b).sum())
@@ -405,7 +407,7 @@ fn delay_estimate_agrees_with_its_standard_error() {
 }
 
 /// Two equations that feed through: each output drives the other at once, and the input both.
-fn at_once(coupled: bool, initial: Initial, inputs: Vec<FreeInput>) -> FreeModel {
+fn feedthrough_model(coupled: bool, initial: Initial, inputs: Vec<FreeInput>) -> FreeModel {
     let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
     let equation = |output: usize, other: usize, order: f64, first: usize| FreeEquation {
         output,
@@ -433,9 +435,9 @@ fn feedthrough_derivative_matches_the_residuals() {
     let coefficients = [1.5, 0.4, 0.7, 0.9, -0.3, 0.5];
     let delayed = || vec![FreeInput { signal: 2, law: InputLaw::Delay, bounds: (0.0, 0.2) }];
     for (name, model) in [
-        ("coupled", at_once(true, Initial::Rest, Vec::new())),
-        ("measured coupling", at_once(false, Initial::Rest, Vec::new())),
-        ("delayed", at_once(true, Initial::Rest, delayed())),
+        ("coupled", feedthrough_model(true, Initial::Rest, Vec::new())),
+        ("measured coupling", feedthrough_model(false, Initial::Rest, Vec::new())),
+        ("delayed", feedthrough_model(true, Initial::Rest, delayed())),
     ] {
         let mut experiment = run(80, 2, &[], 0.02, 700);
         let held = Random::new(701).signal(81);
@@ -473,7 +475,7 @@ fn feedthrough_derivative_matches_the_residuals() {
 #[test]
 fn direct_feedthrough_acts_at_the_sample_time() {
     // y = 0.4 x + 0.7 u and x = -0.3 y + 0.5 u at once: with no other term the samples are those of the two by two.
-    let mut model = at_once(true, Initial::Rest, Vec::new());
+    let mut model = feedthrough_model(true, Initial::Rest, Vec::new());
     model.equations.iter_mut().for_each(|e| {
         e.terms.remove(3);
         e.terms[0].2 = Monomial { factor: 0.0, powers: vec![(0, 1)] };
@@ -617,7 +619,7 @@ fn fixed_integer_orders_match_free_orders_at_the_same_values() {
 }
 
 /// D^1.5 y = c₀ y + c₁ u₁ + c₂ D^0.3 u₂ on two runs.
-fn driven() -> (FreeModel, Vec<Experiment>) {
+fn driven_problem() -> (FreeModel, Vec<Experiment>) {
     let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
     let model = FreeModel {
         equations: vec![FreeEquation {
@@ -652,7 +654,7 @@ fn driven() -> (FreeModel, Vec<Experiment>) {
 
 #[test]
 fn input_coefficients_match_dense_least_squares() {
-    let (mut model, experiments) = driven();
+    let (mut model, experiments) = driven_problem();
     let once = MinimizationSettings { evaluations: 1, ..MinimizationSettings::default() };
     let residuals = |b: f64, c: f64| fit(&model, &experiments, &point(&[], &[-3.0, b, c]), once).unwrap().residuals;
     // The residuals are linear in both: columns by differences, and the normal equations.
@@ -676,7 +678,7 @@ fn input_coefficients_match_dense_least_squares() {
 
 #[test]
 fn optimum_is_independent_of_initial_input_coefficients() {
-    let (model, experiments) = driven();
+    let (model, experiments) = driven_problem();
     let settings = MinimizationSettings { evaluations: 15, tolerance: 1e-12 };
     let ends: Vec<OutputErrorFit> = [[3.0, 0.5], [-3.0, -0.5], [1e4, -1e-4]]
         .iter()
@@ -691,7 +693,7 @@ fn optimum_is_independent_of_initial_input_coefficients() {
 
 #[test]
 fn unexcited_parameters_keep_their_values() {
-    let (model, experiments) = driven();
+    let (model, experiments) = driven_problem();
     let still = |e: &Experiment| {
         let signals = with_signal(&e.record, 2, vec![0.0; e.record.m()]);
         Experiment::new(signals, 1, e.samples.clone(), vec![1.0]).unwrap()
@@ -702,7 +704,7 @@ fn unexcited_parameters_keep_their_values() {
 }
 
 /// Residuals and their slopes of a fit and of the same point evaluated by itself are the same.
-fn agree(name: &str, found: &OutputErrorFit, alone: &OutputErrorFit) {
+fn assert_fits_agree(name: &str, found: &OutputErrorFit, alone: &OutputErrorFit) {
     check(&format!("{name}: residuals"), relative_distance(&found.residuals, &alone.residuals), 1e-8);
     for (parameter, (one, other)) in found.jacobian.iter().zip(&alone.jacobian).enumerate() {
         check(&format!("{name}: slope {parameter}"), relative_distance(one, other), 1e-5);
@@ -762,6 +764,6 @@ fn filter_of_all_outputs_can_be_applied_to_the_inputs() {
             fit(&model, &runs, &start, MinimizationSettings { evaluations: 4, ..MinimizationSettings::default() })
                 .unwrap();
         assert!(found.evaluations > 1);
-        agree(name, &found, &at(&model, &runs, &found.point.orders, &found.point.coefficients));
+        assert_fits_agree(name, &found, &at(&model, &runs, &found.point.orders, &found.point.coefficients));
     }
 }

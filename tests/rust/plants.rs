@@ -31,7 +31,7 @@ fn stage(plant: &Value, derived: bool) -> Vec<Equation> {
 }
 
 /// Point samples of both angles at the record's own instants, simulated with `every` pulses a sample.
-fn simulated(plant: &Value, derived: bool, every: usize) -> Vec<Vec<f64>> {
+fn simulate_plant(plant: &Value, derived: bool, every: usize) -> Vec<Vec<f64>> {
     let input = &plant["input"];
     let (amplitude, period, step) =
         (number(&input["amplitude"]), number(&input["period"]), number(&input["sample_step"]));
@@ -63,7 +63,7 @@ fn plant_a_has_the_stated_deviations() {
     let document = reference("plants");
     let plant = &document["plants"]["A"];
     for (derived, hub, deflection) in [(false, 0.297, 0.0280), (true, 0.2026, 0.01733)] {
-        let y = simulated(plant, derived, 8);
+        let y = simulate_plant(plant, derived, 8);
         check_between("sigma of theta11", deviation(&y[0]) / hub, 0.998, 1.002);
         check_between("sigma of theta12", deviation(&y[1]) / deflection, 0.998, 1.002);
     }
@@ -74,7 +74,7 @@ fn plants_converge_with_the_step() {
     let document = reference("plants");
     for (name, coarsest) in [("A", 1), ("A2", 4)] {
         let plant = &document["plants"][name];
-        let responses: Vec<Vec<Vec<f64>>> = (0..5).map(|k| simulated(plant, false, coarsest << k)).collect();
+        let responses: Vec<Vec<Vec<f64>>> = (0..5).map(|k| simulate_plant(plant, false, coarsest << k)).collect();
         // Differences of neighbouring grids fall as their errors do.
         let found: Vec<Vec<f64>> = responses.windows(2).map(|p| differences(&p[0], &p[1])).collect();
         for (output, angle) in ["hub", "deflection"].into_iter().enumerate() {

@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use crate::common::{cases, check, check_between, distance, orders, Random};
 
 /// Means by adding, pulse by pulse, what every interval contributes. O(N m).
-fn naive(samples: &[f64], m: usize, intersample: Intersample) -> Vec<f64> {
+fn naive_means(samples: &[f64], m: usize, intersample: Intersample) -> Vec<f64> {
     let n = samples.len() - 1;
     // In units of the sampling step pulse k is [k n/m, (k+1) n/m).
     let width = n as f64 / m as f64;
@@ -46,7 +46,7 @@ fn means_match_naive_integration() {
             for intersample in BOTH {
                 let found = pulse_means(&samples, m, intersample).unwrap().into_vec();
                 assert_eq!(found.len(), m);
-                worst = worst.max(distance(&found, &naive(&samples, m, intersample)));
+                worst = worst.max(distance(&found, &naive_means(&samples, m, intersample)));
             }
         }
     }

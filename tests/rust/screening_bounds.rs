@@ -27,7 +27,7 @@ fn score(record: &Record, equation: &Equation, norm: Norm) -> f64 {
 }
 
 /// An output that follows the inputs a little, or not at all, or goes its own way.
-fn unruly(random: &mut Random, m: usize) -> Record {
+fn random_record(random: &mut Random, m: usize) -> Record {
     let (slow, fast) = (random.steps(m, 40), random.steps(m, 9));
     let (follows, noise, drift) = (random.uniform(-1.0, 1.0), random.uniform(0.0, 1.0), random.uniform(-1.0, 1.0));
     let own: Vec<f64> =
@@ -60,7 +60,7 @@ fn divisor_zeros_give_valid_bounds() {
     let (mut proved, mut large, mut stable) = (0, 0, 0);
     for case in 0..400 {
         let m = 60 + random.below(340);
-        let record = unruly(&mut random, m);
+        let record = random_record(&mut random, m);
         let own = 1 + random.below(3);
         let equation = random_equation(&mut random, own, 1.0);
         let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
@@ -86,7 +86,7 @@ fn divisor_zeros_give_valid_bounds() {
 #[test]
 fn nan_limit_and_huge_coefficients_exclude_no_candidate() {
     let mut random = Random::new(3);
-    let record = unruly(&mut random, 300);
+    let record = random_record(&mut random, 300);
     for huge in [1e160, 1e300, f64::MAX, f64::NAN, f64::INFINITY] {
         let equation = |c: f64| equation(0, 1.5, &[(0, 0.5, c), (0, 0.0, -c), (1, 0.0, c)]);
         let _ = has_unstable_zeros(&record, &equation(huge), Norm::L1, 1.0).unwrap();
@@ -112,7 +112,7 @@ fn linearized_test_vectors_give_valid_bounds() {
     let (mut asked, mut close, mut closer, mut cut) = (0, 0, 0, 0);
     for case in 0..150 {
         let m = 60 + random.below(200);
-        let record = unruly(&mut random, m);
+        let record = random_record(&mut random, m);
         let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
         let own = 1 + random.below(3);
         let made_for = random_equation(&mut random, own, -1.0);
@@ -143,7 +143,7 @@ fn test_vector_bounds_hold_for_the_next_candidate() {
     let (mut asked, mut told, mut close) = (0, 0, 0);
     for case in 0..60 {
         let m = 60 + random.below(200);
-        let record = unruly(&mut random, m);
+        let record = random_record(&mut random, m);
         let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
         let own = 1 + random.below(3);
         let made_for = random_equation(&mut random, own, -1.0);
@@ -179,7 +179,7 @@ fn test_vector_bounds_hold_for_the_next_candidate() {
 #[test]
 fn certificates_keep_the_table_of_brute_force() {
     let mut random = Random::new(5);
-    let record = unruly(&mut random, 96);
+    let record = random_record(&mut random, 96);
     let step = 0.05;
     let orders = |n: usize| (0..=n).map(|i| i as f64 * step).collect::<Vec<f64>>();
     let axis = |signal: usize, values: Vec<f64>| TermAxis { signal, values, interchangeable: true };

@@ -63,7 +63,7 @@ fn the_first_lattice_of_the_paper_has_its_size() {
 }
 
 /// All structures of a lattice from its definition: nested loops, filtered.
-fn enumerated(output: usize, alphas: &[f64], axes: &[TermAxis], input: usize) -> Vec<Vec<i64>> {
+fn enumerate_orders(output: usize, alphas: &[f64], axes: &[TermAxis], input: usize) -> Vec<Vec<i64>> {
     let key = |v: f64| ftlm::equation::grains(v);
     let mut found = std::collections::BTreeSet::new();
     for &alpha in alphas {
@@ -120,7 +120,7 @@ fn order_grids_contain_every_structure_once() {
             .collect();
         let mut sorted = keys.clone();
         sorted.sort_unstable();
-        assert_eq!(sorted, enumerated(0, &alphas, &axes, 2));
+        assert_eq!(sorted, enumerate_orders(0, &alphas, &axes, 2));
         // Ascending in alpha: an index means the same candidate whatever happens later in the lattice.
         assert!(keys.windows(2).all(|p| p[0][0] <= p[1][0]));
     }
@@ -683,7 +683,7 @@ fn the_bound_never_exceeds_the_error() {
         let (record, equation) = random_candidate(&mut random);
         for (i, norm) in [Norm::L1, Norm::L2].into_iter().enumerate() {
             let error = raw_error(&record, &equation, norm);
-            unstable += usize::from(error > 1e3 * raw_error(&record, &silent(&equation), norm) || error.is_nan());
+            unstable += usize::from(error > 1e3 * raw_error(&record, &zero_model(&equation), norm) || error.is_nan());
             let bounds = lower_bounds(&record, &equation, norm).unwrap();
             assert!(bounds.iter().all(|b| *b >= 0.0));
             for bound in bounds {
@@ -760,7 +760,7 @@ fn no_score_below_the_threshold_is_excluded() {
 }
 
 /// The equation with nothing on its right-hand side: its error is the measurement.
-fn silent(equation: &Equation) -> Equation {
+fn zero_model(equation: &Equation) -> Equation {
     Equation { coefficients: vec![0.0; equation.coefficients.len()], ..equation.clone() }
 }
 

@@ -26,12 +26,12 @@ fn data() -> Record {
     Record::new(0.1, PulseMeans::from_signals(vec![random.signal(64), random.signal(64)]), None).unwrap()
 }
 
-fn small() -> OrderGrid {
+fn small_grid() -> OrderGrid {
     OrderGrid::new(0, &[1.0, 1.5], &[axis(0, &[0.0, 0.5]), axis(1, &[0.0])], |s| s == 1).unwrap()
 }
 
 fn run(fixed: &[Option<f64>], options: &Options) -> Result<()> {
-    search(&[data()], &small(), fixed, options, &Control::default()).map(|_| ())
+    search(&[data()], &small_grid(), fixed, options, &Control::default()).map(|_| ())
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn order_grids_reject_too_many_terms() {
 
 #[test]
 fn index_after_the_last_structure_gives_the_last() {
-    let lattice = small();
+    let lattice = small_grid();
     assert_eq!(lattice.structure(u64::MAX), lattice.structure(lattice.count() - 1));
 }
 
@@ -71,14 +71,14 @@ fn law(constant: f64, weights: &[f64]) -> AffineOrder {
     AffineOrder { constant, weights: weights.to_vec() }
 }
 
-fn one_law() -> LawEquation {
+fn single_law() -> LawEquation {
     LawEquation { output: 0, order: law(0.0, &[1.0]), terms: vec![(0, law(0.0, &[])), (1, law(0.0, &[]))] }
 }
 
 #[test]
 fn law_grids_reject_invalid_laws() {
     let made = |axes: &[Vec<f64>], change: &dyn Fn(&mut LawEquation)| {
-        let mut equation = one_law();
+        let mut equation = single_law();
         change(&mut equation);
         OrderLawGrid::new(axes, &[equation], &[false, true])
     };
@@ -113,8 +113,8 @@ fn searches_reject_settings_out_of_range() {
     assert!(matches!(run(&[None, Some(f64::NAN)], &Options::default()), Err(Error::NotFinite { .. })));
     // As many rows as there are, however many are asked for.
     let all = Options { top: usize::MAX, ..Options::default() };
-    let found = search(&[data()], &small(), &[None; 2], &all, &Control::default()).unwrap();
-    assert_eq!(found.counts.table_rows + found.counts.singular + found.counts.diverged, small().count());
+    let found = search(&[data()], &small_grid(), &[None; 2], &all, &Control::default()).unwrap();
+    assert_eq!(found.counts.table_rows + found.counts.singular + found.counts.diverged, small_grid().count());
     assert_eq!((batch_count(0, &all), generation_ends(0)), (0, vec![]));
 }
 
@@ -123,7 +123,7 @@ fn searches_reject_records_without_their_signals() {
     let lattice = OrderGrid::new(0, &[1.0], &[axis(2, &[0.0])], |_| false).unwrap();
     let found = search(&[data()], &lattice, &[None], &Options::default(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
-    let mut stage = one_law();
+    let mut stage = single_law();
     stage.terms[1].0 = 2;
     let lattice = OrderLawGrid::new(&[vec![1.0]], &[stage], &[false, false, true]).unwrap();
     let fixed = [vec![None; 2]];
@@ -138,7 +138,7 @@ fn searches_reject_records_without_their_signals() {
 
 #[test]
 fn batches_reject_state_of_another_search() {
-    let (lattice, options, control, pool) = (small(), Options::default(), Control::default(), pool(1).unwrap());
+    let (lattice, options, control, pool) = (small_grid(), Options::default(), Control::default(), pool(1).unwrap());
     let ready = BatchEvaluator::new(&[data()], Cow::Borrowed(&lattice), &[None; 2], &options, &pool, &control).unwrap();
     let refused = |first, last, seed: &[(u64, f64)], from| {
         let found = ready.evaluate_batches(first, last, seed, from, &pool, &control);
@@ -184,7 +184,7 @@ fn batches_reject_state_of_another_search() {
 #[test]
 fn stages_reject_scales_ranges_and_verdicts_of_others() {
     let (options, control, pool) = (Options::default(), Control::default(), pool(1).unwrap());
-    let lattice = |values: &[f64]| OrderLawGrid::new(&[values.to_vec()], &[one_law()], &[false, true]).unwrap();
+    let lattice = |values: &[f64]| OrderLawGrid::new(&[values.to_vec()], &[single_law()], &[false, true]).unwrap();
     let made = |lattice: OrderLawGrid, scale: f64| {
         CoupledSearch::new(&[data()], Cow::Owned(lattice), &[vec![None; 2]], &[scale], &options, &pool, &control)
     };

@@ -517,7 +517,7 @@ proptest! {
 type Integral = (usize, usize, usize, f64);
 
 /// The same system by kernels and division.
-fn by_division(n: usize, m: usize, step: f64, terms: &[Integral], sources: &[Source]) -> Vec<Vec<f64>> {
+fn solve_by_division(n: usize, m: usize, step: f64, terms: &[Integral], sources: &[Source]) -> Vec<Vec<f64>> {
     let mut matrix = vec![vec![vec![0.0; m]; n]; n];
     (0..n).for_each(|i| matrix[i][i][0] = 1.0);
     for &(i, j, order, c) in terms {
@@ -583,7 +583,7 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
         assert_eq!(found.len(), lists.len());
         assert!(found[1].iter().flatten().all(|v| *v == 0.0) && found[5] == found[0]);
         assert!(found[2].iter().flatten().zip(found[0].iter().flatten()).all(|(a, b)| *a == 2.0 * b));
-        for (a, b) in found[0].iter().zip(by_division(n, m, step, &terms, &sources)) {
+        for (a, b) in found[0].iter().zip(solve_by_division(n, m, step, &terms, &sources)) {
             worst = worst.max(block_distance(a, &b));
         }
     }

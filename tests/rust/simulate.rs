@@ -30,13 +30,13 @@ fn stage() -> [Equation; 2] {
     ]
 }
 
-fn driven(m: usize, step: f64, seed: u64) -> Record {
+fn driven_record(m: usize, step: f64, seed: u64) -> Record {
     let mut random = Random::new(seed);
     record(step, vec![vec![0.0; m], vec![0.0; m], random.steps(m, 23)])
 }
 
 /// The record with the outputs that the model gives.
-fn closed(model: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Record {
+fn close_loop(model: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Record {
     let mut closed = record.clone();
     for (equation, y) in model.iter().zip(respond(model, record, initial).unwrap()) {
         closed = with_signal(&closed, equation.structure.output, y);
@@ -72,7 +72,7 @@ fn one_equation_matches_the_dense_solution() {
 #[test]
 fn coupled_equations_match_the_dense_solution() {
     let (m, step) = (120, 0.01);
-    let record = driven(m, step, 71);
+    let record = driven_record(m, step, 71);
     let model = stage();
     let n = 2 * m;
     let (mut a, mut b) = (vec![0.0; n * n], vec![0.0; n]);
@@ -102,7 +102,7 @@ fn coupled_simulation_satisfies_each_equation() {
     // Fed back as measured coupling, the coupled outputs are each equation's own response, and its exact data.
     let model = stage();
     for m in [100, 1000, 2049] {
-        let record = closed(&model, &driven(m, 0.005, 72), &[]);
+        let record = close_loop(&model, &driven_record(m, 0.005, 72), &[]);
         for (i, equation) in model.iter().enumerate() {
             let alone = respond(one(equation), &record, &[]).unwrap();
             check("alone against coupled", relative_distance(&alone[0], record.signal(i)), 1e-11);
@@ -111,16 +111,16 @@ fn coupled_simulation_satisfies_each_equation() {
         }
     }
     // The order in which equations are given does not matter, nor does what the record says of their outputs.
-    let record = driven(500, 0.005, 73);
+    let record = driven_record(500, 0.005, 73);
     let forward = respond(&model, &record, &[]).unwrap();
-    let backward = respond(&[model[1].clone(), model[0].clone()], &closed(&model, &record, &[]), &[]).unwrap();
+    let backward = respond(&[model[1].clone(), model[0].clone()], &close_loop(&model, &record, &[]), &[]).unwrap();
     assert!(distance(&forward[0], &backward[1]) <= 1e-12 && distance(&forward[1], &backward[0]) <= 1e-12);
 }
 
 #[test]
 fn initial_terms_belong_to_their_equation() {
     let model = stage();
-    let record = driven(400, 0.005, 74);
+    let record = driven_record(400, 0.005, 74);
     let rest = respond(&model, &record, &[]).unwrap();
     assert_eq!(respond(&model, &record, &[vec![], vec![]]).unwrap(), rest);
     // Linear in each of them.
@@ -135,7 +135,7 @@ fn initial_terms_belong_to_their_equation() {
 
 #[test]
 fn unsolvable_models_are_rejected() {
-    let record = driven(50, 0.01, 75);
+    let record = driven_record(50, 0.01, 75);
     let twice = [stage()[0].clone(), stage()[0].clone()];
     match respond(&twice, &record, &[]) {
         Err(error @ Error::Structure { .. }) => {
@@ -183,7 +183,7 @@ fn refitted_initial_terms_leave_no_error() {
     let model = stage();
     let initial = [vec![(0.0, 0.2), (1.0, -0.4), (1.05, 1.2)], vec![(0.0, -0.05), (0.95, 0.3), (1.9, 0.7)]];
     for m in [300, 1000] {
-        let record = closed(&model, &driven(m, 0.01, 76), &initial);
+        let record = close_loop(&model, &driven_record(m, 0.01, 76), &initial);
         let found = respond_with_initial(&model, &record, &Initial::Caputo, None).unwrap();
         for (i, equation) in model.iter().enumerate() {
             check("refitted response", relative_distance(&found.outputs[i], record.signal(i)), 1e-10);
@@ -208,7 +208,7 @@ fn filtered_outputs_are_compared_through_the_filter() {
     let model = stage();
     let m = 800;
     let initial = [vec![(0.0, 0.2), (1.0, -0.4)], vec![(0.0, -0.05)]];
-    let clean = closed(&model, &driven(m, 0.01, 77), &initial);
+    let clean = close_loop(&model, &driven_record(m, 0.01, 77), &initial);
     let low_pass: Vec<f64> = (0..m).map(|k| 0.3 * 0.7_f64.powi(i32::try_from(k).unwrap())).collect();
     let filtered = with_signal(&clean, 1, series::multiply(&low_pass, clean.signal(1), m));
     let powers = Initial::Powers(vec![0.0, 1.0]);
@@ -310,7 +310,7 @@ fn traced_errors_are_those_of_separate_runs() {
     let mut random = Random::new(80);
     let m = 700;
     let rest = record(0.01, vec![vec![0.0; m], random.steps(m, 31), random.steps(m, 7)]);
-    let record = closed(one(&model), &rest, &[]);
+    let record = close_loop(one(&model), &rest, &[]);
     let noisy = with_signal(&record, 0, record.signal(0).iter().map(|y| y + 0.01 * random.normal()).collect());
     let rows: Vec<Vec<f64>> = (0..20)
         .map(|k| model.coefficients.iter().map(|c| if k == 0 { 0.0 } else { c * random.uniform(0.5, 1.5) }).collect())
@@ -401,7 +401,7 @@ proptest! {
     fn simulation_is_linear_in_inputs_and_causal(seed in any::<u64>(), c in -3.0..3.0_f64, late in 1usize..200) {
         let model = stage();
         let m = 300;
-        let (first, second) = (driven(m, 0.01, seed), driven(m, 0.01, seed ^ 1));
+        let (first, second) = (driven_record(m, 0.01, seed), driven_record(m, 0.01, seed ^ 1));
         let mixed: Vec<f64> = first.signal(2).iter().zip(second.signal(2)).map(|(a, b)| c * a + b).collect();
         let of = |record: &Record| respond(&model, record, &[]).unwrap();
         let (a, b, both) = (of(&first), of(&second), of(&with_signal(&first, 2, mixed)));
@@ -420,7 +420,7 @@ proptest! {
     #[test]
     fn longer_record_begins_with_the_shorter_one(seed in any::<u64>(), m in 2usize..600) {
         let model = stage();
-        let long = driven(600, 0.01, seed);
+        let long = driven_record(600, 0.01, seed);
         let short = record(0.01, (0..3).map(|s| long.signal(s)[..m].to_vec()).collect());
         let (a, b) = (respond(&model, &long, &[]).unwrap(), respond(&model, &short, &[]).unwrap());
         for i in 0..2 {
@@ -431,7 +431,7 @@ proptest! {
     #[test]
     fn fit_response_matches_simulation(seed in any::<u64>()) {
         let truth = equation(0, 1.6, &[(0, 0.5, -4.0), (0, 0.0, -6.0), (2, 0.0, 5.0)]);
-        let record = closed(one(&truth), &driven(256, 0.02, seed), &[]);
+        let record = close_loop(one(&truth), &driven_record(256, 0.02, seed), &[]);
         let s = structure(0, 1.6, &[(0, 0.5), (0, 0.0), (2, 0.0)]);
         let fit = least_squares::fit(std::slice::from_ref(&record), &s, &[None; 3], &Initial::Rest).unwrap();
         let again = Equation { structure: s, coefficients: fit.coefficients };
