@@ -62,7 +62,7 @@ fn main() -> Result<()> {
         stop: &stop,
     };
     let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-    let initialization = Initialization::Multistart { known: Vec::new(), candidates: None };
+    let initialization = Initialization::Multistart { given_guesses: Vec::new(), candidates: None };
     let Some(joint_fit) = fit::fit(problem, initialization, settings, &|_, _| Ok(()))? else {
         println!("no start has a finite simulation");
         return Ok(());
