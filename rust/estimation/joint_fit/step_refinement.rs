@@ -20,6 +20,11 @@ const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 /// Minimum number of block pulses over all runs at which the step error of a linear model is corrected without fits on
 /// finer pulse grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
+/// Maximum discretization error of a nonlinear fit before its correction, relative to the noise.
+///
+/// Errors of offsets and profile intervals are computed on the same pulse grid without correction, so this error widens
+/// them. Its square is the relative increase of the noise variance.
+const MAX_NONLINEAR_STEP_ERROR: f64 = 0.1;
 /// Maximum number of corrections with the same pair of finer pulse grids.
 ///
 /// Each correction multiplies the remaining error by about the relative discretization error of the fitted pulse grid.
@@ -154,12 +159,35 @@ pub fn correct_step<'a>(
     if !(is_slow || pulses >= MIN_CORRECTED_PULSES) || !optimum.has_converged() {
         return Ok(None);
     }
+    let (mut optimum, mut objective) = (optimum.clone(), objective.clone());
+    if is_slow {
+        loop {
+            let finer = objective.finer()?;
+            let Some((_, ratio)) = limit_shifts(&optimum.iterate, &objective, &objective, &finer)? else {
+                return Ok(None);
+            };
+            if ratio <= MAX_NONLINEAR_STEP_ERROR * MAX_NONLINEAR_STEP_ERROR {
+                break;
+            }
+            if finer.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
+                return Ok(None);
+            }
+            (optimum, objective) = match fit_reweighted(&optimum.iterate, finer, loss) {
+                Err(Error::Interrupted) => return Err(Error::Interrupted),
+                Ok(fit) if fit.0.has_converged() => fit,
+                _ => return Ok(None),
+            };
+        }
+    }
     let time_scaling = objective.time_scaling();
     let (mut current, mut current_objective, mut coarse) = (optimum.clone(), objective.clone(), objective.clone());
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let fine = coarse.finer()?;
         for correction in 0..MAX_CORRECTIONS {
-            let Some(shifts) = limit_shifts(&current.iterate, objective, &coarse, &fine)? else { return Ok(None) };
+            let shifts = match limit_shifts(&current.iterate, &objective, &coarse, &fine)? {
+                Some((shifts, ratio)) if ratio <= 1.0 => shifts,
+                _ => return Ok(None),
+            };
             let corrected = objective.with_weights(current_objective.weights.clone())?.with_residual_shifts(&shifts);
             let (next_result, next_objective) = match fit_reweighted(&current.iterate, corrected, loss) {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
@@ -198,17 +226,20 @@ pub fn correct_step<'a>(
     Ok(None)
 }
 
-/// Return residuals extrapolated to zero step minus residuals on `objective`, in units of the outputs.
+/// Changes of the residuals by run, output and compared sample, in units of the outputs.
+type ResidualShifts = Vec<Vec<Vec<f64>>>;
+
+/// Return residuals extrapolated to zero step minus residuals on `objective`, in units of the outputs, and the ratio of
+/// their power to that of the residuals on the grid of `fine`.
 ///
-/// The values are indexed by run, output and sample. Return None if the differences are large relative to the noise, or
-/// if a simulation is not finite.
+/// Return None if a simulation is not finite.
 fn limit_shifts(
     iterate: &Iterate,
     objective: &Objective<'_>,
     coarse: &Objective<'_>,
     fine: &Objective<'_>,
-) -> Result<Option<Vec<Vec<Vec<f64>>>>> {
-    let mut shifts: Vec<Vec<Vec<f64>>> = Vec::new();
+) -> Result<Option<(ResidualShifts, f64)>> {
+    let mut shifts = ResidualShifts::new();
     let (mut power, mut noise) = (0.0, 0.0);
     // Richardson extrapolation of a scheme of second order.
     for (objective, weight_of_grid) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (objective, -1.0)] {
@@ -227,7 +258,7 @@ fn limit_shifts(
     for run in &shifts {
         power += run.iter().zip(&objective.weights.outputs).map(|(s, weight)| finite_squares(s, *weight)).sum::<f64>();
     }
-    Ok((power <= noise).then_some(shifts))
+    Ok(Some((shifts, if power > 0.0 { power / noise } else { 0.0 })))
 }
 
 /// Sum of the squares of all finite products of a value and `weight`.
