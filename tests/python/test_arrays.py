@@ -153,7 +153,7 @@ CALLS = {
     "kernels.Candidates.coefficients": [
         (TUPLES.coefficients, ORDER_TUPLES),
         (
-            lambda x: TUPLES.coefficients(ORDER_TUPLES, innovation_length=3, prior_covariance=x, row_basis="time"),
+            lambda x: TUPLES.coefficients(ORDER_TUPLES, p=3, prior_covariance=x, rows="time"),
             np.array([1.0, 2.0]),
         ),
     ],

@@ -409,7 +409,7 @@ def test_the_report_of_an_automatic_structure_has_the_choice(tmp_path):
     assert places == sorted(places)
     part = page[places[2] : places[3]]
     assert typeset(found["reason"]) in part
-    assert f"{found['fitted']} candidates fitted." in part
+    assert f"{found['fitted_count']} candidates fitted." in part
     assert f"chosen: {typeset(found['chosen'])}</th>" in part
     for candidate in found["candidates"]:
         row = part[part.index(f"{typeset(candidate['structure'])}") :]

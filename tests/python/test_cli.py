@@ -761,14 +761,14 @@ def test_tables_fit_a_terminal_of_80_columns(tmp_path: Path, monkeypatch: pytest
     ]
     long = "D y = a y + b u + c u*u + d u*u*u + e y*u + f y*y*u + g abs(y)*u"
     choice = ftlm.select(run, [ftlm.equation(text) for text in ("D y = a y + b u", long, "D y = k exp(1e7*y) + b u")])
-    failed = [trial for trial in choice.trials if trial.failed]
+    failed = [trial for trial in choice.trials if trial.failure]
     assert failed
     lines = choice.ranking_text().splitlines()
     table = lines[1 : next(k for k, line in enumerate(lines) if line.startswith("Chosen"))]
     assert max(map(len, table)) <= 80
     words = " ".join(" ".join(line.split()) for line in table)
     assert all(trial.name in words for trial in choice.trials)
-    assert failed[0].failed in words
+    assert failed[0].failure in words
     table_of_orders = ftlm.search_orders(
         run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(0.1, alpha=(0.9, 1.1))
     )

@@ -283,7 +283,7 @@ def test_models_of_other_parameters_orders_and_coefficients():
     assert model.coefficients == link.coefficients(2) | {"g3": 7.0}
     assert model.orders["gamma3"] == 0.9
     assert model.orders["mu4"] == 1.0
-    assert model.structure.reference == {}
+    assert model.structure.nominal_values == {}
     assert ftlm.link_model(stage="both", parameters="table-3").coefficients["d3"] == pytest.approx(0.856 / 0.003)
     with pytest.raises(ftlm.ModelError, match="order 'gama3' does not occur in the equation; did you mean gamma3"):
         ftlm.link_model(stage=2, orders={"gama3": 0.9})

@@ -357,7 +357,7 @@ def test_information_criteria_of_spectra_are_those_of_normal_residuals():
     likelihood = np.sum(-0.5 * np.log(2 * np.pi * level**2) - 0.5 * (parts / level) ** 2)
     known = found.information
     # R0, R1, Q, alpha and the level of the noise.
-    assert (known.parameters, known.samples) == (5, 80)
+    assert (known.parameter_count, known.sample_count) == (5, 80)
     assert known.log_likelihood == pytest.approx(likelihood, rel=1e-9)
     assert known.aic == pytest.approx(10 - 2 * likelihood, rel=1e-9)
     assert known.bic == pytest.approx(5 * np.log(80) - 2 * likelihood, rel=1e-9)

@@ -308,7 +308,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
 
 
 def test_results_print_and_are_json(clean_a, plants):
-    structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
+    structure = ftlm.flexible_link(form="published", parameters="effective").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(clean_a, structure, method=ftlm.MultiInnovation(prior_covariance=100.0), m=256)
     text = found.details()
     assert text.startswith(

@@ -211,7 +211,7 @@ def test_words_say_an_offset_and_are_printed_back():
     assert structure.offset == "constant"
     assert str(structure) == "D^1.5 y = -a y + b u + c"
     assert ftlm.equation(str(structure)) == structure
-    assert str(ftlm.equation("D y = -c y + b u", offset="constant")) == "D^1 y = -c y + b u + c0"
+    assert str(ftlm.equation("D y = -c y + b u", offset="constant")) == "D^1 y = -c y + b u + c1"
     assert ftlm.equation("D y = -c y + b u + c0").offset == "constant"
     # As ever: another name alone is a signal, and so is c with a number.
     assert ftlm.equation("D y = -a y + u").signals == ("y", "u")

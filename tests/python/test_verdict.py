@@ -446,7 +446,7 @@ def test_every_entry_of_the_catalogue_renders():
         templates = "".join((kind.template, kind.reason, kind.remedy, kind.prefix, topic.remedy, topic.alternative))
         names = {n.partition("[")[0] for _, n, _, _ in string.Formatter().parse(templates) if n}
         numbers = dict.fromkeys(names - {*fields, "ask", "choose", "remedy", "signal"}, 1)
-        item = Finding(code, **fields, values=numbers)
+        item = Finding(code, **fields, numbers=numbers)
         for said in (item.text, item.reason, item.remedy):
             assert said != code
             assert not set("{}|") & set(said), (code, said)
