@@ -553,9 +553,13 @@ def _result(
     def covariance_at(optimum: ResponseFit) -> Floats:
         residuals, jacobian = problem.residuals(optimum.values)
         free_jacobian = problem.jacobian_in_seconds(optimum.values, jacobian)[rising][:, is_free]
-        if kind == "deviation" and not is_cost_too_large:
-            return covariance_of(free_jacobian.T, [np.zeros(e.size) for e in series], float(free))
-        return covariance_of(free_jacobian.T, _series(records, residuals[rising]), optimum.cost)
+        residual_series = _series(records, residuals[rising])
+        has_known_errors = kind == "deviation" and not is_cost_too_large
+        squares = float(free) if has_known_errors else optimum.cost
+        if has_known_errors or all(is_white(e) for e in residual_series):
+            # Errors at different frequencies are independent. Only a model error correlates the residuals.
+            residual_series = [np.zeros(e.size) for e in series]
+        return covariance_of(free_jacobian.T, residual_series, squares)
 
     def errors_of(covariance: Floats) -> dict[str, float]:
         return dict(zip(names, np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(), strict=True))
