@@ -14,13 +14,14 @@ from pathlib import Path
 import mpmath
 import numpy as np
 import pytest
-from scipy.signal import lsim
+from scipy.signal import lfilter, lsim
 
 import ftlm
 from ftlm.estimation import nuisance_parameters as history
 from ftlm.estimation.objective import covariance_of, propagated_covariance, propagated_errors
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.report.html_report import model_page
+from ftlm.utils.statistics import is_white
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
 
@@ -196,3 +197,22 @@ def test_derived_errors_of_what_is_not_seen_are_infinite() -> None:
     assert fit.derived_errors == {"both": math.inf, "square": pytest.approx(2 * 3.0 * 0.2)}
     assert np.isnan(fit.correlation[0, 1])
     assert fit.intervals["a"] == (-math.inf, math.inf)
+
+
+def test_short_records_include_the_correlation_that_the_test_for_white_noise_misses():
+    """The mean of samples with a correlation of 0.5 has three times the variance of the mean of white noise."""
+    rows, ratios, white_ratios = 40, [], []
+    jacobian = np.ones((1, rows))
+    for seed in range(60):
+        noise = np.random.default_rng(seed).standard_normal(rows + 50)
+        for values, out in ((lfilter([1.0], [1.0, -0.5], noise)[50:], ratios), (noise[50:], white_ratios)):
+            residuals = values - values.mean()
+            if is_white(residuals):
+                squares = float(residuals @ residuals)
+                variance = covariance_of(jacobian, [residuals], squares)[0, 0]
+                out.append(variance / (squares / (rows - 1) / rows))
+    assert len(ratios) > 20
+    assert len(white_ratios) > 50
+    assert np.median(ratios) > 1.8
+    assert np.min(ratios + white_ratios) > 1.0 - 1e-9
+    assert np.mean(np.array(white_ratios) > 1.01) < 0.1

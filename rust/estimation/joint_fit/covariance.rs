@@ -16,8 +16,8 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
 /// Minimum number of samples per lag of the test for white noise.
 ///
-/// Over fewer samples, the test accepts autocorrelated residuals: a quarter of those of 60 samples with a correlation
-/// of 0.7 from sample to sample. The covariance is then also computed for an autoregression.
+/// Over fewer samples, the test accepts autocorrelated residuals: half of those of 60 samples with a correlation of 0.5
+/// from sample to sample. The covariance is then also computed for an autoregression.
 const MIN_SAMPLES_PER_TESTED_LAG: usize = 10;
 
 /// Return true if residuals are so many that the test for white noise detects autocorrelation.
