@@ -155,8 +155,7 @@ impl FrictionProblem {
 
     /// Return the derivative of a body's friction force in an interval of a pulse with respect to its end velocity
     /// without friction. `velocity` is its velocity at the start. `solved_pulse` holds the end velocity and the pulse
-    /// from
-    /// [`FrictionProblem::solve`].
+    /// from [`FrictionProblem::solve`].
     #[must_use]
     pub fn force_slope(&self, body: usize, length: f64, velocity: f64, solved_pulse: &(f64, Pulse)) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, gain: 0.0, law: [0.0; 3] };

@@ -114,8 +114,8 @@ impl RichardsonTable {
     /// simulation.
     ///
     /// `output_indices` holds the output index of each initial term. `measure` gives the change of each output between
-    /// two estimates. An estimate by which no output is expected to change by more than `tolerance` is returned at
-    /// once.
+    /// two estimates. An estimate is returned immediately if it is expected to change no output by more than
+    /// `tolerance`.
     pub(super) fn estimate(
         &self,
         output_indices: &[usize],

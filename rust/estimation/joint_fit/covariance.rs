@@ -16,11 +16,11 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
 /// Minimum number of samples per lag of the test for white noise.
 ///
-/// Over fewer samples, the test accepts autocorrelated residuals: half of those of 60 samples with a correlation of 0.5
-/// from sample to sample. The covariance is then also computed for an autoregression.
+/// With fewer samples, the test often passes autocorrelated residuals: half of the series of 60 samples with a
+/// correlation of 0.5 between adjacent samples. The covariance is then also computed for an autoregression.
 const MIN_SAMPLES_PER_TESTED_LAG: usize = 10;
 
-/// Return true if residuals are so many that the test for white noise detects autocorrelation.
+/// Return true if there are enough residuals for the test for white noise to detect autocorrelation.
 fn is_long_enough_for_test(residuals: &[f64]) -> bool {
     residuals.iter().filter(|e| !e.is_nan()).count() >= MIN_SAMPLES_PER_TESTED_LAG * WHITENESS_LAGS
 }

@@ -222,11 +222,11 @@ impl StableSearch<'_, '_> {
         Ok(fits)
     }
 
-    /// Continue from `end` along the stability limit, and return the best result.
+    /// Continue from `stopped_candidate` along the stability limit, and return the best result.
     ///
-    /// The optimization of all parameters stopped at `end` because its next step would be unstable. The cost can still
-    /// decrease along the limit. Each autoregressive coefficient in turn is therefore fixed at its value in `end`, and
-    /// the cost is minimized over the other parameters.
+    /// The optimization of all parameters stopped at this candidate because its next step would be unstable. The cost
+    /// can still decrease along the limit. Each autoregressive coefficient in turn is therefore fixed at its value in
+    /// the candidate, and the cost is minimized over the other parameters.
     fn minimize_along_limit(&self, stopped_candidate: &Candidate) -> Result<Candidate> {
         let status = stopped_candidate.result.status;
         let mut best_candidate = stopped_candidate.clone();

@@ -22,8 +22,8 @@ const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
 /// Maximum discretization error of a nonlinear fit before its correction, relative to the noise.
 ///
-/// Errors of offsets and profile intervals are computed on the same pulse grid without correction, so this error widens
-/// them. Its square is the relative increase of the noise variance.
+/// Standard errors of offsets and profile-likelihood intervals are computed on the same pulse grid without correction,
+/// so this error widens them. Its square is the relative increase of the noise variance.
 const MAX_NONLINEAR_STEP_ERROR: f64 = 0.1;
 /// Maximum number of corrections with the same pair of finer pulse grids.
 ///
@@ -138,7 +138,8 @@ pub fn refine_step<'a>(
 
 /// Return the optimum for zero step by deferred correction; None if this fails or is not worth its overhead.
 ///
-/// It serves long records, and nonlinear terms without friction, whose fits on fine pulse grids are slow.
+/// It is used for long records and for nonlinear terms without friction, because their fits on fine pulse grids are
+/// slow.
 ///
 /// At the optimum, the residuals on two finer pulse grids are extrapolated to zero step. The difference of this limit
 /// from the residuals on `objective` hardly depends on the parameters. It is added to the samples, and the model is

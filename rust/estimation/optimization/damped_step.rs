@@ -498,7 +498,7 @@ impl Curvature {
 
     /// Update the matrix after a step.
     ///
-    /// `change` is the change of the gradient, and `columns` is its part due to JᵀJ.
+    /// `change` is the change of the gradient, and `gauss_newton_change` is its part due to JᵀJ.
     pub(crate) fn update(&mut self, step: &[f64], change: &[f64], gauss_newton_change: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let target: Vec<f64> = change.iter().zip(gauss_newton_change).map(|(y, c)| y - c).collect();

@@ -45,17 +45,17 @@ pub(crate) struct SampledSimulation {
     pub(crate) effects: Vec<Vec<f64>>,
 }
 
-/// Difference of two integration orders from a whole number below which it counts as one.
+/// Difference of an integration order from an integer, or of two fractional parts, below which they count as equal.
 const WHOLE_ORDER_TOLERANCE: f64 = 1e-14;
 
-/// Distinct integration orders η. Each is the sum of a whole number and of a fraction in [0, 1).
+/// Distinct integration orders η. Each is the sum of an integer and a fractional part in [0, 1).
 ///
-/// The orders of an equation often differ by whole numbers. The power s^−η is then computed once for the common
-/// fraction, and multiplied by whole powers of 1/s.
+/// The orders of an equation often differ by integers. The power s^−η is then computed once for the common fractional
+/// part, and multiplied by integer powers of 1/s.
 #[derive(Default)]
 struct IntegrationOrders {
     etas: Vec<f64>,
-    /// Whole part of each order, and the index of its fraction; None if the fraction is 0.
+    /// Integer part of each order, and the index of its fractional part; None if the fractional part is 0.
     parts: Vec<(u32, Option<usize>)>,
     fractions: Vec<f64>,
 }
@@ -85,7 +85,7 @@ impl IntegrationOrders {
     /// Write s^−η of each order to `powers`.
     fn powers(&self, point: LaplacePoint, powers: &mut Vec<Bin>) {
         powers.clear();
-        // The powers of the fractions come first and are removed at the end.
+        // The powers of the fractional parts come first and are removed at the end.
         powers.extend(self.fractions.iter().map(|&fraction| point.integration(fraction)));
         let reciprocal = point.s.inv();
         for &(whole, fraction) in &self.parts {
@@ -445,7 +445,7 @@ impl Run {
         weight_sets: &[Vec<f64>],
         exponents: &[f64],
     ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
-        // The place of a set of weights, the input, and the weighted sum of powers for this input.
+        // The index of a set of weights, the input, and the weighted sum of powers for this input.
         let mut functions: Vec<(usize, usize, PowerSum)> = Vec::new();
         let mut initial_jumps = Vec::new();
         for (set_index, weights) in weight_sets.iter().enumerate() {
@@ -496,7 +496,7 @@ impl Run {
         };
         let signals = terms.signals();
         let denominators: Vec<PowerSum> = (0..requests.len()).map(|request| derivative(request, None)).collect();
-        // The place of a request, the place of an input in `signals`, and the derivative of the numerator for it.
+        // The index of a request, the index of an input in `signals`, and the derivative of the numerator for it.
         let mut functions: Vec<(usize, Option<usize>, PowerSum)> = Vec::new();
         for (request, (_, initial_slopes)) in requests.iter().enumerate() {
             for (index, &signal) in signals.iter().enumerate() {

@@ -489,7 +489,7 @@ pub(crate) struct ParameterEffect {
 }
 
 impl ParameterEffect {
-    /// Apply a change of the parameter by `by` to residuals and pulse means.
+    /// Apply the change `change` of the parameter to residuals and pulse means.
     pub(crate) fn apply(&mut self, change: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
         if change != 0.0 {
             residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= change * v);

@@ -20,10 +20,11 @@ const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 
 /// Return true if an equation of order α with given autoregressive terms is unstable.
 ///
-/// `own` contains the coefficient c and the order ν of each term. The equation is unstable if s^α − Σ c s^ν has a zero
-/// in the right half-plane, or on the imaginary axis except the origin. Zeros are counted by the argument principle on
-/// the principal sheet. The angle of the function at s = jω, for ω from 0 to ∞, changes by (p_high − p_low − 2Z)·π/2.
-/// p_high and p_low are the largest and the smallest exponent, and Z is the number of zeros in the right half-plane.
+/// `autoregressive_terms` contains the coefficient c and the order ν of each term. The equation is unstable if
+/// s^α − Σ c s^ν has a zero in the right half-plane, or on the imaginary axis except the origin. Zeros are counted by
+/// the argument principle on the principal sheet. The angle of the function at s = jω, for ω from 0 to ∞, changes by
+/// (p_high − p_low − 2Z)·π/2. p_high and p_low are the largest and the smallest exponent, and Z is the number of zeros
+/// in the right half-plane.
 ///
 /// ```
 /// use ftlm::estimation::output_error::stability::is_unstable;

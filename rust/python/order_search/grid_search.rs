@@ -322,7 +322,7 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     }
 }
 
-/// Test hook: run all kernels with the instruction set of the oldest supported processor if `on` is true.
+/// Test hook: run all kernels with the instruction set of the oldest supported processor if `is_forced` is true.
 #[pyfunction]
 pub fn force_portable(is_forced: bool) {
     crate::simd::force_portable(is_forced);

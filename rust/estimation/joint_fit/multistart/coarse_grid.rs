@@ -70,7 +70,8 @@ fn output_samples<'a>(parameter_set: &ParameterSet, source: &'a Recordings) -> R
     parameter_set.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
 }
 
-/// Return true if every output has a similar standard deviation in the first `first` intervals as in the whole record.
+/// Return true if every output has a similar standard deviation in the first `leading_intervals` intervals as in the
+/// whole record.
 fn varies_like_whole(outputs: &[Vec<&[f64]>], leading_intervals: usize) -> bool {
     outputs.iter().flatten().all(|samples| {
         standard_deviation(&samples[..=leading_intervals.min(samples.len() - 1)])

@@ -489,7 +489,7 @@ fn value_at(values: &Values, name: &str) -> f64 {
     values.get(name).copied().unwrap_or(0.0)
 }
 
-/// Return the coefficients of the reaction forces of attached bodies on a body, scaled by the inertia ratio `share`.
+/// Return the coefficients of the reaction forces of attached bodies on a body, scaled by `inertia_ratio`.
 fn reaction_coefficients(
     structure: &ParametricStructure,
     equation: &ParametricEquation,

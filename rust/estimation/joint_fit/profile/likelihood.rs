@@ -377,7 +377,7 @@ impl<'a> CostSurface<'a> {
         Ok(Self { parameter_set, objective, optimum, pair, sensitivities })
     }
 
-    /// Return `points` evenly spaced values of one of the two parameters, `of` = 0 or 1.
+    /// Return `point_count` evenly spaced values of one of the two parameters, `axis` = 0 or 1.
     ///
     /// They are within bounds and differ from the optimum by at most `half_width`, which has the unit of the parameter.
     #[must_use]
