@@ -186,7 +186,7 @@ def phases() -> Figure:
     design = control.fractional_pid(hub, crossover=40.0, phase_margin=60.0)
     w = np.geomspace(8.0, 200.0, 300)
     plant = design.plants[0].response(w)
-    # As many gains, and all that integer orders have left: the same crossover and margin, an integral of the same size.
+    # The three gains of a PID of integer orders give the same crossover and margin, and an integral of the same size.
     at = design.plants[0].response(np.array([40.0]))[0]
     wanted = np.exp(1j * np.radians(-120.0)) / at
     slow = design.pid.ki * 40.0 ** (1.0 - design.pid.lam)

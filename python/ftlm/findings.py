@@ -172,7 +172,7 @@ class _SentenceFormatter(string.Formatter):
 
 
 class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Finding about data, a fit or a model: a code, its subjects, and the numbers in its sentence.
+    """Finding about data, a fit or a model: a code, its subjects, and the values in its sentence.
 
     Parameters
     ----------

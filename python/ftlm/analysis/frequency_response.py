@@ -318,8 +318,8 @@ def parameter_vector(model: Model) -> Floats:
     """Return all orders and coefficients of a model as a vector, equation by equation, then its input parameters.
 
     An equation contributes alpha, then order and coefficient of each term, then the parameters of its friction. The
-    coefficient of a term includes its known factor. The input parameters, delays, saturations and dead
-    zones, are those of ``Structure.fixed_input_parameters``.
+    coefficient of a term includes its known factor. The input parameters (delays, saturations and dead
+    zones) are those of ``Structure.fixed_input_parameters``.
     """
     parameters: list[float] = []
     for equation in model.equations:

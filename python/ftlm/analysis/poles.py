@@ -375,7 +375,7 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 class OrderExcess:
     """Excess of the highest power of s in a characteristic function over the sum of the orders of its equations.
 
-    The product of all D^alpha should contain the highest power. If terms in the outputs of other equations contain a
+    Usually, the product of all D^alpha contains the highest power. If terms in the outputs of other equations contain a
     higher one with the opposite sign, the coupled equations have a growing pole. As the excess decreases to 0, this
     pole tends to infinity, so data that do not determine the sign of the excess do not show whether the pole exists.
 

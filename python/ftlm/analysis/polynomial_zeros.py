@@ -27,10 +27,10 @@ OVERFLOW_LOG_FREQUENCY = 600.0
 #: Magnitude of the characteristic function, relative to the sum of the magnitudes of its terms, below which a pole is
 #: regarded as on the imaginary axis.
 AXIS_TOLERANCE = 1e-9
-#: Maximum number of polynomials whose zeros are kept, because findings, verdict and report of one model need them.
+#: Maximum number of polynomials whose zeros are cached. Findings, verdict and report of one model need the same zeros.
 CACHED_POLYNOMIALS = 64
-#: Maximum angle [rad] between a relaxation and the negative real axis. The limit is smaller, 1.96 standard deviations
-#: of the angle, for a zero with a smaller uncertainty.
+#: Maximum angle [rad] between the pole of a relaxation and the negative real axis. The limit is 1.96 standard
+#: deviations of the angle if these are smaller.
 REAL_AXIS_ANGLE_RAD = 0.02 * math.pi
 #: Maximum abs(ln s) of a frequency without overflow.
 MAX_LOG_FREQUENCY = 700.0
@@ -174,7 +174,7 @@ def _zeros_of_terms(terms: tuple[tuple[float, float], ...], max_argument: float)
         base, roots = exact_roots
         roots = roots[np.abs(roots) > 0]
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
-        # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
+        # Of a conjugate pair, only the zero with Im ln s > 0 is returned.
         is_in_sector = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= max_argument)]
         if abs(base - 1) < POWER_TOLERANCE:
             is_in_sector = is_in_sector[is_in_sector.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]

@@ -345,7 +345,7 @@ class PidDesign(LoopDesign):
     pid
         Designed controller.
     rate
-         Sampling rate [Hz].
+        Sampling rate [Hz].
     nominal
         Stability margins of the loop at the nominal parameters of the model.
     samples

@@ -55,8 +55,8 @@ from ftlm.validation.residual_tests import (
 #: (Kass and Raftery, doi:10.1080/01621459.1995.10476572). The threshold is three times that, because the best of
 #: several extensions is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: The same for a drift, which is not chosen among many forms. A line through a random walk of the noise decreases the
-#: criterion by up to 16 in 128 records.
+#: Minimum decrease for a drift, which is a single form and not the best of several. In 128 records whose noise is a
+#: random walk, a line decreases the criterion by up to 16.
 MIN_DRIFT_DECREASE = 20.0
 #: Minimum further decrease of the criterion at which an extension replaces one that precedes it in the list. Some are
 #: nearly equivalent on sampled data: feedthrough of a first-order plant, and an input that was logged one sample late.
@@ -82,7 +82,7 @@ LOCAL_FRICTION_FRACTION = 0.02
 MIN_CHANGING_FRACTION = 0.5
 #: Codes of extensions by offsets and initial conditions, which are preferred to other causes.
 OFFSET_CODES = ("level_missing", "offset_missing", "motion_missing", "drift_fits")
-#: Words for the extensions by their codes, in the message on causes that the data do not distinguish.
+#: Text of each extension by its code, in the message on causes that the data do not distinguish.
 CAUSE_NAMES = {
     "level_missing": "a level at rest",
     "offset_missing": "a constant in the equation",
@@ -344,7 +344,7 @@ def _offset_extensions(
                 extensions += _input_offset_extensions(structure, runs, starts)
             add("level_missing", count, offset="level")
             add("motion_missing", terms, initial="caputo")
-        # A ramp has a constant and a slope; the constant is not new beside a level.
+        # A ramp adds a constant and a slope. With a level, it adds only the slope.
         count *= 2
     drift = replace(structure, offset="ramp")
     return [*extensions, Extension("drift_fits", drift, count, [], initial_fit=joint)]
@@ -488,7 +488,7 @@ def _alternative_findings(
 ) -> list[Finding]:
     """Return a finding if other causes with no more parameters than the best extension explain the residuals as well.
 
-    A structure with more parameters may contain the best one, and then always explains as much.
+    A structure with more parameters may contain the best one, and then always explains at least as much.
     """
     codes = list(
         dict.fromkeys(
@@ -615,7 +615,7 @@ def _friction_extensions(
     """Return extensions by Coulomb friction: -fc sign(D y) if the output y is a position, -fc tanh(s y) if a speed.
 
     The second one is omitted if y never changes sign, because its friction is then nearly constant. `values` are the
-    parameters from which they are fitted. Unless `is_local`, they are the optimum of another extension.
+    initial guesses of the parameters: those of the fit if `is_local`, otherwise the optimum of another extension.
     """
     (equation,) = structure.equations
     (name,) = unused_names("fc", 1, structure, runs[0].signals)

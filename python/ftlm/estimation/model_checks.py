@@ -567,8 +567,8 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
     return findings
 
 
-#: Codes of findings on growing poles, if they are significant and if they are not, by whether the simulation of the
-#: model contains these poles. It does not if outputs that enter other equations are taken as measured.
+#: Codes of the findings on significant and on insignificant growing poles, by whether the simulation of the model
+#: contains these poles. It does not if outputs that enter other equations are taken as measured.
 GROWTH_CODES = {
     True: ("simulation_unbounded", "instability_not_significant"),
     False: ("coupled_model_unstable", "coupled_instability_not_significant"),
@@ -646,7 +646,7 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether an unstable model is significantly so (99 %); True if modes or their errors are unknown.
+    """Whether the growth of a mode is significant (99 %); True if modes or their errors are unknown.
 
     `coupling` selects the poles, as in :func:`ftlm.modes`.
     """

@@ -264,7 +264,7 @@ def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Pop
 
     Parameters
     ----------
-    register_file
+    page
         Output registers, which the process shares through their file.
     keep
         Whether the process keeps this file when it ends, instead of removing it.
@@ -294,7 +294,7 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
     ----------
     process
         Process from `spawn_watchdog`.
-    register_file
+    page
         Output registers that the process shares.
 
     Raises

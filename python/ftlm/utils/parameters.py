@@ -53,7 +53,7 @@ class Note(str):
     Parameters
     ----------
     fact
-        Text without the parameter, for readers to whom its syntax means nothing.
+        Text without the parameter, for readers who do not know its syntax.
     override
         Text of the parameter; empty if there is none.
     """

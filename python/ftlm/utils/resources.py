@@ -72,7 +72,7 @@ def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
 
 def _read_text(path: Path) -> str:
     try:
-        # These files are read before each simulation, and a text file takes twice as long.
+        # These files are read before each simulation, and reading in text mode takes twice as long.
         with path.open("rb", buffering=0) as file:
             return file.read().decode("ascii", "replace")
     except OSError:
