@@ -213,17 +213,12 @@ fn correction_agrees_with_finer_grids(size: f64) {
 
 #[test]
 fn step_correction_of_nonlinear_terms_agrees_with_finer_grids() {
-    // y′ = u − y², of which tanh is the step response: exact from sample to sample.
-    let (step, rows, size) = (0.1, 500, 2e-3);
+    // y′ = u − y², of which tanh is the step response.
+    let (step, rows, size) = (0.2_f64, 40, 2e-3);
     let mut random = Random::new(5);
-    let u: Vec<f64> = random.steps(rows, 10).iter().map(|v| 1.25 + 0.75 * v.signum()).collect();
-    let mut state = 0.0;
-    let mut y = Vec::new();
-    for (u, noise) in u.iter().zip(random.signal(rows)) {
-        y.push(state + size * noise);
-        let (end, share) = (u.sqrt(), (u.sqrt() * step).tanh());
-        state = end * (state + end * share) / (end + state * share);
-    }
+    let u = vec![1.0; rows];
+    let y: Vec<f64> =
+        (0..rows).zip(random.signal(rows)).map(|(k, noise)| (step * k as f64).tanh() + size * noise).collect();
     let none = || order(0.0, &[0.0]);
     let equation = FreeEquation {
         output: 0,
@@ -241,9 +236,9 @@ fn step_correction_of_nonlinear_terms_agrees_with_finer_grids() {
     assert!(corrected.step_converged && corrected.pulses_per_sample < refined.pulses_per_sample);
     let truths = [1.0, -1.0, 1.0];
     let errors: Vec<f64> = (0..3).map(|k| corrected.covariance[k * 4].sqrt()).collect();
-    // On the grid itself a parameter is off by more than its error.
+    // On the grid itself a parameter is off by far more than its error.
     let offsets: Vec<f64> = (0..3).map(|k| (best.values()[k] - truths[k]).abs() / errors[k]).collect();
-    assert!(offsets.iter().any(|offset| *offset > 2.0), "{offsets:?}");
+    assert!(offsets.iter().any(|offset| *offset > 4.0), "{offsets:?}");
     for (k, truth) in truths.into_iter().enumerate() {
         let (found, expected, error) = (corrected.estimate[k], refined.estimate[k], errors[k]);
         assert!((found - expected).abs() < 0.2 * error, "{found} and {expected} ± {error}");
