@@ -72,7 +72,8 @@ const TAYLOR_TERMS: i32 = 15;
 /// // y′ = −y + u.
 /// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
 /// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
-/// let step = InputSignal { signal: 1, samples: vec![1.0; 3], between: Intersample::Hold, delay: 0.0, before: 0.0 };
+/// let (samples, intersample) = (vec![1.0; 3], Intersample::Hold);
+/// let step = InputSignal { signal: 1, samples, intersample, delay: 0.0, before: 0.0 };
 /// let y = respond(&[model], &[step], &[], 0.5, 3, &ftlm::parallel::Stop::default())?.unwrap_or_default();
 /// assert!((y[2] - (1.0 - (-1.0_f64).exp())).abs() < 1e-15);
 /// # Ok(())
