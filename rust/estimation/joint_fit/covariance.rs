@@ -16,8 +16,9 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
 /// Minimum number of samples per lag of the test for white noise.
 ///
-/// With fewer samples, the test often passes autocorrelated residuals: half of the series of 60 samples with a
-/// correlation of 0.5 between adjacent samples. The covariance is then also computed for an autoregression.
+/// With fewer samples, the test often misses autocorrelation: it passes half of all series of 60 residuals with a
+/// correlation of 0.5 between adjacent ones. The covariance is then also computed for autoregressive noise, and the
+/// larger variance is used.
 const MIN_SAMPLES_PER_TESTED_LAG: usize = 10;
 
 /// Return true if there are enough residuals for the test for white noise to detect autocorrelation.

@@ -226,7 +226,7 @@ impl OptimizationResult {
         Self { iterate, cost, residual_count, residuals, jacobian, initial, initial_responses, evaluations, status }
     }
 
-    /// Return the result without residuals and derivatives, which fill most of the memory of a long record.
+    /// Return the result without residuals and Jacobian, which take most of the memory of a long record.
     #[must_use]
     pub fn without_residuals(self) -> Self {
         Self { residuals: Vec::new(), jacobian: Vec::new(), initial_responses: Vec::new(), ..self }

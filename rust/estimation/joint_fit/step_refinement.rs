@@ -20,10 +20,11 @@ const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 /// Minimum number of block pulses over all runs at which the step error of a linear model is corrected without fits on
 /// finer pulse grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
-/// Maximum discretization error of a nonlinear fit before its correction, relative to the noise.
+/// Maximum discretization error of a nonlinear fit before its correction, relative to the standard deviation of the
+/// noise.
 ///
-/// Standard errors of offsets and profile-likelihood intervals are computed on the same pulse grid without correction,
-/// so this error widens them. Its square is the relative increase of the noise variance.
+/// Standard errors of offsets, and profile-likelihood intervals, are computed on the same pulse grid without correction.
+/// The discretization error widens them, because its square adds to the variance of the noise.
 const MAX_NONLINEAR_STEP_ERROR: f64 = 0.1;
 /// Maximum number of corrections with the same pair of finer pulse grids.
 ///
@@ -136,15 +137,15 @@ pub fn refine_step<'a>(
     Ok(Optimum { result: optimum, objective, estimate, step_converged: has_converged, covariance: covariance_matrix })
 }
 
-/// Return the optimum for zero step by deferred correction; None if this fails or is not worth its overhead.
+/// Return the optimum in the limit of zero pulse length by deferred correction; None if this fails or does not pay.
 ///
-/// It is used for long records and for nonlinear terms without friction, because their fits on fine pulse grids are
-/// slow.
+/// It is used for long records and for models with nonlinear terms other than friction, because both are slow to fit on
+/// fine pulse grids.
 ///
-/// At the optimum, the residuals on two finer pulse grids are extrapolated to zero step. The difference of this limit
-/// from the residuals on `objective` hardly depends on the parameters. It is added to the samples, and the model is
-/// fitted again on `objective` until the estimate does not change (Stetter, doi:10.1007/BF01432879). The finer pulse
-/// grids are simulated without derivatives.
+/// At the optimum, the residuals on two finer pulse grids are extrapolated to zero pulse length. This limit minus the
+/// residuals on `objective` hardly depends on the parameters. It is added to the samples, and the model is fitted again
+/// on `objective`, until the estimate converges (Stetter, doi:10.1007/BF01432879). The finer pulse grids are simulated
+/// without derivatives.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]). An error if the runs cannot be sampled at a

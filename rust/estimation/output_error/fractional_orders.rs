@@ -48,10 +48,10 @@ pub(crate) struct SampledSimulation {
 /// Difference of an integration order from an integer, or of two fractional parts, below which they count as equal.
 const WHOLE_ORDER_TOLERANCE: f64 = 1e-14;
 
-/// Distinct integration orders η. Each is the sum of an integer and a fractional part in [0, 1).
+/// Distinct integration orders η. Each is n + φ, with an integer n and a fractional part φ in [0, 1).
 ///
-/// The orders of an equation often differ by integers. The power s^−η is then computed once for the common fractional
-/// part, and multiplied by integer powers of 1/s.
+/// The orders of an equation often differ by integers. Therefore s^−φ is computed once per distinct φ, and multiplied by
+/// s^−n.
 #[derive(Default)]
 struct IntegrationOrders {
     etas: Vec<f64>,
