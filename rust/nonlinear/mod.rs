@@ -12,8 +12,11 @@ mod contact;
 pub mod convolution;
 mod fit;
 mod initial_state;
+mod input_continuation;
 mod jumps;
 mod model;
+mod pulse;
+mod sensitivity;
 mod system;
 mod time_stepping;
 
@@ -93,7 +96,7 @@ impl NonlinearSystem {
         let operators = time_stepping::Operators::new(self, record)?;
         let mut forcing = operators.initial_forcing(self, &powers)?;
         operators.add_inputs(self, record, &mut forcing);
-        let (run, end) = operators.run(self, &forcing);
+        let (run, end) = operators.run(self, &forcing, None);
         if let Some(end) = end.filter(|end| !end.is_overflow) {
             return Err(end.error(record.step()));
         }

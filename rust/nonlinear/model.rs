@@ -2,8 +2,10 @@
 
 use super::channels::{ForcingTerms, InputDerivative, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
+use super::input_continuation::InputContinuation;
+use super::sensitivity::{OutputDerivatives, SensitivityCache};
 use super::system::NonlinearSystem;
-use super::time_stepping::{LinearizedRun, Operators, SensitivityCache};
+use super::time_stepping::{LinearizedRun, Operators};
 use crate::equation::Equation;
 use crate::error::{Error, Result};
 use crate::estimation::output_error::{Experiment, FreeModel, Monomial};
@@ -154,6 +156,8 @@ pub(super) struct ExperimentLinearization {
     record: Option<Record>,
     operators: Operators,
     run: LinearizedRun,
+    /// Continuation of the inputs after samples at which they jump.
+    continuation: Option<InputContinuation>,
     /// Derivative of each input with respect to its free parameter.
     input_slopes: Vec<InputDerivative>,
 }
@@ -397,7 +401,10 @@ impl NonlinearModel {
             let operators = Operators::new(&system, record)?;
             let mut forcing = self.initial_forcing(&operators, (&point.orders, &point.coefficients, values))?;
             operators.add_inputs(&system, record, &mut forcing);
-            let (run, end) = operators.run(&system, &forcing);
+            // With friction, the body's own reversals limit the order of convergence.
+            let continuation =
+                if self.frictions.is_empty() { InputContinuation::new(experiment, record) } else { None };
+            let (run, end) = operators.run(&system, &forcing, continuation.as_ref());
             if let Some(end) = end {
                 return Err(end.error(record.step()));
             }
@@ -408,6 +415,11 @@ impl NonlinearModel {
             add_impulses(&mut outputs, &impulses, record.step());
             let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
+            if continuation.is_some() {
+                let corrections = run.sample_corrections(outputs.len(), experiment.compared_count());
+                let corrections = experiment.weighted_corrections(&corrections);
+                residuals.iter_mut().zip(corrections).for_each(|(e, v)| *e -= v);
+            }
             if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
                 return Err(Error::Diverged { what: "simulation".into(), index });
             }
@@ -417,6 +429,7 @@ impl NonlinearModel {
                 record: transformed_record,
                 operators,
                 run,
+                continuation,
                 input_slopes,
             });
         }
@@ -448,7 +461,7 @@ impl NonlinearModel {
                 let slopes = match parameter {
                     // If an order has fallen below an integer, there are fewer initial terms than at the initial guess.
                     Parameter::InitialTerm(_, state) if *state >= states.len() => {
-                        vec![vec![0.0; record.m()]; self.model.equations.len()]
+                        OutputDerivatives::of_means(vec![vec![0.0; record.m()]; self.model.equations.len()])
                     }
                     Parameter::InitialTerm(_, state) if states[*state].is_impulse() => {
                         // The transient of a filter does not enter the equations.
@@ -458,15 +471,30 @@ impl NonlinearModel {
                             impulses[i].push((e, 1.0));
                         }
                         add_impulses(&mut slopes, &impulses, record.step());
-                        slopes
+                        OutputDerivatives::of_means(slopes)
                     }
                     _ => {
                         let derivatives = self.derivatives(point, index, part, parameter)?;
-                        part.operators.sensitivity(&part.system, record, &part.run, &mut cache, &derivatives)?
+                        let continuation = part.continuation.as_ref();
+                        let operators = &part.operators;
+                        operators.sensitivity(
+                            &part.system,
+                            record,
+                            &part.run,
+                            &mut cache,
+                            &derivatives,
+                            continuation,
+                        )?
                     }
                 };
                 // Residuals are measurement minus response.
-                column.extend(experiment.weighted_samples(&slopes).into_iter().map(|v| -v));
+                let mut samples = experiment.weighted_samples(&slopes.means);
+                if part.continuation.is_some() {
+                    let corrections = slopes.sample_corrections(experiment.compared_count());
+                    let corrections = experiment.weighted_corrections(&corrections);
+                    samples.iter_mut().zip(corrections).for_each(|(v, correction)| *v += correction);
+                }
+                column.extend(samples.into_iter().map(|v| -v));
             }
         }
         if columns.iter().flatten().any(|v| !v.is_finite()) {

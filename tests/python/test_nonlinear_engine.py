@@ -217,15 +217,16 @@ JACOBIANS = {
 }
 
 
+@pytest.mark.parametrize("intersample", ["zoh", "foh"])
 @pytest.mark.parametrize("initial", ["rest", "caputo"])
 @pytest.mark.parametrize("name", JACOBIANS)
-def test_derivatives_of_residuals_are_those_of_differences(name, initial):
+def test_derivatives_of_residuals_are_those_of_differences(name, initial, intersample):
     text, values, options = JACOBIANS[name]
     structure = ftlm.equation(text, initial=initial, **options)
     rng = np.random.default_rng(3)
     outputs = {o: 0.3 + 0.1 * rng.standard_normal(200) for o in structure.outputs}
     run = ftlm.Run.from_arrays(
-        step=0.02, inputs={"u": np.repeat(rng.uniform(-1, 1, 10), 20)}, outputs=outputs, intersample={"u": "foh"}
+        step=0.02, inputs={"u": np.repeat(rng.uniform(-1, 1, 10), 20)}, outputs=outputs, intersample={"u": intersample}
     )
     problem = FreeProblem.of(structure)
     grid = Objective(problem, [run], [1.0] * len(structure.outputs))
@@ -257,6 +258,37 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial):
         difference = (residuals(base + by) - residuals(base - by)) / 2e-5
         difference -= basis @ (basis.T @ difference)
         assert np.max(np.abs(column - difference)) < 2e-5 * max(np.max(np.abs(difference)), 1e-3), problem.names[k]
+
+
+#: Plants of order 1 whose outputs have a kink where the input jumps: equation, derivative of y, true coefficients.
+FIRST_ORDER = {
+    "input beside": ("D y = k y^2 + b u", lambda y, u: u - y**2, {"k": -1.0, "b": 1.0}),
+    "input inside": ("D y = k y*u + b u^2", lambda y, u: 0.7 * u**2 - 0.5 * y * u, {"k": -0.5, "b": 0.7}),
+    "functions": ("D y = k tanh(y) + b tanh(u)", lambda y, u: np.tanh(u) - 2 * np.tanh(y), {"k": -2.0, "b": 1.0}),
+}
+
+
+@pytest.mark.parametrize("intersample", ["zoh", "foh"])
+@pytest.mark.parametrize("name", FIRST_ORDER)
+def test_residuals_after_jumps_of_the_input_are_of_second_order_in_the_step(name, intersample):
+    text, slope, values = FIRST_ORDER[name]
+    rows, step, y, exact = 120, 0.1, 0.0, []
+    u = np.repeat(np.where(np.random.default_rng(5).uniform(-1, 1, rows // 5) > 0, 2.0, 0.5), 5)
+    for k in range(rows):
+        exact.append(y)
+        after = u[min(k + 1, rows - 1)] if intersample == "foh" else u[k]
+        level = lambda t, k=k, after=after: u[k] + (after - u[k]) * t / step  # noqa: E731
+        solution = solve_ivp(lambda t, y, u=level: slope(y, u(t)), (0, step), [y], rtol=1e-10, atol=1e-12)
+        y = solution.y[0, -1]
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": exact}, intersample={"u": intersample})
+    problem = FreeProblem.of(ftlm.equation(text, initial="rest"))
+    largest = []
+    for pulses in (1, 2, 4, 8):
+        iterate = Objective(problem, [run], [1.0], pulses).evaluate(start_from_values(problem, values))
+        largest.append(np.max(np.abs(iterate.outcome["residuals"])))
+    # Linear interpolation has kinks of the input, whose pulse means are of second order themselves.
+    assert largest[0] < (0.01 if intersample == "zoh" else 0.05) * np.max(exact)
+    np.testing.assert_array_less(np.divide(largest[1:], largest[:-1]), 0.35)
 
 
 def test_two_runs_with_a_delay_gaps_and_initial_values_are_fitted_together():

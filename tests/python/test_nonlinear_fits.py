@@ -232,7 +232,7 @@ def test_from_the_command_line_to_a_page(runs, tmp_path):
     found = call("identify", first, "--structure", plant.text, "-o", model, "--report", page, "--validation", second)
     assert found.exit_code == 0, found.output
     assert "TRUST" in found.output
-    assert "of that of D^0.8998 y in the equation of y" in " ".join(found.output.split())
+    assert re.search(r"of that of D\^0\.(89|90)\d* y in the equation of y", " ".join(found.output.split()))
     assert "<msup><mrow><mi>y</mi></mrow><mn>2</mn></msup>" in page.read_text(encoding="utf-8")
     assert "only its linear model about a point has poles" in page.read_text(encoding="utf-8")
     compared = call("compare", model, second)
