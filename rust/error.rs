@@ -111,6 +111,14 @@ pub enum Error {
         /// Remedy.
         remedy: String,
     },
+    /// Parameter values at which the equations cannot be simulated.
+    #[error(
+        "the equations cannot be simulated at these parameter values: {reason}; change the orders or coefficients"
+    )]
+    NotSimulable {
+        /// Reason, as a clause.
+        reason: String,
+    },
     /// Simulation, derivative or estimate without a finite result.
     #[error("the {what} is not finite from index {index} on; the model is unstable on this record, so change its orders or coefficients")]
     Diverged {
@@ -178,10 +186,18 @@ pub enum Kind {
 }
 
 impl Error {
+    /// Return the error for a term whose order is above that of its equation.
+    pub(crate) fn term_above_equation() -> Self {
+        Self::NotSimulable { reason: "the order of a term is above that of its equation".into() }
+    }
+
     /// True if this error ends a simulation early, so that an optimizer must shorten its step.
     #[must_use]
     pub fn ends_simulation(&self) -> bool {
-        matches!(self, Self::Diverged { .. } | Self::NoSolution { .. } | Self::LeadingZero { .. })
+        matches!(
+            self,
+            Self::Diverged { .. } | Self::NotSimulable { .. } | Self::NoSolution { .. } | Self::LeadingZero { .. }
+        )
     }
 
     /// Return the category of this error.
@@ -189,9 +205,11 @@ impl Error {
     pub fn kind(&self) -> Kind {
         match self {
             Self::NotFinite { .. } | Self::Length { .. } | Self::Recording { .. } => Kind::Data,
-            Self::Diverged { .. } | Self::NoSolution { .. } | Self::Singular { .. } | Self::Overflow { .. } => {
-                Kind::Convergence
-            }
+            Self::Diverged { .. }
+            | Self::NotSimulable { .. }
+            | Self::NoSolution { .. }
+            | Self::Singular { .. }
+            | Self::Overflow { .. } => Kind::Convergence,
             Self::Interrupted => Kind::Interrupted,
             Self::Internal { .. } => Kind::Internal,
             _ => Kind::Model,

@@ -42,12 +42,13 @@ impl FrictionProblem {
     /// Friction problem of bodies with these friction laws. `gains` holds G_ab, row-major.
     ///
     /// # Errors
-    /// [`Error::Diverged`] if G is not a P-matrix, so that the friction forces of a pulse are not unique. The step is
+    /// [`Error::NotSimulable`] if G is not a P-matrix, so that the friction forces of a pulse are not unique. The step is
     /// then too long.
     pub fn new(laws: Vec<FrictionLaw>, gains: Vec<f64>) -> Result<Self> {
         if !is_p_matrix(&gains, laws.len()) {
             // The optimizer shortens its step after this error.
-            return Err(Error::Diverged { what: "friction of coupled bodies; simulation".into(), index: 0 });
+            let reason = "the friction forces of the coupled bodies are not unique at this step";
+            return Err(Error::NotSimulable { reason: reason.into() });
         }
         Ok(Self { laws, gains })
     }

@@ -50,7 +50,7 @@ impl NonlinearSystem {
     ///
     /// # Errors
     /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution although no
-    /// value overflows. [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction
+    /// value overflows. [`Error::NotSimulable`](crate::error::Error::NotSimulable) if coupled bodies have no unique friction
     /// forces at this step. The errors of [`NonlinearSystem::check`] for an invalid system.
     ///
     /// ```

@@ -396,8 +396,7 @@ impl NonlinearModel {
             let record = transformed_record.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
             // The optimizer shortens its step after this error.
-            let overflow = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
-            system.check().map_err(overflow)?;
+            system.check().map_err(|error| Error::NotSimulable { reason: error.to_string() })?;
             let operators = Operators::new(&system, record)?;
             let mut forcing = self.initial_forcing(&operators, (&point.orders, &point.coefficients, values))?;
             operators.add_inputs(&system, record, &mut forcing);

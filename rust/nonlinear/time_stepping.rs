@@ -153,7 +153,7 @@ impl Operators {
             }
         }
         // The optimizer shortens its step after this error.
-        let order_too_high = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
+        let order_too_high = Error::term_above_equation;
         let (mut integrals, mut groups, mut inputs) = (Vec::new(), Vec::<KernelContributions>::new(), Vec::new());
         let mut is_algebraic = false;
         for (state, &channel) in states.iter().enumerate() {

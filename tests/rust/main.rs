@@ -11,6 +11,7 @@ mod branch_and_bound;
 mod certificate;
 mod coupled_instrumental_variables;
 mod coupled_search;
+mod dual_bounds;
 mod equation;
 mod estimators;
 mod force_jumps;

@@ -12,7 +12,7 @@ use crate::signal::statistics::{
 /// Exponent e in the number of autocovariance lags of the robust covariance, which is 4 N^e for N samples.
 const LAG_POWER: f64 = 1.0 / 3.0;
 /// Minimum fraction of the noise variance that is assumed to remain in the residuals of a fit.
-const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
+const MIN_RESIDUAL_NOISE_RATIO: f64 = 0.2;
 
 /// Minimum number of samples per lag of the test for white noise.
 ///
@@ -269,7 +269,7 @@ fn autoregressive_covariance(pseudoinverse_rows: &[Vec<f64>], basis: &[&[f64]], 
         let filtered_directions = multiply_toeplitz(&directions, &covariances);
         let explained =
             filtered_directions.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
-        let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_SHARE);
+        let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_RATIO);
         let rows: Vec<&[f64]> = pseudoinverse_rows.iter().map(|row| &row[range.clone()]).collect();
         total
             .iter_mut()

@@ -23,9 +23,9 @@ use crate::regressors::BANK_LIMIT;
 use crate::signal::statistics::{mean, median, white_noise_deviation};
 
 /// Fraction of the progress of a fit that is complete after its multistart.
-const MULTISTART_PROGRESS_SHARE: f64 = 0.5;
+const MULTISTART_PROGRESS_FRACTION: f64 = 0.5;
 /// Fraction of the remaining multistart progress that each sweep over the candidates completes.
-const SWEEP_PROGRESS_SHARE: f64 = 0.3;
+const SWEEP_PROGRESS_FRACTION: f64 = 0.3;
 /// Noise standard deviation assumed in a coarse fit, relative to the standard deviation of the output.
 const COARSE_RESIDUAL_RATIO: f64 = 0.01;
 /// Minimum of the estimated noise standard deviation, relative to the standard deviation of the output.
@@ -191,7 +191,12 @@ impl<'a> FitProblem<'a> {
         let weights: Vec<f64> = self.scales.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
         let shared_progress = std::cell::RefCell::new(progress);
         let listener = |count, total| {
-            shared_progress.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, total)
+            shared_progress.borrow_mut().advance_within(
+                MULTISTART_PROGRESS_FRACTION,
+                SWEEP_PROGRESS_FRACTION,
+                count,
+                total,
+            )
         };
         let Self { source, guess_source, stop, .. } = *self;
         let context = MultistartContext {
@@ -342,7 +347,7 @@ pub fn fit(
         }
     };
     let Some(first) = survivors.first() else { return Ok(None) };
-    progress.advance_to(MULTISTART_PROGRESS_SHARE)?;
+    progress.advance_to(MULTISTART_PROGRESS_FRACTION)?;
     let weights = problem.scales.iter().map(|size| 1.0 / size.noise).collect();
     let mut objective = problem.objective(weights, Sampling::default(), settings.refine)?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.

@@ -151,8 +151,8 @@ impl Terms {
             let eta = structure.order - term.order;
             let is_autoregressive = model.output_index(i, term.signal).is_some();
             if eta < if is_autoregressive { MIN_INTEGRATION_ORDER } else { 0.0 } {
-                // This is reported as divergence, so that the optimization shortens its step.
-                return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
+                // The optimizer shortens its step after this error.
+                return Err(Error::term_above_equation());
             }
             let index = terms.orders.index(eta);
             terms.eta_indices.push(index);

@@ -179,7 +179,7 @@ impl FreeModel {
 
     /// Return the integral operators of the terms, by equation.
     ///
-    /// [`Error::Diverged`] if a term has a higher order than its equation permits.
+    /// [`Error::NotSimulable`] if a term has a higher order than its equation permits.
     fn term_operators(
         &self,
         experiment: &Experiment,
@@ -202,8 +202,8 @@ impl FreeModel {
                     MIN_INTEGRATION_ORDER - MAX_ORDER_EXCESS
                 };
                 if eta < min_eta {
-                    // This is reported as divergence, so that the optimization shortens its step.
-                    return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
+                    // The optimizer shortens its step after this error.
+                    return Err(Error::term_above_equation());
                 }
                 row.push(cache.operator((i, k), eta, self.depends_on_free_order(i, k)));
             }

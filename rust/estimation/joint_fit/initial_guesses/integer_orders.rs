@@ -12,7 +12,7 @@
 use std::borrow::Cow;
 use std::f64::consts::PI;
 
-use super::prefilter::power_share_frequency;
+use super::prefilter::cumulative_power_frequency;
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
 use crate::estimation::joint_fit::format::format_general;
@@ -233,7 +233,7 @@ impl<'a> Equation<'a> {
         let frequency = median(
             experiments
                 .iter()
-                .map(|e| power_share_frequency(&output_samples(e), e.record.step(), 0.5))
+                .map(|e| cumulative_power_frequency(&output_samples(e), e.record.step(), 0.5))
                 .filter(|f| f.is_finite())
                 .collect(),
         );

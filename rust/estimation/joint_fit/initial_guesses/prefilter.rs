@@ -67,7 +67,7 @@ impl LowPassCache {
 }
 
 /// Fraction of the power of a signal that lies below its bandwidth.
-const POWER_SHARE: f64 = 0.9;
+const BANDWIDTH_POWER_RATIO: f64 = 0.9;
 
 /// Bandwidth \[rad/s\] of a signal: the frequency below which 90 % of its power lies.
 ///
@@ -83,12 +83,12 @@ const POWER_SHARE: f64 = 0.9;
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
-    power_share_frequency(samples, step, POWER_SHARE)
+    cumulative_power_frequency(samples, step, BANDWIDTH_POWER_RATIO)
 }
 
-/// Frequency \[rad/s\] below which the fraction `share` of the power of the samples lies.
+/// Frequency \[rad/s\] below which this fraction of the power of the samples lies.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f64 {
+pub(super) fn cumulative_power_frequency(samples: &[f64], step: f64, fraction: f64) -> f64 {
     let count = samples.len();
     if count == 0 {
         return f64::NAN;
@@ -108,7 +108,7 @@ pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f
     // A constant signal has no power; its bandwidth is the lowest frequency of the run.
     let reaches_share = |power: &f64| {
         power_below += power;
-        power_below / total_power >= share || (power_below / total_power).is_nan()
+        power_below / total_power >= fraction || (power_below / total_power).is_nan()
     };
     let bin = power.iter().position(reaches_share).unwrap_or(power.len());
     2.0 * PI * bin.max(1) as f64 / (count as f64 * step)

@@ -331,8 +331,9 @@ impl<'a> MultistartState<'a> {
 
     /// Evaluate candidates with the full problem on the subsampled records, and add them to the candidates of the
     /// multistart.
-    fn evaluate_and_add(&mut self, candidates: &[Candidate]) -> Result<()> {
-        let results = self.executor.run(self.parameter_set, &self.coarse_objective, candidates, 1)?;
+    fn evaluate_and_add(&mut self, candidates: impl IntoIterator<Item = Candidate>) -> Result<()> {
+        let candidates: Vec<Candidate> = candidates.into_iter().collect();
+        let results = self.executor.run(self.parameter_set, &self.coarse_objective, &candidates, 1)?;
         self.add(results);
         Ok(())
     }
@@ -345,22 +346,8 @@ impl<'a> MultistartState<'a> {
             let candidates_with_start = first_budget_candidates.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
             let candidates: Vec<Candidate> =
                 candidates_with_start.map(|candidate| submodel.restrict(candidate, self.parameter_set)).collect();
-            let mut candidates = self.executor.run(
-                &submodel.parameter_set,
-                &self.coarse_objective,
-                &candidates,
-                PRESCREEN_EVALUATIONS,
-            )?;
-            candidates.truncate(MAX_FINAL_SURVIVORS);
-            let results = self.executor.run(
-                &submodel.parameter_set,
-                &self.coarse_objective,
-                &candidates,
-                FIRST_BUDGET_EVALUATIONS,
-            )?;
-            return self.evaluate_and_add(
-                &results.iter().take(1).map(|r| submodel.embed(r, self.parameter_set)).collect::<Vec<_>>(),
-            );
+            let best = self.best_optimum(&submodel.parameter_set, &candidates)?;
+            return self.evaluate_and_add(best.map(|best| submodel.embed(&best, self.parameter_set)));
         }
         let cost_level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
         let results = optimize_submodel(
@@ -370,9 +357,7 @@ impl<'a> MultistartState<'a> {
             SUBMODEL_SURVIVORS,
             cost_level,
         )?;
-        self.evaluate_and_add(
-            &results.iter().take(1).map(|r| submodel.embed(r, self.parameter_set)).collect::<Vec<_>>(),
-        )
+        self.evaluate_and_add(results.first().map(|best| submodel.embed(best, self.parameter_set)))
     }
 
     /// Add the optimum with one order fixed as a candidate, so that the full problem does not fit worse than this
@@ -384,10 +369,10 @@ impl<'a> MultistartState<'a> {
             if let Some((results, _)) =
                 none_if_invalid_model(multistart_without_history(&submodel.parameter_set, self.context.for_submodel()))?
             {
+                let full_set = self.parameter_set;
                 let embedded_candidates = competitive_candidates(&results).into_iter().take(MAX_FINAL_SURVIVORS);
-                let embedded_candidates =
-                    embedded_candidates.map(|candidate| submodel.embed(&candidate, self.parameter_set));
-                return self.evaluate_and_add(&embedded_candidates.collect::<Vec<_>>());
+                return self
+                    .evaluate_and_add(embedded_candidates.map(|candidate| submodel.embed(&candidate, full_set)));
             }
         }
         // Start from the optima found so far and from those with integer orders.
@@ -401,20 +386,18 @@ impl<'a> MultistartState<'a> {
             .chain(first.iter().take(MAX_FINAL_SURVIVORS))
             .chain(&self.integer_order_optima);
         let candidates: Vec<Candidate> = sources.map(|candidate| submodel.restrict(candidate, time_scaling)).collect();
-        let mut candidates = merge_duplicates(
-            &self.executor.run(&submodel.parameter_set, &self.coarse_objective, &candidates, PRESCREEN_EVALUATIONS)?,
-            is_same_iterate,
-        );
-        candidates.truncate(MAX_FINAL_SURVIVORS);
-        let results = self.executor.run(
-            &submodel.parameter_set,
-            &self.coarse_objective,
-            &candidates,
-            FIRST_BUDGET_EVALUATIONS,
-        )?;
-        self.evaluate_and_add(
-            &results.iter().take(1).map(|candidate| submodel.embed(candidate, self.parameter_set)).collect::<Vec<_>>(),
-        )
+        let best = self.best_optimum(&submodel.parameter_set, &candidates)?;
+        self.evaluate_and_add(best.map(|best| submodel.embed(&best, self.parameter_set)))
+    }
+
+    /// Optimize a submodel from the given candidates with the first budget, and return its best optimum.
+    fn best_optimum(&self, submodel: &ParameterSet, candidates: &[Candidate]) -> Result<Option<Candidate>> {
+        let run = |candidates: &[Candidate], evaluations: usize| {
+            self.executor.run(submodel, &self.coarse_objective, candidates, evaluations)
+        };
+        let mut survivors = merge_duplicates(&run(candidates, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+        survivors.truncate(MAX_FINAL_SURVIVORS);
+        Ok(run(&survivors, FIRST_BUDGET_EVALUATIONS)?.into_iter().next())
     }
 
     /// Add the optima of the model without offsets.
