@@ -7,7 +7,7 @@ use super::time_stepping::{ExpressionArgument, Operators};
 use crate::expression::Values;
 use crate::linalg::small;
 
-/// Maximum number of Newton iterations in a pulse. Three are usual.
+/// Maximum number of Newton iterations in a pulse. Two or three are usual.
 const MAX_NEWTON_ITERATIONS: usize = 50;
 /// Maximum number of times that a Newton step is halved if it does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
@@ -76,7 +76,8 @@ impl<'a> Pulse<'a> {
         self.z.get(index).copied().unwrap_or_else(|| self.values[index - self.z.len()])
     }
 
-    /// Evaluate non-linear terms, their derivatives and the residual at `z`. Return the Euclidean norm of the residual.
+    /// Evaluate non-linear terms, their derivatives and the residual at `z`. Return the sum of the magnitudes of the
+    /// residual.
     fn evaluate(&mut self) -> f64 {
         let (states, width) = (self.z.len(), self.z.len() + self.input_means.len());
         self.slopes.fill(0.0);
@@ -99,7 +100,7 @@ impl<'a> Pulse<'a> {
             }
         }
         let count = self.operators.sources();
-        let mut norm: f64 = 0.0;
+        let mut norm = 0.0;
         for a in 0..states {
             let gains = &self.operators.gains[a * count..(a + 1) * count];
             let same_pulse_sum: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
@@ -109,17 +110,18 @@ impl<'a> Pulse<'a> {
                 Some(value) => self.z[a] - value,
                 None => self.z[a] - self.free[a] - same_pulse_sum,
             };
-            norm = norm.hypot(self.residual[a]);
+            norm += self.residual[a].abs();
         }
         norm
     }
 
-    /// Set `z` to the linear extrapolation of the last two pulses. The second pulse starts at the value of the first
-    /// pulse, and the first pulse at the forcing.
+    /// Set `z` to the quadratic extrapolation of the last three pulses. The third pulse starts at the linear
+    /// extrapolation of the first two, the second at the value of the first, and the first at the forcing.
     pub(super) fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {
-                [.., previous, last] => 2.0 * last - previous,
+                [.., first, previous, last] => 3.0 * (last - previous) + first,
+                [previous, last] => 2.0 * last - previous,
                 [last] => *last,
                 [] => *free,
             };

@@ -5,7 +5,7 @@
 //! of the fractional integral I^η. w is the coefficient of the term, and x a state channel or the value of an
 //! expression. The autoregressive terms are not inverted, so no kernel grows exponentially, and an unstable linear part
 //! loses no digits. The scheme is implicit. Newton iterations solve each pulse, starting from an extrapolation of the
-//! last two pulses. Sensitivities satisfy the same equations, linearized at the simulation, and need no iteration.
+//! last three pulses. Sensitivities satisfy the same equations, linearized at the simulation, and need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel};
 use super::contact::{BodyMotion, ContactOperators, ContactStates};
