@@ -1,5 +1,6 @@
 //! Initial states and constant forces of a run, as powers of t in outputs and velocities.
 
+use super::system::is_derived_from_output;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};
@@ -106,8 +107,8 @@ impl PowerSum {
 /// Return the powers of t in the derivative D^ρ of an equation's output as (exponent, coefficient). `order` is ρ, and
 /// `powers` holds the powers of t in every output. Return an error if the derivative has no mean over the first pulse.
 ///
-/// With the fractional integral I^η, the derivative D^ρ I^η y equals I^η D^ρ y plus powers of t from y(0), y′(0), ….
-/// These cancel the powers of the initial terms of Caputo derivatives.
+/// Where a term is computed as I^η D^ρ y, powers of t from y(0), y′(0), … are added, because D^ρ I^η y equals I^η D^ρ y
+/// plus these powers. They cancel the powers of the initial terms of Caputo derivatives.
 pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
@@ -123,7 +124,9 @@ pub(super) fn derivative_powers(
         };
         let constants: Vec<f64> = powers.iter().map(coefficient_at).collect();
         let initial_outputs = solve_feedthrough(&constants, links)?;
-        for link in links[equation].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
+        let integrates_derivative =
+            |link: &&Link| link.integration.abs() >= ORDER_GRAIN && !is_derived_from_output(link.integration, order);
+        for link in links[equation].iter().filter(integrates_derivative) {
             let exponent = link.integration + integer_order;
             let value = initial_outputs[link.output] * libm::tgamma(integer_order + 1.0);
             sum.add(exponent, link.coefficient * value / libm::tgamma(exponent + 1.0));

@@ -13,6 +13,18 @@ use crate::linalg::small;
 /// Minimum integration order of a linear term: order of the equation minus order of the term.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
+/// Maximum order of a derivative that is computed from the pulse means of an output.
+const MAX_DIFFERENTIATION_ORDER: f64 = 0.5;
+
+/// Return true if a linear term with integration order η contributes D^ρ I^η y to the derivative D^ρ of an output
+/// through the pulse means of y, as I^{η−ρ} y. Otherwise it contributes I^η D^ρ y.
+///
+/// The second form is an equation of D^ρ y alone. If the linear part of the equation is unstable, the rounding and
+/// discretization errors of y then grow, because the non-linear terms depend on D^ρ y and do not respond to them.
+pub(super) fn is_derived_from_output(eta: f64, rho: f64) -> bool {
+    rho > ORDER_GRAIN && eta >= MIN_INTEGRATION_ORDER && eta - rho >= -MAX_DIFFERENTIATION_ORDER
+}
+
 /// Equations with non-linear terms and dry friction, with given orders and coefficients.
 ///
 /// Signals with an index of `recorded` or more are derived signals.
@@ -225,8 +237,8 @@ impl NonlinearSystem {
             }
         }
         self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
-        // A derivative of an output depends on the same derivative of each output coupled to it. Outputs that enter its
-        // end velocity by their pulse means are the exception.
+        // A derivative of an output depends on the same derivative of each output coupled to it. Outputs that enter it
+        // by their pulse means are the exception.
         let mut processed = 0;
         while processed < states.len() {
             let channel = states[processed];
@@ -234,7 +246,9 @@ impl NonlinearSystem {
                 let eta = self.equations[channel.equation()].structure.order - term.order;
                 match self.output_index(channel.equation(), term.signal) {
                     Some(l) if !(channel.is_at_ends() && self.couples_by_means(channel.equation(), l, eta)) => {
-                        add(&mut states, channel.with_equation(l));
+                        if channel.is_at_ends() || !is_derived_from_output(eta, channel.order()) {
+                            add(&mut states, channel.with_equation(l));
+                        }
                     }
                     _ => {}
                 }

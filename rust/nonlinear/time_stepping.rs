@@ -14,7 +14,7 @@ use super::initial_state::{derivative_powers, power_term_means, EndVelocityForci
 use super::input_continuation::{ContinuedPulse, InputContinuation};
 use super::jumps::ForceJumps;
 use super::pulse::Pulse;
-use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
+use super::system::{is_derived_from_output, NonlinearSystem, MIN_INTEGRATION_ORDER};
 use crate::equation::{Equation, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, MAX_ORDER_EXCESS};
@@ -175,6 +175,9 @@ impl Operators {
                     if at_ends && system.couples_by_means(j, l, eta) {
                         let mean = StateChannel::Mean { equation: l, order: 0.0 };
                         (state_index(mean), kernel_index(&mut integrals, eta - 1.0, true))
+                    } else if !at_ends && is_derived_from_output(eta, rho) {
+                        let mean = StateChannel::Mean { equation: l, order: 0.0 };
+                        (state_index(mean), kernel_index(&mut integrals, eta - rho, false))
                     } else {
                         (state_index(channel.with_equation(l)), kernel_index(&mut integrals, eta, false))
                     }
