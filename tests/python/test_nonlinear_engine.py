@@ -260,6 +260,39 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial, inters
         assert np.max(np.abs(column - difference)) < 2e-5 * max(np.max(np.abs(difference)), 1e-3), problem.names[k]
 
 
+@pytest.mark.parametrize("velocity", [0.0, 0.75])
+def test_a_self_oscillation_stays_on_its_limit_cycle(velocity):
+    # The linear part is unstable: errors that the damping did not feel would grow with exp(0.75 t), 6e9 times.
+    def slope(_, x):
+        return [x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]]
+
+    solution = solve_ivp(slope, (0, 30), [0.5, velocity], method="DOP853", rtol=1e-11, atol=1e-12, dense_output=True)
+    # In the sense of Riemann and Liouville, 1.5 D y also integrates the jump to y(0).
+    initial = {0.0: 0.5, 1.0: velocity - 0.75}
+    text = "D^2 y = 1.5 D y - 1.5 y^2*D y - 1 y"
+    largest = errors(text, 30.0, lambda t: solution.sol(t)[0], {}, initial, sizes=(600, 1200, 2400))
+    assert largest[0] < 0.3
+    np.testing.assert_array_less(np.divide(largest[1:], largest[:-1]), 0.3)
+
+
+def test_a_self_oscillation_is_identified_with_intervals():
+    rows, step = 600, 0.05
+    solution = solve_ivp(
+        lambda _, x: [x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]],
+        (0, rows * step),
+        [0.5, 0.0],
+        t_eval=step * np.arange(rows),
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    y = solution.y[0] + 0.02 * np.random.default_rng(2).standard_normal(rows)
+    run = ftlm.Run.from_arrays(step=step, inputs={}, outputs={"y": y})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = e D y + m y^2*D y + k y"), threads=1)
+    assert "simulation_chaotic" not in {finding.code for finding in found.findings}
+    for name, value in {"e": 1.5, "m": -1.5, "k": -1.0}.items():
+        assert abs(found.values[name] - value) < 3 * found.standard_errors[name] < 0.05, name
+
+
 #: Plants of order 1 whose outputs have a kink where the input jumps: equation, derivative of y, true coefficients.
 FIRST_ORDER = {
     "input beside": ("D y = k y^2 + b u", lambda y, u: u - y**2, {"k": -1.0, "b": 1.0}),
