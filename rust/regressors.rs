@@ -655,10 +655,11 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
 }
 
 /// Split initial terms, given as (exponent, coefficient) pairs by equation, into terms of the equations and impulses of
-/// the sensors.
+/// the sensors. Levels of the outputs, with the exponent ∞, are neither and are left out.
 #[allow(clippy::type_complexity)]
 pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
-    powers.iter().map(|terms| terms.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
+    let finite = |terms: &Vec<(f64, f64)>| terms.iter().copied().filter(|(e, _)| e.is_finite()).collect::<Vec<_>>();
+    powers.iter().map(|terms| finite(terms).into_iter().partition(|(e, _)| !is_impulse(*e))).unzip()
 }
 
 /// Add impulses and their derivatives, given as (exponent, coefficient) pairs by output, to the pulse means of the

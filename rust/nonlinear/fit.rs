@@ -45,6 +45,8 @@ pub struct NonlinearFit {
     /// Derivatives of the residuals with respect to orders, coefficients and input parameters, one vector each. The
     /// span of the derivatives with respect to the initial states is projected out.
     pub jacobian: Vec<Vec<f64>>,
+    /// Orthonormal basis of the derivatives with respect to the initial states of all runs.
+    pub state_responses: Vec<Vec<f64>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
     /// Termination status.
@@ -318,6 +320,7 @@ pub fn fit(
         cost: optimum.cost,
         residuals,
         jacobian,
+        state_responses: basis,
         evaluations: optimum.evaluations,
         status: optimum.status,
     })

@@ -208,6 +208,9 @@ pub(super) enum InitialTerm {
     /// Explicit exponent of t in the output of the equation with this index. The exponents −1, −2, … denote an impulse,
     /// and derivatives of an impulse, at the sensor filter of the output.
     Power(usize, f64),
+    /// Level that is added to the samples of the output of the equation with this index, and does not enter the
+    /// equations. Its exponent is ∞.
+    OutputLevel(usize),
 }
 
 impl InitialTerm {
@@ -248,6 +251,9 @@ impl InitialTerm {
             let offsets = initial.offset_exponents(structure.order).len();
             all.extend((0..offsets).filter_map(|k| u32::try_from(k).ok()).map(|k| Self::Offset(i, k)));
         }
+        if initial.has_level() {
+            all.extend((0..equations.len()).map(Self::OutputLevel));
+        }
         for i in (0..equations.len()).filter(|&i| filtered.get(i).is_some_and(|&is_filtered| is_filtered)) {
             all.extend(initial.impulses().map(|e| Self::Power(i, e)));
         }
@@ -281,6 +287,7 @@ impl InitialTerm {
             }
             Self::Offset(i, degree) => vec![(i, equations[i].structure.order + f64::from(degree), 1.0)],
             Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
+            Self::OutputLevel(i) => vec![(i, f64::INFINITY, 1.0)],
         }
     }
 }

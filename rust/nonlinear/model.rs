@@ -410,10 +410,14 @@ impl NonlinearModel {
             let mut residuals = experiment.measured_samples();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
             let mut outputs = run.sources[..system.equations.len()].to_vec();
-            let (_, impulses) = split_impulses(&self.powers(&point.orders, &point.coefficients, values));
+            let powers = self.powers(&point.orders, &point.coefficients, values);
+            let (_, impulses) = split_impulses(&powers);
             add_impulses(&mut outputs, &impulses, record.step());
             let sampled = experiment.weighted_samples(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
+            let levels = powers.iter().map(|terms| terms.iter().filter(|(e, _)| e.is_infinite()).map(|(_, v)| v).sum());
+            let levels = weighted_levels(experiment, &levels.collect::<Vec<f64>>());
+            residuals.iter_mut().zip(levels).for_each(|(e, v)| *e -= v);
             if continuation.is_some() {
                 let corrections = run.sample_corrections(outputs.len(), experiment.compared_count());
                 let corrections = experiment.weighted_corrections(&corrections);
@@ -457,6 +461,14 @@ impl NonlinearModel {
                     continue;
                 }
                 stop.check()?;
+                if let Parameter::InitialTerm(_, state) = parameter
+                    && let Some(InitialTerm::OutputLevel(output)) = states.get(*state)
+                {
+                    let mut unit = vec![0.0; self.model.equations.len()];
+                    unit[*output] = 1.0;
+                    column.extend(weighted_levels(experiment, &unit).into_iter().map(|v| -v));
+                    continue;
+                }
                 let slopes = match parameter {
                     // If an order has fallen below an integer, there are fewer initial terms than at the initial guess.
                     Parameter::InitialTerm(_, state) if *state >= states.len() => {
@@ -501,6 +513,11 @@ impl NonlinearModel {
         }
         Ok(columns)
     }
+}
+
+/// Return the levels of the outputs at all compared samples, multiplied by the weights, with all outputs concatenated.
+fn weighted_levels(experiment: &Experiment, levels: &[f64]) -> Vec<f64> {
+    levels.iter().enumerate().flat_map(|(i, level)| experiment.weights_of(i).map(move |w| w * level)).collect()
 }
 
 /// Return guesses of the initial states from the first samples of a run. Every guess holds the initial positions and

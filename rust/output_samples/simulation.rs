@@ -292,7 +292,11 @@ impl OutputSimulation {
         let (units, has_level) = match initial {
             InitialTerms::Given(terms) => {
                 check_length("initial terms", self.equations.len(), terms.len())?;
-                let outputs = pulse_grid.samples(&pulse_grid.respond(terms)?, terms, true)?;
+                let mut outputs = pulse_grid.samples(&pulse_grid.respond(terms)?, terms, true)?;
+                for (row, terms) in outputs.iter_mut().zip(terms) {
+                    let level: f64 = terms.iter().filter(|(e, _)| e.is_infinite()).map(|(_, value)| value).sum();
+                    row.iter_mut().for_each(|v| *v += level);
+                }
                 return Ok(OutputSamples { outputs, initial: terms.clone() });
             }
             InitialTerms::Fitted { exponents, has_level } => (self.unit_terms(exponents)?, *has_level),

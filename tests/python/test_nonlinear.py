@@ -210,7 +210,9 @@ LINEAR_ONLY = {
     "reference": lambda m, run: ftlm.identify(
         run, ftlm.equation("D y = a y^2 + b u"), method=ftlm.OutputError(reference="u")
     ),
-    "offset test": lambda m, run: ftlm.identify(run, ftlm.equation("D y = a y^2 + b u"), offset="auto"),
+    "offset test": lambda m, run: ftlm.identify(
+        run, ftlm.equation("D y = a y^2 + b u"), offset="auto", method="least-squares"
+    ),
     "search by instruments": lambda m, run: ftlm.search_orders(
         run, ftlm.equation("D^q y = a y^2 + b u"), coefficients="instrumental-variables"
     ),

@@ -219,6 +219,23 @@ def test_a_fit_to_chaotic_motion_has_no_intervals():
     assert set(found.intervals.values()) == {(-np.inf, np.inf)}
 
 
+@pytest.mark.parametrize("offset", [None, "auto", "level"])
+def test_an_offset_of_the_sensor_is_estimated_as_a_level(offset):
+    rng = np.random.default_rng(12)
+    u = np.repeat(rng.uniform(0, 2, 16), 25)
+    rest = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.zeros(u.size)})
+    y = ftlm.Model(ftlm.equation("D y = -1 y - 0.3 y^3 + 1 u")).simulate(rest, tolerance=1e-6)["y"]
+    run = rest.with_outputs({"y": y + 5.0 + 0.01 * rng.standard_normal(u.size)})
+    found = ftlm.identify(run, ftlm.equation("D y = a y + c y^3 + b u"), offset=offset, threads=1)
+    truth = {"a": -1.0, "c": -0.3, "b": 1.0}
+    for name, value in truth.items():
+        # An error of 0.01 in the level changes a by 2 %, which the errors of the coefficients include.
+        assert abs(found.values[name] - value) < 3 * found.standard_errors[name] < 0.1, name
+    level = found.offsets["level_y"]
+    assert abs(level.value - 5.0) < 3 * level.standard_error < 0.05
+    assert found.joint.noise["y"] == pytest.approx(0.01, rel=0.1)
+
+
 def test_from_the_command_line_to_a_page(runs, tmp_path):
     first, second = tmp_path / "first.csv", tmp_path / "second.csv"
     plant = PLANTS["rotor"]

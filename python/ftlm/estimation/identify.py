@@ -284,7 +284,9 @@ def identify_pieces(
 
 
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
-    """Raise ModelError if ``offset="auto"`` is not possible: with friction, non-linear terms or a checkpoint file.
+    """Raise ModelError if ``offset="auto"`` is not possible: with friction or a checkpoint file.
+
+    With non-linear terms it is only possible with :class:`OutputError`, whose fits with and without offset are compared.
 
     The offset test may require two fits, but the checkpoint file of a method stores only one search.
     """
@@ -294,7 +296,8 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
             f"{parameter('offset', 'auto')} does not support; use {parameter('offset', 'constant')}, whose interval "
             f"says whether it is 0, or {parameter('offset', 'none')}"
         )
-    check_linear(structure.equations, f"the test of {parameter('offset', 'auto')}")
+    if not isinstance(method, OutputError):
+        check_linear(structure.equations, f"the test of {parameter('offset', 'auto')}")
     if getattr(method, "store", None) is not None:
         raise ModelError(
             f"{parameter('offset', 'auto')} may need two searches, but a store keeps only one; use "

@@ -53,8 +53,13 @@ def fit_with_offset_decision(
 
     With ``offset="auto"``, the function `estimate` fits the structure, and a constant is added to each equation if it
     is significant. The structure with the constant is fitted first, because a fit that lacks a necessary constant may
-    end at any wrong optimum. With every other offset, the functions in `fits` fit the structure.
+    end at any wrong optimum. With every other offset, and for non-linear models, for which there is no test of an
+    offset, the functions in `fits` fit the structure.
     """
+    if structure.offset == "auto" and not structure.is_linear:
+        fit = _fit_with_start_decision(replace(structure, offset="none"), replace(fits, may_add_offset=True))
+        decision = f"{fit.task.structure.offset}: no offset, a constant and a level were compared by their fits"
+        return _with_offset_decision(fit, decision)
     if structure.offset != "auto":
         fit = _fit_with_start_decision(structure, fits)
         if structure.initial != "auto" or structure.offset != "none":
@@ -170,7 +175,8 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     """Return the fit with a constant in the equations; None if a level suffices or the constant is no improvement.
 
     No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
-    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
+    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum. For a
+    non-linear plant, the fit with a level of the outputs is returned if it is better still.
     """
     automatic = structure.initial == "auto" and structure.offset == "none" and fits.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":
@@ -197,7 +203,13 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     except FtlmError:
         return None
     joint = candidate.joint
-    if joint is None or joint.unstable_optimum is not None or not is_better(joint):
+    is_constant_better = joint is not None and joint.unstable_optimum is None and is_better(joint)
+    if structure.has_nonlinear_terms:
+        # A non-linear model with an output level is no model with a constant in other coordinates.
+        level = _fit_with_level(candidate if is_constant_better else fit, structure, fits, is_suggested=True)
+        if level is not None:
+            return level
+    if not is_constant_better:
         return None
     complete_fit = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}

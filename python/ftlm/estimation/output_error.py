@@ -379,8 +379,11 @@ def fit_output_error(
 
 
 def level_count(runs: Sequence[Run], structure: Structure) -> int:
-    """Return the number of output levels over all runs. The core does not count them as initial terms."""
-    return len(runs) * len(structure.outputs) if structure.offset == "level" else 0
+    """Return the number of output levels over all runs that the core does not count as initial terms.
+
+    In a non-linear model the levels are initial states, which the core counts.
+    """
+    return len(runs) * len(structure.outputs) if structure.offset == "level" and structure.is_linear else 0
 
 
 def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def output_simulation(
         return core, (False, [list(initial.get(o, {}).items()) for o in model.outputs], False)
     if not structure.is_linear:
         check_uniform_samples(run, model)
-        states = initial_tuple(start, run_without_level.offset, run_without_level.filter_states(start))
+        states = initial_tuple(start, structure.offset, run_without_level.filter_states(start))
         return core, (False, core.fit_initial_states(states, state_refinement, stop_flag()), False)
     names = initial_names(model, start)
     exponents = [[(power, 0.0) for output, power in names if output == o] for o in model.outputs]

@@ -163,11 +163,12 @@ impl Problem {
         let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
         let model = NonlinearModel { model, derived, frictions, filtered };
         let optimum = nonlinear::fit(&model, experiments, &start, settings, stop)?;
+        let basis = if settings.evaluations > 1 { &[][..] } else { &optimum.state_responses };
         let point =
             ParameterPoint { orders: optimum.orders, coefficients: optimum.coefficients, inputs: optimum.inputs };
         Ok(OptimizationResult {
             initial: optimum.states.iter().map(|states| vec![states.clone()]).collect(),
-            initial_responses: Vec::new(),
+            initial_responses: responses_by_run(experiments, basis),
             iterate: Iterate { point, states: optimum.states },
             cost: optimum.cost,
             residual_count: optimum.residuals.len(),
@@ -177,6 +178,19 @@ impl Problem {
             status: optimum.status,
         })
     }
+}
+
+/// Return the vectors of an orthonormal basis of responses to initial states by run, each over the residuals of its
+/// run. A response to an initial state is 0 in all other runs.
+fn responses_by_run(experiments: &[Experiment], basis: &[Vec<f64>]) -> Vec<Vec<Vec<f64>>> {
+    let mut start = 0;
+    let run_responses = |experiment: &Experiment| {
+        let range = start..start + experiment.samples.len() * experiment.compared_count();
+        start = range.end;
+        let part = basis.iter().map(|response| response[range.clone()].to_vec());
+        part.filter(|part| part.iter().any(|v| *v != 0.0)).collect()
+    };
+    experiments.iter().map(run_responses).collect()
 }
 
 /// Iterate of an optimization: parameters and initial states.
