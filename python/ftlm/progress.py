@@ -129,7 +129,7 @@ class Progress:
     label
         Description of the work.
     quiet
-        Whether nothing is shown. Without a terminal nothing is shown in any case.
+        Whether to show no progress bar. Without a terminal, no bar is shown in any case.
     """
 
     def __init__(self, label: str, *, quiet: bool = False) -> None:
@@ -168,7 +168,7 @@ class Progress:
 
     @property
     def quiet(self) -> bool:
-        """Whether nothing is shown."""
+        """Whether the progress bar is hidden."""
         return self._quiet
 
     def announce(self, label: str, shortest: float, longest: float | None = None) -> None:

@@ -380,8 +380,8 @@ def test_a_name_stays_in_its_folder(name):
 
 def test_two_files_of_one_name_are_two(page):
     page.loop(put_beside(page.desk, "run.csv.gz", 1))
-    assert page.desk.check_room("Run.csv.gz", 1) == "Run-2.csv.gz"
-    assert page.desk.check_room("../run.csv", 1) == "run.csv"
+    assert page.desk.unique_file_name("Run.csv.gz", 1) == "Run-2.csv.gz"
+    assert page.desk.unique_file_name("../run.csv", 1) == "run.csv"
 
 
 # ------------------------------------------------------------------------------------------------ from file to model

@@ -12,7 +12,7 @@ from ftlm.analysis import dcgain, modes, polynomial_zeros, steady_states
 from ftlm.analysis.poles import _mode, characteristic, order_excesses
 from ftlm.analysis.polynomial_zeros import right_zeros, zeros_of
 from ftlm.analysis.time_response import response
-from ftlm.estimation.model_checks import has_growing_mode, stability_findings
+from ftlm.estimation.model_checks import has_unstable_mode, stability_findings
 from ftlm.report.html_report import behavior_tables, stability_note
 from ftlm.report.text_summary import behavior_lines
 
@@ -315,8 +315,8 @@ def test_a_pole_from_an_excess_of_orders_is_one_if_the_excess_is_significant() -
         (excess,) = order_excesses(doubtful, coupling="simulated")
         assert (excess.excess, excess.order_sum) == pytest.approx((0.1, 2.0))
         assert excess.error == pytest.approx(0.1 / 2.2)
-        assert has_growing_mode(certain, "simulated")
-        assert not has_growing_mode(doubtful, "simulated")
+        assert has_unstable_mode(certain, "simulated")
+        assert not has_unstable_mode(doubtful, "simulated")
         assert [(f.code, f.level) for f in stability_findings(certain)] == [("order_excess", "with care")]
         (fact,) = stability_findings(doubtful)
         assert (fact.code, fact.level) == ("order_excess_not_significant", "fact")

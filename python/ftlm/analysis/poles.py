@@ -42,7 +42,7 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
-#: One-sided confidence level of a growing mode, and number of standard errors by which the real part of its pole, or
+#: One-sided confidence level of an unstable mode, and number of standard errors by which the real part of its pole, or
 #: the excess of orders that causes it, must exceed 0.
 GROWTH_LEVEL = 0.99
 GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
@@ -342,7 +342,7 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     -------
     tuple of Mode
         One mode per real pole or conjugate pair; poles at the origin are excluded. A pole that exists only because of
-        an insignificant excess of orders (:class:`OrderExcess`) is excluded too. Standard errors are first-order
+        an insignificant order excess (:class:`OrderExcess`) is excluded too. Standard errors are first-order
         approximations from the parameter covariance of the fit.
 
     Raises
@@ -376,7 +376,7 @@ class OrderExcess:
     """Excess of the highest power of s in a characteristic function over the sum of the orders of its equations.
 
     Usually, the product of all D^alpha contains the highest power. If terms in the outputs of other equations contain a
-    higher one with the opposite sign, the coupled equations have a growing pole. As the excess decreases to 0, this
+    higher one with the opposite sign, the coupled equations have an unstable pole. As the excess decreases to 0, this
     pole tends to infinity, so data that do not determine the sign of the excess do not show whether the pole exists.
 
     Parameters
@@ -388,7 +388,7 @@ class OrderExcess:
     error
         Standard error of the excess; None without a covariance.
     poles
-        Growing poles that do not exist without the excess, as ln s.
+        Unstable poles that do not exist without the excess, as ln s.
     """
 
     order_sum: float
@@ -403,14 +403,14 @@ class OrderExcess:
 
 
 def order_excesses(model: Model, *, coupling: str) -> list[OrderExcess]:
-    """Return the excesses of orders that cause growing poles, at most one for each group of coupled equations."""
+    """Return the order excesses that cause unstable poles, at most one for each group of coupled equations."""
     coupled = is_coupled(coupling)
     groups = range(len(coupled_outputs(model, coupled=coupled)))
     return [e for k in groups if (e := order_excess(model, k, coupled=coupled)) is not None]
 
 
 def order_excess(model: Model, group: int, *, coupled: bool) -> OrderExcess | None:
-    """Return the excess of orders that causes a growing pole of a group of coupled equations; None if there is none."""
+    """Return the order excess that causes an unstable pole of a group of coupled equations; None if there is none."""
     names = coupled_outputs(model, coupled=coupled)[group]
     polynomial = characteristic(model, coupled=coupled)[group]
     order_sum, highest = sum(e.order.constant for e in model.equations if e.output in names), max(polynomial)

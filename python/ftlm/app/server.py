@@ -136,7 +136,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     address = f"http://{hosts[0]}/{token}/"
     try:
         for path in paths:
-            await session.take(path.name, path.stat().st_size, _read_chunks(path))
+            await session.store_upload(path.name, path.stat().st_size, _read_chunks(path))
         print(f"ftlm app: {address}\nCtrl-C ends it. Who knows this address can use it: do not pass it on.", flush=True)
         opener = None
         if browser:

@@ -158,7 +158,7 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------------------ files
 
-    def check_room(self, name: str, size: int | None) -> str:
+    def unique_file_name(self, name: str, size: int | None) -> str:
         """Return a unique displayed name for a new file; raise DataError if a limit on number or size is exceeded.
 
         `size` is the announced size in bytes; None if it is unknown.
@@ -187,7 +187,7 @@ class Session:
             free = f"{stem}-{count}{dot}{suffixes}"
         return free
 
-    async def take(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
+    async def store_upload(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
         """Store an uploaded file from its chunks, start to read its preview, and return the file.
 
         The method waits up to `OPEN_REPLY_TIMEOUT_S` for the preview, which is sufficient for most files.
@@ -197,9 +197,9 @@ class Session:
         DataError
             If the file exceeds a size limit, there are too many files, or the file cannot be written.
         """
-        free = self.check_room(name, size)
+        file_name = self.unique_file_name(name, size)
         # The name is reserved here, so that a second upload of the same name gets another one.
-        file, byte_count = File(secrets.token_hex(8), free, 0), 0
+        file, byte_count = File(secrets.token_hex(8), file_name, 0), 0
         self.files[file.key] = file
         try:
             with open(self.folder / file.stored_name, "xb") as stream:

@@ -224,8 +224,8 @@ class WebApplication:
         )
         name = request.query_params.get("name", "")
         try:
-            self._session.check_room(name, size)
-            file = await self._session.take(name, size, request.stream())
+            self._session.unique_file_name(name, size)
+            file = await self._session.store_upload(name, size, request.stream())
         except FtlmError as error:
             raise HTTPException(413, self._session.without_paths(str(error))) from None
         return html_response(view.file(file))

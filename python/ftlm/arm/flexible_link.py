@@ -49,7 +49,7 @@ class LinkParameters:
     def inertia_ratio(self) -> float:
         """Inertia ratio r = (J_1 + J_2)/J_2 of hub J_1 and link J_2.
 
-        In the published form, coefficients a and d of the deflection are -r times those of the hub.
+        In the published form, coefficients a and d of the deflection equation are -r times those of the hub equation.
         """
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from ftlm.cli.framework import OptionalOutputFile, command, print_text, say_written, show
+from ftlm.cli.framework import OptionalOutputFile, command, print_text, print_written_files, show
 from ftlm.cli.reading_options import ReadingOptions
 
 
@@ -34,7 +34,7 @@ def open_(
         opened.write_columns(write_columns, force=force)
     show(opened, as_json=as_json)
     if not as_json:
-        say_written(write_columns)
+        print_written_files(write_columns)
 
 
 @command

@@ -20,7 +20,7 @@ from ftlm.cli.framework import (
     numbers,
     parse_numbers,
     print_text,
-    say_written,
+    print_written_files,
     show,
     show_json,
     write_figure,
@@ -181,7 +181,7 @@ def control(
         *([planned] if planned is not None else []),
     ):
         print_text(str(line))
-    say_written(out, trajectory)
+    print_written_files(out, trajectory)
 
 
 @command
@@ -220,7 +220,7 @@ def input_shaper(
         show_json(shaper.to_dict() | {"rate": rate, "samples": taps})
         return
     print_text(str(shaper))
-    say_written(out)
+    print_written_files(out)
 
 
 def _write_trajectory(planned: designs.Trajectory, rate: float, path: str, *, force: bool) -> None:
@@ -309,7 +309,7 @@ def design_input(
         write_figure(design_plots.design(result), plot, force=force)
     show(result, as_json=as_json)
     if not as_json:
-        say_written(out, plot)
+        print_written_files(out, plot)
 
 
 def _sizes(option: str, texts: list[str] | None) -> float | dict[str, float] | None:

@@ -398,7 +398,7 @@ def restrict_grid(grid: OrderGrid, group: Structure) -> OrderGrid:
 
 
 def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print results, given by name of their output or search, as text or JSON."""
+    """Print a dictionary of results by name (of an output or a search) as text, or as JSON."""
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:

@@ -172,7 +172,7 @@ class Command(TyperCommand):
             raise
 
     def _check_repetition(self, ctx: Any, args: Sequence[str]) -> None:
-        """Fail if an option with a single value is given twice; the parser would ignore all values but the last."""
+        """Raise a usage error for a repeated option with a single value; the parser would use the last value only."""
         order: list[Any] = self.make_parser(ctx).parse_args(list(args))[2]
         single_valued = [p for p in order if p.param_type_name == "option" and not (p.multiple or p.is_flag or p.count)]
         for option in single_valued:
@@ -481,8 +481,8 @@ def write_figure(figure: Any, path: str, *, force: bool) -> None:
     write_atomically(path, data.getvalue(), force=force)
 
 
-def say_written(*paths: str | None) -> None:
-    """Print one line for each written file; None is ignored."""
+def print_written_files(*paths: str | None) -> None:
+    """Print one line for each path of a written file; a path that is None is skipped."""
     for path in paths:
         if path is not None:
             print(f"written: {path}")

@@ -113,7 +113,7 @@ def version(
 
 
 def main() -> None:
-    """Run the program."""
+    """Run the program ``ftlm`` with the arguments of the command line."""
     # A standard stream may be closed, as by `>&-`. The next file that is opened must not get its descriptor.
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115

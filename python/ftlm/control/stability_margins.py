@@ -79,7 +79,7 @@ class LoopDesign:
     def margin_interval(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
         """Return the central 95 % interval (low, high) of a margin over the parameter samples.
 
-        Without samples, both limits are the nominal value.
+        `what` is the name of the margin. Without samples, both limits are the nominal value.
         """
         if not self.samples:
             value = getattr(self.nominal, what)

@@ -549,7 +549,7 @@ class NonuniformSamples:
         """Return the samples with times from `start` to `stop` + `step` [s]; the new times are counted from `start`.
 
         If there is no sample at `start`, a sample is added there, with NaN for the outputs, and with values for the
-        inputs by their intersample `intersample`.
+        inputs by their intersample behavior `intersample`.
         """
         tolerance = 1e-9 * step
         rows = np.flatnonzero((self.times >= start - tolerance) & (self.times <= stop + step))
@@ -567,7 +567,7 @@ class NonuniformSamples:
         return NonuniformSamples(times, data)
 
     def replace_signals(self, **changes: Any) -> NonuniformSamples:
-        """Return a copy with some signals replaced."""
+        """Return a copy with new samples of some signals, given as keyword arguments by signal name."""
         return NonuniformSamples(self.times, {**self.data, **changes})
 
 

@@ -358,7 +358,7 @@ def _bound_crossing(
 
 
 def _positive_least_squares(table: Floats, target: Floats) -> Floats:
-    """Return a positive least-squares solution x of ``table @ x = goal``.
+    """Return a positive least-squares solution x of ``table @ x = target``.
 
     Components that are not positive are replaced by 0.001 of the largest component, for columns of unit norm.
     """

@@ -66,9 +66,9 @@ def fit_with_instruments(
     the noise-free part that the reference explains.
 
     The residuals belong to the measured runs. The instruments are the sensitivities of the outputs to the parameters,
-    computed with `noise_free_runs`. Orthogonality of both removes the bias caused by feedback of noise, whatever the
-    accuracy of `noise_free_runs` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The
-    equations are solved by Gauss-Newton. The covariance is robust to colored residuals.
+    computed with `noise_free_runs`. Residuals that are orthogonal to the instruments have no bias from feedback of
+    noise, even if `noise_free_runs` are inaccurate (Young, Recursive Estimation and Time-Series Analysis, 2011,
+    chapters 7 and 9). The equations are solved by Gauss-Newton. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     pulses_per_sample = max(joint.refinement, MIN_PULSES_PER_SAMPLE)

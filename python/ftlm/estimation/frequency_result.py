@@ -18,7 +18,7 @@ from ftlm.analysis.frequency_response import covariance_of, frequency_response, 
 from ftlm.analysis.model_algebra import Ratio
 from ftlm.data.frequency_data import FrequencyData, as_frequency_data
 from ftlm.errors import DataError, FtlmError, ModelError
-from ftlm.estimation.model_checks import has_growing_mode, unstable_poles_text
+from ftlm.estimation.model_checks import has_unstable_mode, unstable_poles_text
 from ftlm.estimation.response_problem import is_impedance
 from ftlm.estimation.verdict import TRUST_LEVEL, Verdict, verdict_from, verdict_html
 from ftlm.findings import Finding, group_findings, make_finding, texts
@@ -460,7 +460,7 @@ class FrequencyIdentification:
             return []
         with contextlib.suppress(FtlmError):
             stable = self.model.stability(coupling="simulated")
-            if stable.unstable_poles > 0 and has_growing_mode(self.model, "simulated"):
+            if stable.unstable_poles > 0 and has_unstable_mode(self.model, "simulated"):
                 return [make_finding("response_grows", poles=unstable_poles_text(stable.unstable_poles))]
         return []
 

@@ -311,8 +311,8 @@ def assess_fit(fit: Fit) -> Identification:
     All of them are computed on the estimation runs.
     """
     runs, model = as_runs(fit.task.runs), fit.model
-    free = simulate_runs(model, runs)
-    comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
+    simulations = simulate_runs(model, runs)
+    comparison = compare_samples(model, runs, simulations, m=model.m or default_m(runs, power_of_two=False))
     findings = [*comparison.findings, *fit.findings]
     findings += [note for run in runs for note in data_notes(run)]
     findings += start_findings(runs, model.structure)
@@ -321,9 +321,9 @@ def assess_fit(fit: Fit) -> Identification:
         discretization_findings(model, comparison)
         + stability_findings(replace(model, estimate=_estimate(fit, comparison, None, ())))
         + mode_sampling_findings(model, runs)
-        + friction_direction_findings(model, free)
-        + stribeck_findings(model, runs, free)
-        + nonlinear_findings(model, runs, free)
+        + friction_direction_findings(model, simulations)
+        + stribeck_findings(model, runs, simulations)
+        + nonlinear_findings(model, runs, simulations)
     )
     if fit.joint is not None and any(f.code == "simulation_chaotic" for f in findings):
         # The cost is nowhere quadratic, and a profile follows one of its many minima.
@@ -331,7 +331,7 @@ def assess_fit(fit: Fit) -> Identification:
         fit = replace(fit, joint=replace(fit.joint, covariance=infinite_covariance, profiles={}))
     tests, criteria = None, None
     try:
-        tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))
+        tests = run_residual_tests(model, runs, simulations, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))
         criteria = information_criteria(tests, fit.parameters)
     except DataError:
         # The run is too short for correlations. All other results are available.

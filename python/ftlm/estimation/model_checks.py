@@ -525,7 +525,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
     return findings
 
 
-def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> list[Finding]:
+def friction_direction_findings(model: Model, simulations: Sequence[OutputSamples]) -> list[Finding]:
     """Return a finding for each body that slides in one direction only, so that friction and offset are collinear."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
@@ -537,11 +537,11 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
     return [
         make_finding("friction_unsigned", output=model.outputs[i])
         for i in model.structure.friction_equations
-        if not any(reverses(run.outputs[i]) for run in free)
+        if not any(reverses(run.outputs[i]) for run in simulations)
     ]
 
 
-def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+def stribeck_findings(model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]) -> list[Finding]:
     """Return findings if no run distinguishes friction at low speed from friction at high speed."""
     findings = []
     for equation in model.equations:
@@ -550,7 +550,8 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
             continue
         vs, column = float(stribeck.speed), model.outputs.index(equation.output)
         speeds_by_run = [
-            np.abs(np.diff(simulated.outputs[column])) / run.step for run, simulated in zip(runs, free, strict=True)
+            np.abs(np.diff(simulated.outputs[column])) / run.step
+            for run, simulated in zip(runs, simulations, strict=True)
         ]
         speeds = np.concatenate([p[p > MIN_MOTION_RANGE_FRACTION * p.max(initial=0.0)] for p in speeds_by_run])
         slow_count = int(np.sum(speeds < SLOW_SPEED_RATIO * vs))
@@ -567,7 +568,7 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
     return findings
 
 
-#: Codes of the findings on significant and on insignificant growing poles, by whether the simulation of the model
+#: Codes of the findings on significantly and on insignificantly unstable poles, by whether the simulation of the model
 #: contains these poles. It does not if outputs that enter other equations are taken as measured.
 GROWTH_CODES = {
     True: ("simulation_unbounded", "instability_not_significant"),
@@ -586,17 +587,17 @@ def stability_findings(model: Model) -> list[Finding]:
         # Friction or a hardening spring can bound a growing motion. Poles do not describe this.
         return []
     coupling = model.structure.coupling
-    findings = _growth_findings(model, coupling)
+    findings = _instability_findings(model, coupling)
     if findings or coupling == "simulated":
         return findings
     try:
-        return _growth_findings(model, "simulated")
+        return _instability_findings(model, "simulated")
     except FtlmError:
         # Equations that cannot be solved for all outputs together have no common poles.
         return []
 
 
-def _growth_findings(model: Model, coupling: str) -> list[Finding]:
+def _instability_findings(model: Model, coupling: str) -> list[Finding]:
     """Return findings on poles with a positive real part of the model with the given coupling."""
     stable = model.stability(coupling=coupling)
     if not stable.unstable_poles > 0:
@@ -606,13 +607,13 @@ def _growth_findings(model: Model, coupling: str) -> list[Finding]:
     count = stable.unstable_poles - _excess_pole_count(excesses)
     if count > 0:
         codes = GROWTH_CODES[coupling == model.structure.coupling]
-        code = codes[0 if _has_other_growing_mode(model, coupling) else 1]
+        code = codes[0 if _has_other_unstable_mode(model, coupling) else 1]
         findings.append(make_finding(code, stability=str(stable), poles=unstable_poles_text(count)))
     return findings
 
 
 def _excess_finding(excess: OrderExcess) -> Finding:
-    """Return the finding on an excess of orders and the growing pole that it causes."""
+    """Return the finding on an :class:`OrderExcess` and the unstable pole that it causes."""
     return make_finding(
         "order_excess" if excess.significant else "order_excess_not_significant",
         excess=excess.excess,
@@ -645,8 +646,8 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
     return [make_finding("mode_sampled_coarsely", **details)]
 
 
-def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether the growth of a mode is significant (99 %); True if modes or their errors are unknown.
+def has_unstable_mode(model: Model, coupling: str) -> bool:
+    """Whether the model has a significantly unstable mode (99 %); True if modes or their errors are unknown.
 
     `coupling` selects the poles, as in :func:`ftlm.modes`.
     """
@@ -654,19 +655,19 @@ def has_growing_mode(model: Model, coupling: str) -> bool:
     if any(excess.significant for excess in excesses):
         return True
     count = model.stability(coupling=coupling).unstable_poles - _excess_pole_count(excesses)
-    return count > 0 and _has_other_growing_mode(model, coupling)
+    return count > 0 and _has_other_unstable_mode(model, coupling)
 
 
-def _has_other_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether a growing mode that no excess of orders causes is significant.
+def _has_other_unstable_mode(model: Model, coupling: str) -> bool:
+    """Whether the model has a significantly unstable mode that no :class:`OrderExcess` causes.
 
     The standard error of a pole is a first-order approximation. It fails at multiple poles, such as those of a double
     integrator. A mode is therefore not significant if the model is stable without its insignificant terms.
     """
-    return _has_significant_growth(model, coupling) and not _is_stable_without_insignificant_terms(model, coupling)
+    return _has_significant_instability(model, coupling) and not _is_stable_without_insignificant_terms(model, coupling)
 
 
-def _has_significant_growth(model: Model, coupling: str) -> bool:
+def _has_significant_instability(model: Model, coupling: str) -> bool:
     """Whether the real part of an unstable pole exceeds its standard error significantly."""
     try:
         unstable = [mode for mode in modes(model, coupling=coupling) if mode.unstable]

@@ -68,8 +68,8 @@ def _residual_findings(model: Model, runs: Run | Sequence[Run], comparison: Comp
         return {}
 
     try:
-        free = simulate_runs(model, run_list)
-        tests = run_residual_tests(model, run_list, free, lags=DEFAULT_LAGS, sensitivities=sensitivities)
+        simulations = simulate_runs(model, run_list)
+        tests = run_residual_tests(model, run_list, simulations, lags=DEFAULT_LAGS, sensitivities=sensitivities)
     except FtlmError:
         # The runs are too short for correlations, or a simulation fails, which other findings report.
         return []

@@ -28,14 +28,14 @@ EXPONENTIAL_GROWTH, MAX_OUTPUT_GROWTH = 64.0, 4.0
 RELATIVE_CHANGE = 1e-7
 
 
-def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+def nonlinear_findings(model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]) -> list[Finding]:
     """Return findings on the non-linear terms of a model on its runs; [] for a linear model."""
-    finite = all(np.isfinite(samples.outputs).all() for samples in free)
+    finite = all(np.isfinite(samples.outputs).all() for samples in simulations)
     if not model.structure.has_nonlinear_terms or not finite or any(run.nonuniform_samples is not None for run in runs):
         return []
-    values = [_signal_values(model, run, samples) for run, samples in zip(runs, free, strict=True)]
+    values = [_signal_values(model, run, samples) for run, samples in zip(runs, simulations, strict=True)]
     findings = [f for equation in model.equations for f in _term_findings(equation, runs, values)]
-    return [*findings, *_sensitivity_growth_findings(model, runs, free)]
+    return [*findings, *_sensitivity_growth_findings(model, runs, simulations)]
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
@@ -101,7 +101,9 @@ def _rms(parts: Sequence[Floats]) -> float:
         return math.sqrt(float(np.mean(np.concatenate(parts) ** 2)))
 
 
-def _sensitivity_growth_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
+def _sensitivity_growth_findings(
+    model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]
+) -> list[Finding]:
     """Return a finding if the sensitivity of a simulated output to a parameter grows exponentially.
 
     The output itself must not grow. As in chaotic motion, the end of the run then depends too strongly on the
@@ -109,19 +111,19 @@ def _sensitivity_growth_findings(model: Model, runs: Sequence[Run], free: Sequen
     """
     theta = parameter_vector(model)
     worst: tuple[float, float, str] | None = None
-    for run, samples in zip(runs, free, strict=True):
+    for run, samples in zip(runs, simulations, strict=True):
         half = run.length // 2
         for k in np.flatnonzero(theta):
             perturbed = theta.copy()
             perturbed[k] *= 1.0 + RELATIVE_CHANGE
             try:
-                simulations = [
+                outputs, perturbed_outputs = [
                     simulate_samples(m, run, 1, samples.initial)[0]
                     for m in (model, with_parameter_vector(model, perturbed))
                 ]
             except FtlmError:
                 continue
-            y, change = simulations[0], np.abs(simulations[1] - simulations[0])
+            y, change = outputs, np.abs(perturbed_outputs - outputs)
             early_change, late_change = change[:, :half].max(), change[:, half:].max()
             is_growing = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
             if (

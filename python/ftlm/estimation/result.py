@@ -523,7 +523,7 @@ class Identification:
           is permitted.
         - Equations that take other outputs as measured are significantly unstable if they are simulated together. Or
           the highest power of s in the characteristic function of coupled equations significantly exceeds the sum of
-          their orders, so that they have a growing pole.
+          their orders, so that they have an unstable pole.
         - Residuals are correlated with an input or depend on the direction of motion. Or they are not white, and no
           test shows that they are independent of the inputs. Or a closed loop biases the estimates. Residuals below a
           thousandth of the output do not count.

@@ -21,7 +21,7 @@ from ftlm.simulation.output_samples import measured_samples
 from ftlm.structure.structure import Structure
 from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, Comparison, simulate_runs
 
-#: Length of a piece, and minimum length if a run is shorter, both in time constants of the fastest growing mode; and
+#: Length of a piece, and minimum length if a run is shorter, both in time constants of the most unstable mode; and
 #: minimum number of samples. Over a piece, a model error grows by the factor e^5, or at least e^2.5.
 PIECE_TIME_CONSTANTS, MIN_PIECE_TIME_CONSTANTS, MIN_PIECE_SAMPLES = 5.0, 2.5, 20
 #: Maximum exponent a T of the growth exp(a T) of a mode over the shortest piece.

@@ -43,7 +43,7 @@ NUMERIC_MATLAB_CLASSES = frozenset(
 
 
 class UnreadableError(Exception):
-    """Error for a file that cannot be read, with its `reason` and a remedy `way_out`; "" for a damaged file."""
+    """Error for a file that cannot be read, with the reason as message and a remedy `way_out`, "" if there is none."""
 
     def __init__(self, reason: str, way_out: str = "") -> None:
         super().__init__(reason)

@@ -260,12 +260,12 @@ class Timestamps:
         parts, clock = (np.concatenate([getattr(p, name) for p in pieces]) for name in ("parts", "clock"))
         return replace(pieces[0], parts=parts, clock=clock)
 
-    def seconds(self, thing: str, dates: str | None) -> Floats:
+    def seconds(self, label: str, dates: str | None) -> Floats:
         """Return the times in seconds since the first row, exact to the nanosecond.
 
         Parameters
         ----------
-        thing
+        label
             Label of the column in error messages.
         dates
             Sequence of year, month and day given by the user ("ymd", "dmy" or "mdy"), or None.
@@ -278,14 +278,14 @@ class Timestamps:
         since = self.clock
         if not self.separator:
             return np.asarray((since - since[0]) / _NANOSECONDS_PER_SECOND)
-        year, month, day = (self.parts[:, index] for index in self._order(thing, dates))
+        year, month, day = (self.parts[:, index] for index in self._order(label, dates))
         year = np.where(year < 100, year + 2000, year)
         months = (12 * (year - 1970) + np.clip(month, 1, 12) - 1).astype("datetime64[M]")
         starts, ends = (m.astype("datetime64[D]").astype(np.int64) for m in (months, months + 1))
         is_invalid = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
         if is_invalid.any():
             remedy = f"correct these rows, or give the order of day and month with {layout_parameter(dates='dmy')}"
-            raise masked_rows_error(thing, "an invalid date", is_invalid, remedy)
+            raise masked_rows_error(label, "an invalid date", is_invalid, remedy)
         days = starts + day - 1
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
@@ -310,7 +310,7 @@ class Timestamps:
         is_day_first = self.separator == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
         return "dmy" if is_day_first else ""
 
-    def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
+    def _order(self, label: str, dates: str | None) -> tuple[int, int, int]:
         """Return the positions of year, month and day in a date; raise DataError if they are ambiguous."""
         largest_first, likely = self.parts[:, 0].max(), self._detect_date_order()
         order = likely if likely == "ymd" or dates is None else dates
@@ -318,11 +318,11 @@ class Timestamps:
             return {"ymd": (0, 1, 2), "dmy": (2, 1, 0), "mdy": (2, 0, 1)}[order]
         if largest_first > 12:
             raise DataError(
-                f"{thing}: {self.first!r} may begin with the year or with the day; give "
+                f"{label}: {self.first!r} may begin with the year or with the day; give "
                 f"{layout_parameter(dates='ymd')} or {layout_parameter(dates='dmy')}"
             )
         raise DataError(
-            f"{thing}: {self.first!r} may begin with the day or with the month; give {layout_parameter(dates='dmy')} "
+            f"{label}: {self.first!r} may begin with the day or with the month; give {layout_parameter(dates='dmy')} "
             f"or {layout_parameter(dates='mdy')}"
         )
 

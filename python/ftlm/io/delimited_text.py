@@ -82,7 +82,7 @@ class _BadCells:
     example: str = ""
 
     def error(self, column: str, source: str) -> DataError:
-        thing = f"{source}: column {column!r}, line {self.line}"
+        label = f"{source}: column {column!r}, line {self.line}"
         text = self.cell.strip()
         cell_text = repr(text if len(text) <= 40 else text[:40] + "…")
         way_out = "correct or remove these rows"
@@ -116,7 +116,7 @@ class _BadCells:
             )
         else:
             description = f"{cell_text} is not a number"
-        return bad_rows_error(thing, description, self.row, self.count, way_out)
+        return bad_rows_error(label, description, self.row, self.count, way_out)
 
 
 @dataclass

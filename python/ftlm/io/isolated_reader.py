@@ -285,13 +285,13 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
 def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
     """Return the column of an array of timestamps [ns], counted from the time `since` [ns since 1970]."""
     values = matrix.ravel(order="F")
-    thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
+    label, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
     if is_missing.any():
-        problem = masked_rows_error(thing, "no date", is_missing, "remove or fill these rows yourself")
+        problem = masked_rows_error(label, "no date", is_missing, "remove or fill these rows yourself")
         return Column(name, name, path, None, problem)
     first_text = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
     timestamps = Timestamps(
         np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first_text
     )
-    problem = dates_error(thing, f"dates, not numbers ({first_text})", values.size)
+    problem = dates_error(label, f"dates, not numbers ({first_text})", values.size)
     return Column(name, name, path, values, problem, timestamps=timestamps)

@@ -218,7 +218,7 @@ def run_from_tables(
 
     given_inputs = gather(selection.inputs, blank=policy == "hold")
     given_outputs = gather(selection.outputs, blank=policy != "refuse")
-    clock = _time_column(selection, pool, used_columns, options, policy)
+    time_column = _time_column(selection, pool, used_columns, options, policy)
     name = options.name
     if name is None:
         stem = base_name(tables[0].path)
@@ -230,25 +230,25 @@ def run_from_tables(
         for a in table.assumptions
         if a.affects_run
     )
-    facts += (*(a.note for a in roles), *clock.notes, *conversion_notes(selection.units))
+    facts += (*(a.note for a in roles), *time_column.notes, *conversion_notes(selection.units))
     arguments = RunArguments(
         given_inputs,
         given_outputs,
         step=selection.step,
-        time=clock.times,
+        time=time_column.times,
         units=selection.units,
         intersample=selection.intersample,
         name=name,
         resample=options.resample,
         window=options.window,
-        time_unit=clock.unit,
+        time_unit=time_column.unit,
         labels=labels,
         notes=facts,
-        time_label=clock.label,
+        time_label=time_column.label,
         missing=policy,
     )
     if header is not None:
-        known_step = header.step if clock.name == CSV_TIME else None
+        known_step = header.step if time_column.name == CSV_TIME else None
         arguments = replace(arguments, known_step=known_step, notes=(*header.warnings, *facts), metadata=header.about)
     return Run._from_checked(**arguments.checked_fields())
 
@@ -308,10 +308,10 @@ def _assume_roles(selection: ColumnSelection, pool: ColumnTable, signals: Signal
     if selection.inputs or selection.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
-    clock = unused_time(selection, pool, set())
+    time_column = unused_time(selection, pool, set())
     if selection.step is None:
-        clock, _ = pool.time(selection.time, matrices if len(matrices) == 1 else [], set())
-    return assume_roles(selection, [c for c in pool.columns if c is not clock], signals)
+        time_column, _ = pool.time(selection.time, matrices if len(matrices) == 1 else [], set())
+    return assume_roles(selection, [c for c in pool.columns if c is not time_column], signals)
 
 
 def unused_time(selection: ColumnSelection, pool: ColumnTable, signals: Collection[str]) -> Column | None:
@@ -352,12 +352,16 @@ def _check_disjoint_roles(selection: ColumnSelection, pool: ColumnTable) -> None
         )
 
 
-def time_header(clock: Column) -> str:
+def time_header(time_column: Column) -> str:
     """Return the header of a time column with its unit, or ``time`` for the first column of a matrix."""
-    if clock.matrix is not None:
+    if time_column.matrix is not None:
         return "time"
-    is_unit_row = clock.file_unit and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
-    return f"{clock.variable} [{clock.file_unit}]" if is_unit_row else clock.variable
+    is_unit_row = (
+        time_column.file_unit
+        and split_time_header(time_column.variable)[1] is None
+        and not split_unit(time_column.variable)[1]
+    )
+    return f"{time_column.variable} [{time_column.file_unit}]" if is_unit_row else time_column.variable
 
 
 def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:

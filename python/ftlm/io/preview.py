@@ -284,14 +284,16 @@ class _FilePreview:
     def result(self, path: str) -> OpenedFile:
         table, selection = self.table, self.selection
         all_columns = self.pool.columns
-        clock, assumed, problem = self._time(all_columns)
-        of_clock = () if clock is None or selection.step is not None else self._time_assumptions(clock)
-        roles, role_assumptions, open_roles = self._roles(all_columns, clock)
-        assumed = (*table.assumptions, *assumed, *of_clock, *role_assumptions)
+        time_column, assumed, problem = self._time(all_columns)
+        time_assumptions = (
+            () if time_column is None or selection.step is not None else self._time_assumptions(time_column)
+        )
+        roles, role_assumptions, open_roles = self._roles(all_columns, time_column)
+        assumed = (*table.assumptions, *assumed, *time_assumptions, *role_assumptions)
         step, notes = None, tuple[str, ...]()
         if not problem:
             problem = open_roles
-        options = self._options(clock, of_clock)
+        options = self._options(time_column, time_assumptions)
         if not problem:
             try:
                 run = run_from_tables([table], selection, self.options)
@@ -327,22 +329,22 @@ class _FilePreview:
             return None, (), f"{reason}; {hint} {fits}"
         matrices = list(dict.fromkeys(c.matrix for c in all_columns if c.matrix is not None))
         try:
-            clock, assumed = self.pool.time(selection.time, matrices if len(matrices) == 1 else [], signals)
+            time_column, assumed = self.pool.time(selection.time, matrices if len(matrices) == 1 else [], signals)
         except DataError as error:
             return None, (), str(error)
         if assumed is not None:
-            return clock, (assumed,), ""
-        if selection.time is None and clock.matrix is not None:
-            reason = f"the time is the first column of the matrix, {clock.name!r}"
+            return time_column, (assumed,), ""
+        if selection.time is None and time_column.matrix is not None:
+            reason = f"the time is the first column of the matrix, {time_column.name!r}"
             return (
-                clock,
-                (Assumption("time", clock.name, reason, f"{parameter('time', Placeholder('COLUMN'))}", False),),
+                time_column,
+                (Assumption("time", time_column.name, reason, f"{parameter('time', Placeholder('COLUMN'))}", False),),
                 "",
             )
-        return clock, (), ""
+        return time_column, (), ""
 
     def _roles(
-        self, all_columns: list[Column], clock: Column | None
+        self, all_columns: list[Column], time_column: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
         """Return (role, signal) by column, assumptions, and "" or a text on why the roles are unknown."""
         selection, header = self.selection, self.table.header
@@ -350,8 +352,8 @@ class _FilePreview:
         if header is not None and not selection.inputs and not selection.outputs:
             selection.inputs, selection.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         else:
-            assumptions = assume_roles(selection, [c for c in all_columns if c is not clock])
-        roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
+            assumptions = assume_roles(selection, [c for c in all_columns if c is not time_column])
+        roles: dict[str, tuple[str, str]] = {} if time_column is None else {time_column.name: ("time", "")}
         for role, specs in (("input", selection.inputs), ("output", selection.outputs)):
             for name, spec in specs.items():
                 roles[self.pool.find(spec, f"signal {name!r}").name] = (role, name)
@@ -359,39 +361,41 @@ class _FilePreview:
             add_file_units(selection, self.pool)
         open_roles = ""
         if not selection.outputs:
-            choice = join_names((c.name for c in all_columns if c is not clock and has_numbers(c)), 20)
+            choice = join_names((c.name for c in all_columns if c is not time_column and has_numbers(c)), 20)
             open_roles = (
                 "the column names do not say which are inputs and which are outputs; name them with "
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
             )
-            text_columns = (c for c in all_columns if c is not clock and not has_numbers(c) and c.timestamps is None)
+            text_columns = (
+                c for c in all_columns if c is not time_column and not has_numbers(c) and c.timestamps is None
+            )
             texts = [f"{c.name!r} ({_first_bad_cell(c)})" for c in text_columns]
             if texts:
                 further_text = f" and {len(texts) - _MAX_LISTED_COLUMNS} more" * (len(texts) > _MAX_LISTED_COLUMNS)
                 open_roles += f"; no column of numbers is {', '.join(texts[:_MAX_LISTED_COLUMNS])}{further_text}"
         return roles, assumptions, open_roles
 
-    def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
+    def _time_assumptions(self, time_column: Column) -> tuple[Assumption, ...]:
         """Return the assumptions on the time column: its unit, or the sequence of day and month in its dates."""
         if self.table.header is not None:
             return ()
-        if clock.timestamps is not None:
-            order = date_order_assumption(clock, self.selection.layout.dates)
+        if time_column.timestamps is not None:
+            order = date_order_assumption(time_column, self.selection.layout.dates)
             return () if order is None else (order,)
-        name = time_header(clock)
+        name = time_header(time_column)
         is_certain = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
-        if self.options.time_unit is not None or is_certain or clock.problem is not None:
+        if self.options.time_unit is not None or is_certain or time_column.problem is not None:
             return ()
-        text = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
+        text = f"the numbers of {time_column.name!r} are seconds, as no unit is stated"
         return (Assumption("time_unit", "s", text, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
-    def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
+    def _options(self, time_column: Column | None, time_assumptions: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments with which :func:`ftlm.load` returns the previewed run without assumptions."""
         selection = self.selection
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
-        if clock is not None and selection.step is None and self.table.header is None:
-            options["time"] = clock.name
+        if time_column is not None and selection.step is None and self.table.header is None:
+            options["time"] = time_column.name
         further_options = {key: getattr(self.options, key) for key in ("window", "resample", "time_unit", "missing")}
         options |= {key: value for key, value in further_options.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
@@ -399,7 +403,7 @@ class _FilePreview:
                 options[key] = dict(getattr(selection, key))
         keys = {*selection.layout.to_dict(), *(a.option for a in self.table.assumptions)}
         layout = Layout.from_argument({key: value for key, value in self.table.layout.to_dict().items() if key in keys})
-        for assumption in of_clock:
+        for assumption in time_assumptions:
             if assumption.option == "dates":
                 layout = layout.merge(Layout(dates=str(assumption.value)))
             else:

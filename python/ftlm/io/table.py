@@ -79,9 +79,9 @@ class Column:
         return self.values
 
 
-def dates_error(thing: str, description: str, rows: int) -> DataError:
+def dates_error(label: str, description: str, rows: int) -> DataError:
     """Return the DataError for a column of dates or times of day that is used as numbers."""
-    return bad_rows_error(thing, description, 0, rows, f"name it with {parameter('time')}, or choose another column")
+    return bad_rows_error(label, description, 0, rows, f"name it with {parameter('time')}, or choose another column")
 
 
 @dataclass(frozen=True)
@@ -185,15 +185,15 @@ class ColumnTable:
             text += "; not read: " + ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10])
         return text
 
-    def find(self, spec: object, thing: str) -> Column:
+    def find(self, spec: object, use: str) -> Column:
         """Return the column with the name or position `spec`; raise DataError if there is none.
 
-        `thing` is the use of the column in messages. A name may omit its unit, and ``V(:,1)`` means ``V.1``.
+        `use` states in messages what the column is used for. A name may omit its unit, and ``V(:,1)`` means ``V.1``.
         """
         if isinstance(spec, int) and not isinstance(spec, bool):
-            return self._at(spec, thing)
+            return self._at(spec, use)
         if not isinstance(spec, str):
-            raise DataError(f"column {spec!r} ({thing}) is neither a name nor a position; give one of them")
+            raise DataError(f"column {spec!r} ({use}) is neither a name nor a position; give one of them")
         name = spec
         match = _MATLAB_COLUMN.fullmatch(spec)
         if spec not in self._columns and match:
@@ -207,18 +207,18 @@ class ColumnTable:
             column = bare[0] if len(bare) == 1 else None
         if column is None:
             raise DataError(
-                f"column {spec!r} ({thing}) is not in {join_names(table.path.name for table in self._tables)}"
+                f"column {spec!r} ({use}) is not in {join_names(table.path.name for table in self._tables)}"
                 f"{nearest(spec, self._columns)}; {self.describe()}"
             )
         return column
 
-    def _at(self, position: int, thing: str) -> Column:
+    def _at(self, position: int, use: str) -> Column:
         if len(self._tables) > 1 or not self._tables[0].text:
-            raise DataError(f"column {position} ({thing}): positions are for single text files; {self.describe()}")
+            raise DataError(f"column {position} ({use}): positions are for single text files; {self.describe()}")
         columns = self._tables[0].columns
         if not 0 <= position < len(columns):
             raise DataError(
-                f"column {position} ({thing}) is out of range, positions go from 0 to {len(columns) - 1}; "
+                f"column {position} ({use}) is out of range, positions go from 0 to {len(columns) - 1}; "
                 f"{self.describe()}"
             )
         return columns[position]
@@ -242,7 +242,7 @@ class ColumnTable:
         """
         if spec is not None:
             return self.find(spec, "time"), None
-        clocks, assumed = [], None
+        time_columns, assumed = [], None
         for table in self._tables:
             columns, problem = self._time_candidates(table, signals)
             if len(columns) > 1 and table.runs:
@@ -257,19 +257,19 @@ class ColumnTable:
                 )
             if columns and problem:
                 assumed = Assumption("time", columns[0].name, problem, parameter("time", Placeholder("COLUMN")))
-            clocks += columns
-        if not clocks:
+            time_columns += columns
+        if not time_columns:
             first_columns = [self._columns[f"{matrix}.1"] for matrix in dict.fromkeys(matrices)]
-            clocks = [column for column in first_columns if column.name not in signals]
-        if not clocks:
+            time_columns = [column for column in first_columns if column.name not in signals]
+        if not time_columns:
             raise DataError(
                 "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
                 f"name it with {parameter('time')}, or give the time between rows with {parameter('step')}; "
                 f"{choose_text('identify_frequency', 'ftlm identify-frequency')} takes spectra; {self.describe()}"
             )
-        for other_clock in clocks[1:]:
-            _check_agreement(clocks[0], other_clock)
-        return clocks[0], assumed
+        for other_time_column in time_columns[1:]:
+            _check_agreement(time_columns[0], other_time_column)
+        return time_columns[0], assumed
 
     def _time_candidates(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
         """Return candidates for the time column of a file, and the reason for the choice if it is an assumption.
@@ -297,13 +297,13 @@ class ColumnTable:
         return [], ""
 
 
-def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None:
+def date_order_assumption(time_column: Column, dates: str | None) -> Assumption | None:
     """Return the assumption on the sequence of day and month in a time column; None if none was assumed."""
-    order = "" if clock.timestamps is None else clock.timestamps.inferred_date_order(dates)
-    if clock.timestamps is None or not order:
+    order = "" if time_column.timestamps is None else time_column.timestamps.inferred_date_order(dates)
+    if time_column.timestamps is None or not order:
         return None
     first_part = "day" if order == "dmy" else "month"
-    text = f"dates begin with the {first_part}, as in {clock.timestamps.first!r}"
+    text = f"dates begin with the {first_part}, as in {time_column.timestamps.first!r}"
     return Assumption("dates", order, text, layout_parameter(dates=Placeholder("ORDER")))
 
 

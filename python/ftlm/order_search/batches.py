@@ -197,9 +197,9 @@ def evaluate_rounds(
 ) -> tuple[float, Part] | None:
     """Evaluate rounds (groups of candidates) `first` to `last` - 1 of one equation in a worker process.
 
-    `seed` is (index, score) of each row found in earlier batches, and `start` a checkpoint to resume from, or None.
-    Return (computing time [s], partial result). Return None if `work` is None and the worker has not cached the search
-    that `key` identifies.
+    `work` is the search problem, or None if the worker should have cached it under `key`. `seed` is (index, score) of
+    each row found in earlier batches, and `start` is a checkpoint to resume from, or None. Return (computing time [s],
+    partial result), or None if neither `work` nor the cache gives the problem.
     """
     return _run_cached(
         key, work, lambda search: cast("Part", search.evaluate_batches(first, last, seed, start, threads, None, None))
@@ -211,8 +211,9 @@ def evaluate_candidates(
 ) -> tuple[float, Outcomes] | None:
     """Evaluate candidates of a coupled search in a worker process.
 
-    `spans` are blocks of candidates: (equation, first, exclusive end, limit of the score). Return (computing time [s],
-    outcomes). Return None if `work` is None and the worker has not cached the search that `key` identifies.
+    `work` is the search problem, or None if the worker should have cached it under `key`. `spans` are blocks of
+    candidates: (equation, first, exclusive end, limit of the score). Return (computing time [s], outcomes), or None if
+    neither `work` nor the cache gives the problem.
     """
     return _run_cached(key, work, lambda search: cast("Outcomes", search.evaluate_spans(spans, threads, None)))
 

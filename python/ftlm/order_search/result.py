@@ -90,9 +90,10 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether other orders may reduce the error by more than the requested tolerance, for each start point.
+        """For each point of the argument `start`, whether other orders may have an error that is clearly smaller.
 
-        False means that the lower bound excludes this.
+        Clearly smaller means by more than the requested tolerance. False means that the lower bound excludes such
+        orders.
         """
         return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
@@ -284,9 +285,9 @@ class SearchResult(BestIdentification):
         """Return the result as a dictionary for JSON."""
         names = ("candidates", "exclusion_counts", "excluded_by_box", "m", "settings", "table")
         failures = {"failures": [{"orders": o, "reason": reason} for o, reason in self.failures]}
-        return attributes(self, names) | failures | {"at_grid_edge": self.at_grid_edge} | self._judgement_dict()
+        return attributes(self, names) | failures | {"at_grid_edge": self.at_grid_edge} | self._verdict_dict()
 
-    def _judgement_dict(self) -> dict[str, Any]:
+    def _verdict_dict(self) -> dict[str, Any]:
         """Return verdict and findings as a dictionary for JSON; empty for a search without a verdict."""
         if self.verdict is None:
             return {}

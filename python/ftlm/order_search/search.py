@@ -507,19 +507,19 @@ def resume_job(
     """
     check_executor(executor)
     job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
-    with _usable(store.path, store.contents.requests[number]):
+    with _convert_model_errors(store.path, store.contents.requests[number]):
         return run_job(job, store=store, number=number, executor=executor)
 
 
 def job_of(store: Store, number: int, threads: int | None) -> Job:
     """Return the search with index `number` in a checkpoint file; raise DataError if it is invalid."""
     request = store.contents.requests[number]
-    with _usable(store.path, request):
+    with _convert_model_errors(store.path, request):
         return Job.of(request, check_threads(threads), None)
 
 
 @contextlib.contextmanager
-def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
+def _convert_model_errors(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
     """Convert a ModelError within a ``with`` block to a DataError that names the search and the checkpoint file."""
     try:
         yield
@@ -553,7 +553,7 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     contents = read_store(path)
     states = {}
     for request, section in zip(contents.requests, contents.sections, strict=True):
-        with _usable(path, request):
+        with _convert_model_errors(path, request):
             job = Job.of(request, 1, None)
             if section.law:
                 candidates, best = coupled_state(job.coupled_problem(), section)

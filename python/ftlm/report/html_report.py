@@ -19,7 +19,7 @@ from ftlm.data.runs import as_runs
 from ftlm.errors import FtlmError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.linear import multi_innovation_trace, trace_chart
-from ftlm.estimation.model_checks import has_growing_mode
+from ftlm.estimation.model_checks import has_unstable_mode
 from ftlm.estimation.model_validation import validate, validate_model
 from ftlm.estimation.output_error import JointFit
 from ftlm.estimation.result import Identification, Task
@@ -213,7 +213,7 @@ def stability_note(model: Model) -> str:
         stable = model.stability()
     except FtlmError as error:
         return f"As a whole, the model has no poles: {error}."
-    is_doubtful = stable.unstable_poles > 0 and not has_growing_mode(model, "simulated")
+    is_doubtful = stable.unstable_poles > 0 and not has_unstable_mode(model, "simulated")
     return f"As a whole, the model is {stable}{', but not significantly' if is_doubtful else ''}."
 
 

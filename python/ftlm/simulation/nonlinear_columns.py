@@ -53,7 +53,7 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
     undefined = np.full(means.shape[1], np.nan)
     values: dict[Channel, Floats] = {}
     for signal, order in dict.fromkeys(c for item in columns.values() for c in item.channels):
-        if structure.sensor_filter is not None or _is_held(run, signal, order):
+        if structure.sensor_filter is not None or _lacks_derivative(run, signal, order):
             values[signal, order] = undefined
         else:
             values[signal, order] = (
@@ -63,8 +63,8 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
     return np.vstack([means, *(np.where(np.isfinite(row), row, np.nan) for row in row_values)])
 
 
-def _is_held(run: Run, signal: str, order: float) -> bool:
-    """Whether a signal is a zero-order-hold input, which has no derivative, and the order is positive."""
+def _lacks_derivative(run: Run, signal: str, order: float) -> bool:
+    """Whether a derivative of a signal does not exist: a positive order of a zero-order-hold input, which has jumps."""
     return order > 0 and run.intersample.get(signal) == "zoh"
 
 
@@ -87,7 +87,7 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
                 f"{name} does not apply to filtered signals; use {parameter('method', 'output-error')}, "
                 "or leave the filter out"
             )
-        pair = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)
+        pair = next(((signal, order) for signal, order in item.channels if _lacks_derivative(run, signal, order)), None)
         if pair is not None:
             raise ModelError(
                 f"{name} has the derivative of order {pair[1]:g} of {pair[0]}, but run {run.name!r} has a zero-order "

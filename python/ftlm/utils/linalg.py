@@ -50,7 +50,7 @@ def thin_svd(matrix: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def minimum_norm_solution(matrix: Floats, target: Floats, rcond: float | None) -> Floats:
-    """Return the minimum-norm least-squares solution x of ``tall @ x = target``.
+    """Return the minimum-norm least-squares solution x of ``matrix @ x = target``.
 
     Singular values below `rcond` times the largest are treated as zero. With None, `rcond` is the machine epsilon times
     the larger dimension of the matrix.

@@ -312,33 +312,35 @@ def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
 
     The result has the initial terms of the first piece.
     """
-    free = [
+    simulations = [
         simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
         for run in pieces
     ]
     return replace(
-        free[0],
-        outputs=np.concatenate([samples.outputs for samples in free], axis=1),
-        refinement=max(samples.refinement for samples in free),
-        change=np.max([samples.change for samples in free], axis=0),
+        simulations[0],
+        outputs=np.concatenate([samples.outputs for samples in simulations], axis=1),
+        refinement=max(samples.refinement for samples in simulations),
+        change=np.max([samples.change for samples in simulations], axis=0),
     )
 
 
-def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
-    """Return the comparison of runs with their simulations `free`, which are samples of the simulated outputs.
+def compare_samples(model: Model, runs: Runs, simulations: Sequence[OutputSamples], *, m: int) -> Comparison:
+    """Return the comparison of runs with their `simulations`, which are samples of the simulated outputs.
 
     The equation error is computed on `m` block pulses per run.
     """
     block_pulses = records(runs, model.structure, m)
     run_signals = []
-    for run, sampled, rec in zip(runs, free, block_pulses, strict=True):
+    for run, sampled, rec in zip(runs, simulations, block_pulses, strict=True):
         outputs = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
         run_signals.append(_run_signals(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
     result = _pooled_comparison(model, runs, run_signals, m, times, sampled=True)
     findings = list(result.findings)
-    if unconverged_runs := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
+    if unconverged_runs := [
+        run.name for run, sampled in zip(runs, simulations, strict=True) if _is_unconverged(sampled)
+    ]:
         findings.append(make_finding("sampling_coarse", run=", ".join(unconverged_runs)))
     if names_in_motion := runs_in_motion(model, runs):
         findings.append(make_finding("simulated_from_rest", run=", ".join(names_in_motion)))
@@ -360,11 +362,9 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
     check_no_missing(run_list, "figures of pulse means")
     pairs = zip(comparison_records(run_list, model, m), records(run_list, model.structure, m), strict=True)
     run_signals = []
-    for free, block_pulses in pairs:
-        responses, initial = simulate_record(model, free)
-        run_signals.append(
-            _run_signals(model, block_pulses, responses, {o: free.of(o) for o in model.outputs}, initial)
-        )
+    for rec, block_pulses in pairs:
+        responses, initial = simulate_record(model, rec)
+        run_signals.append(_run_signals(model, block_pulses, responses, {o: rec.of(o) for o in model.outputs}, initial))
     midpoint_times = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in run_signals]
     return _pooled_comparison(model, run_list, run_signals, m, midpoint_times, sampled=False)
 
@@ -540,11 +540,11 @@ def _pooled_errors(run_signals: Sequence[_RunSignals]) -> tuple[dict[str, Metric
         else UNKNOWN_METRICS
         for o in outputs
     }
-    free = {
+    simulation = {
         o: pooled_metrics([p.measured[o] for p in run_signals], [p.measured[o] - p.simulated[o] for p in run_signals])
         for o in outputs
     }
-    return equation, free
+    return equation, simulation
 
 
 def near_identity_findings(

@@ -237,8 +237,8 @@ class Residuals:
     def independence(self) -> dict[str, str]:
         """Result of the independence test by output as text: ``"yes"``, ``"no"`` or ``"undecided"``."""
         return {
-            name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if free else "undecided"
-            for (name, output), free in zip(self.outputs.items(), self.independent.values(), strict=True)
+            name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if is_independent else "undecided"
+            for (name, output), is_independent in zip(self.outputs.items(), self.independent.values(), strict=True)
         }
 
     @property
@@ -361,12 +361,12 @@ def check_run_lengths(runs: Runs, lags: int) -> None:
 def run_residual_tests(
     model: Model,
     runs: Runs,
-    free: Sequence[OutputSamples],
+    simulations: Sequence[OutputSamples],
     *,
     lags: int,
     sensitivities: Callable[[], Mapping[str, list[Floats]]] | None = None,
 ) -> Residuals:
-    """Run whiteness, independence and feedback tests on the residuals of runs, given their simulations `free`.
+    """Run whiteness, independence and feedback tests on the residuals of runs, given their `simulations`.
 
     The first and last sample of each run are omitted. ``sensitivities`` is a function that returns, by output, the
     sensitivities to the fitted parameters, one array per run with shape (parameters, samples). It is called only if
@@ -375,7 +375,7 @@ def run_residual_tests(
     """
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    for run, sampled in zip(runs, free, strict=True):
+    for run, sampled in zip(runs, simulations, strict=True):
         with np.errstate(invalid="ignore"):
             residuals_by_output = measured_samples(model, run, sampled.refinement) - sampled.outputs
         for name, series in zip(model.outputs, residuals_by_output, strict=True):
@@ -403,15 +403,19 @@ def run_residual_tests(
         signs: list[Floats] = []
         if equation.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
-            motion = [np.gradient(f.outputs[row]) if equation.order.constant > 1.0 else f.outputs[row] for f in free]
+            motion = [
+                np.gradient(f.outputs[row]) if equation.order.constant > 1.0 else f.outputs[row] for f in simulations
+            ]
             signs = _signs_of_motion(motion)
             slope = math.inf if equation.order.constant > 1.0 else sign_tanh_slope(motion)
             outputs[name] = _test_direction(outputs[name], signs, lags, slope)
         if sensitivities is not None and outputs[name].is_correlated:
             output_sensitivities = sensitivities().get(name, [])
             outputs[name] = _test_beyond_parameters(outputs[name], output_sensitivities, signals, signs, lags)
-    step_sizes, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
-    return Residuals(outputs, tuple(run.name for run in runs), step_sizes, max(s.refinement for s in free), terms)
+    step_sizes, terms = tuple(run.step for run in runs), sum(len(t) for s in simulations for t in s.initial.values())
+    return Residuals(
+        outputs, tuple(run.name for run in runs), step_sizes, max(s.refinement for s in simulations), terms
+    )
 
 
 def _test_output(
