@@ -115,8 +115,9 @@ impl<'a> Pulse<'a> {
         norm
     }
 
-    /// Set `z` to the quadratic extrapolation of the last three pulses. The third pulse starts at the linear
-    /// extrapolation of the first two, the second at the value of the first, and the first at the forcing.
+    /// Set the initial guess `z` of the Newton iterations: the quadratic extrapolation of the last three pulses. For
+    /// the third pulse, it is the linear extrapolation of the first two, for the second the value of the first, and for
+    /// the first the forcing.
     pub(super) fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {

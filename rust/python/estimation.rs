@@ -162,8 +162,8 @@ pub fn instrumental_variables(
     Ok(InstrumentalFit { estimates, covariances, iterations, converged, damped })
 }
 
-/// Nonuniform samples: (sample positions in pulses, (positions in pulses, sizes) of the jumps of each
-/// zero-order-hold signal or None).
+/// Nonuniform samples as a pair. The first element holds the sample positions, in pulses. The second holds the jumps of
+/// each signal as (positions in pulses, sizes), None for a signal that is not a zero-order hold.
 pub type NonuniformSamplesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// Experiment from a dictionary with these fields as keys. `samples` and `robust_weights` have one row per output.

@@ -223,8 +223,8 @@ impl LevelBuffers {
     }
 }
 
-/// Computation of a spectrum: the contribution of the first `count` blocks of one block length to equation `i` of `n`
-/// in the next block. This task is compiled for the widest vector instructions available.
+/// Computation of one spectrum, for equation `i` of `n` in the next block: the sum of the contributions of the first
+/// `count` solved blocks of one length. This task is compiled for the widest vector instructions available.
 struct Contributions<'a> {
     n: usize,
     i: usize,
@@ -265,8 +265,8 @@ pub struct Division {
     n: usize,
     m: usize,
     solved_count: usize,
-    /// For each unknown: the quotient in the solved terms, then the right-hand side minus the contributions of solved
-    /// blocks.
+    /// One series per unknown. Its solved terms are those of the quotient. The other terms are the right-hand side
+    /// minus the contributions of the solved blocks.
     remainders: Vec<Vec<f64>>,
     /// Spectra by block length, the shortest first.
     levels: Vec<Level>,

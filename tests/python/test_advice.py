@@ -208,8 +208,8 @@ def test_a_fit_to_a_channel_that_was_off_says_so():
 def test_advice_prints_counts_and_is_json(small_run):
     empty = small_run.advice()
     assert len(empty) == 0
-    assert str(empty) == "advice on small, simulated: nothing stands out"
-    assert "nothing stands out" in empty._repr_html_()
+    assert str(empty) == "advice on small, simulated: no findings"
+    assert "no findings" in empty._repr_html_()
     hostile = ftlm.Run.from_arrays(
         step=1, inputs={"u": np.ones(200)}, outputs={"y": np.arange(200) % 9.0}, name="<b>x</b>"
     )

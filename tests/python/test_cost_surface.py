@@ -42,7 +42,7 @@ def test_refitted_the_cost_is_that_of_the_covariance(fit):
     ratio = found.scores[near] / wanted[near]
     assert np.all((ratio > 0.4) & (ratio < 2.5))
     assert np.corrcoef(np.log(found.scores.ravel()), np.log(wanted.ravel()))[0, 1] > 0.9
-    assert found.other_orders_note.startswith("All other numbers refitted")
+    assert found.other_orders_note.startswith("All other parameters are refitted")
 
 
 def test_costs_are_those_of_residuals_after_a_linear_step(fit):
@@ -82,7 +82,7 @@ def test_the_pair_least_told_apart_is_named(fit):
     assert (first, second) == ("alpha", "nu")
     assert correlation == pytest.approx(fit.joint.correlation[0, 1])
     drawn = output_error_landscape(fit)
-    assert "All other numbers refitted, by one linear step." in drawn.caption
+    assert "All other parameters are refitted" in drawn.caption
     assert "increase of the weighted sum of squares" in drawn.caption
 
 

@@ -169,8 +169,8 @@ def test_inertial_coupling_has_its_words_and_orders() -> None:
     for options, words in [
         ({"cross_stage": "inertia"}, "cross_stage = 'inertia' is not known"),
         ({"cross_stage": "inertial", "form": "published"}, "cross_stage='inertial' requires form='lagrange'"),
-        ({"laws": ("velocities",)}, "law 'velocities' ties two orders of form='lagrange' under the order law"),
-        ({"laws": ("orders", "velocities"), "form": "published"}, "law 'velocities' ties two orders"),
+        ({"laws": ("velocities",)}, "law 'velocities' relates two orders of form='lagrange' under the order law"),
+        ({"laws": ("orders", "velocities"), "form": "published"}, "law 'velocities' relates two orders"),
     ]:
         with pytest.raises(ftlm.ModelError, match=words):
             ftlm.flexible_link(**options)

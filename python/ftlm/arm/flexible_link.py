@@ -333,7 +333,7 @@ def flexible_link(
     if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
         order_law_text = choose_text("laws=('orders', …)", "--laws orders")
         raise ModelError(
-            f"law 'velocities' ties two orders of {parameter('form', 'lagrange')} under the order law; use it with "
+            f"law 'velocities' relates two orders of {parameter('form', 'lagrange')} under the order law; use it with "
             f"{order_law_text}"
         )
     if cross_stage not in (False, True, "torques", "inertial"):

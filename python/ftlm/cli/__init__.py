@@ -35,7 +35,7 @@ fixed : NAME=VALUE
 delay : INPUT=SECONDS
     Delay of an input [s]; LOW:HIGH estimates it in this range.
 driven_by : OUTPUT=SIGNAL,…
-    With auto: signals that drive an output; default all inputs.
+    With auto: input signals of an output; default all inputs.
 
 Method
 ------

@@ -205,7 +205,7 @@ class StructureOptions:
         inapplicable = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
         if inapplicable:
             raise ModelError(
-                f"{', '.join(inapplicable)}: --structure {text} has its own; leave "
+                f"{', '.join(inapplicable)}: not used with --structure {text}, which fixes these options; leave "
                 f"{'it' if len(inapplicable) == 1 else 'them'} out, "
                 "or use --structure flexible-link:1, :2 or :both"
             )

@@ -183,7 +183,7 @@ def record(
     amplitude : A or A1:A2
         Amplitude of the current [A], of both motors or each.
     period
-        Period, or clock of a prbs [s].
+        Period, or switching interval of a prbs [s].
     band : LOW:HIGH
         Frequency band of chirp and multisine [Hz].
     ramp

@@ -102,7 +102,8 @@ def output_error_landscape(
         stop=stop_flag(),
     )
     minimum = min(minimum, float(costs.min()))
-    subtitle = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
+    treatment = "refitted by one linear step" if refit else "fixed at the optimum"
+    subtitle = f"All other parameters are {treatment}."
     i, j = names.index(first), names.index(second)
     return Landscape(
         (first, second),

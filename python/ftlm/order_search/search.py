@@ -173,7 +173,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name of the output, or ``"stage"`` if an order law ties the orders of coupled equations."""
+        """Name of the output, or ``"stage"`` if an order law relates the orders of coupled equations."""
         return "stage" if self.structure.has_order_law else self.structure.outputs[0]
 
     def request(self, name: str) -> Request:

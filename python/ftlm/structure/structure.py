@@ -259,7 +259,7 @@ class Structure:
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
         names = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if names:
-            raise ModelError(f"{words}, and a law ties its {names[0]} to other coefficients; leave one of the two out")
+            raise ModelError(f"{words}, and a coefficient law relates its {names[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
                 f"{words}: powers of t for unknown past inputs are not used with friction; use "

@@ -272,8 +272,8 @@ class Trial:
     bic
         Schwarz's criterion, as in :class:`ftlm.InformationCriteria`; None without a fit.
     effective_bic
-        Schwarz's criterion with an effective number of samples for correlated residuals, which decides. None until the
-        autocorrelation of the best candidate's residuals is known.
+        Schwarz's criterion with the effective number of samples of correlated residuals; candidates are compared by it.
+        None until the autocorrelation of the best candidate's residuals is known.
     values, standard_errors
         Estimates and standard errors from all runs, by name.
     insignificant

@@ -102,7 +102,7 @@ _HYPHEN_OF_NUMBER = re.compile(r"(?<![^\s(\[±])-(?=\.?\d)")
 
 
 def with_minus_signs(text: str) -> str:
-    """Return a text with minus signs before negative numbers, for pages."""
+    """Return a text in which the hyphen of a negative number is replaced by a minus sign (−), for HTML pages."""
     return _HYPHEN_OF_NUMBER.sub("−", text)
 
 

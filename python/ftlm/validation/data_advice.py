@@ -104,12 +104,12 @@ class Advice:
 
     def __str__(self) -> str:
         if not self.findings:
-            return f"advice on {self.run}: nothing stands out"
+            return f"advice on {self.run}: no findings"
         return "\n".join([f"advice on {self.run}:", *(f"  {f.sentence}" for f in self.findings)])
 
     def _repr_html_(self) -> str:
         items = "".join(f"<li>{html.escape(f.sentence)}</li>" for f in self.findings)
-        return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
+        return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>no findings</li>'}</ul>"
 
 
 @check_arguments

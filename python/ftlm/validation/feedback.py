@@ -166,7 +166,8 @@ def feedback_test(
     if not dense and count < MIN_CHANGES:
         return FeedbackTest("undecided", f"{count} changes; {MIN_CHANGES} are needed", samples=longest)
     if not dense:
-        # Between its changes a held input has no innovation. The residual before a change is known at the change.
+        # Between its changes a zero-order-hold input has no innovation. The residual before a change is known at the
+        # change.
         rows_by_run = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
         if not rows_by_run:
             return FeedbackTest("undecided", f"{count} changes over {len(runs)} short runs", samples=longest)

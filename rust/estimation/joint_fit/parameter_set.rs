@@ -327,7 +327,7 @@ impl TimeScaling {
 
     /// Return the relative decrease of the value of parameter `i` in seconds if the orders change by `step`.
     ///
-    /// The value of the parameter in the scaled unit of time is held constant.
+    /// The value of the parameter in the scaled unit of time is kept constant.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => step[..self.orders]

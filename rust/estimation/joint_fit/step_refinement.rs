@@ -137,7 +137,8 @@ pub fn refine_step<'a>(
     Ok(Optimum { result: optimum, objective, estimate, step_converged: has_converged, covariance: covariance_matrix })
 }
 
-/// Return the optimum in the limit of zero pulse length by deferred correction; None if this fails or does not pay.
+/// Return the optimum in the limit of zero pulse length by deferred correction; None if this fails or would not save
+/// time.
 ///
 /// It is used for long records and for models with nonlinear terms other than friction, because both are slow to fit on
 /// fine pulse grids.

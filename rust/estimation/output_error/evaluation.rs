@@ -80,7 +80,7 @@ impl<P> Evaluation<P> {
     }
 }
 
-/// Damping of the unit columns of the linear coefficients.
+/// Levenberg damping of the least-squares problem for the steps of the linear coefficients, whose columns have norm 1.
 ///
 /// It is at the level of rounding errors, so a coefficient that is not identifiable is not changed.
 const COLLINEARITY_DAMPING: f64 = 1e-7;

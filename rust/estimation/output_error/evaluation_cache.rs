@@ -38,7 +38,7 @@ struct GridCache {
     filter: Option<Rc<SeriesFilter>>,
     /// Number of runs that share the cache.
     runs: usize,
-    /// Last operator of each term, by index of its equation and of the term.
+    /// Most recently used operator of each term, by index of its equation and of the term.
     operators: HashMap<(usize, usize), Rc<Operator>>,
     /// Initial terms t^e, by the bits of the exponent e.
     powers: HashMap<u64, Rc<InitialTerm>>,

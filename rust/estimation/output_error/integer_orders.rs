@@ -2,9 +2,9 @@
 //!
 //! The equation is D^n y = Σ a_i D^i y + Σ b_j D^j u with output y and inputs u. Its denominator is A(s) = s^n − Σ a_i
 //! s^i. The samples of (s^j/A) u are states of one companion form, which its matrix exponential advances from pulse to
-//! pulse. This is exact for an input that is held or linear over a pulse. A zero-order-hold input may have any delay.
-//! The output is linear in b_j. Its derivative with respect to a_i is (s^i/A) y, a state of two companion forms in
-//! series. Its derivative with respect to a delay is −D y. An initial term c t^e is the response of a chain of
+//! pulse. This is exact for an input that is constant or linear over a pulse. A zero-order-hold input may have any
+//! delay. The output is linear in b_j. Its derivative with respect to a_i is (s^i/A) y, a state of two companion forms
+//! in series. Its derivative with respect to a delay is −D y. An initial term c t^e is the response of a chain of
 //! integrators to an impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of
 //! the companion form is above 1.
 
@@ -31,7 +31,7 @@ const MAX_ORDER: usize = 12;
 /// The effect of faster poles on the samples cannot be distinguished from noise.
 const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
 
-/// Equations of integer orders whose inputs are held or linear in every experiment.
+/// Equations of integer orders whose inputs are zero-order holds, or linear over each pulse, in every experiment.
 pub(crate) struct IntegerOrders {
     equations: Vec<EquationOrders>,
 }
@@ -47,7 +47,7 @@ struct EquationOrders {
 
 /// Input of a companion form.
 pub(crate) struct SourceInput<'a> {
-    /// Values of the input: one per pulse if it is held, one per pulse edge if it is linear.
+    /// Values of the input: one per pulse for a zero-order hold, one per pulse edge if it is linear over each pulse.
     pub(crate) samples: Cow<'a, [f64]>,
     pub(crate) intersample: Intersample,
     /// Delay of a zero-order-hold input in pulses.
@@ -308,7 +308,8 @@ impl IntegerOrders {
     /// Return the integer orders of a model at a point; None if it has no exact simulation.
     ///
     /// This is the case if an order is free or fractional, or if equations are coupled. It is also the case if an
-    /// experiment has a sensor filter, nonuniform samples, or an input that is neither held nor linear.
+    /// experiment has a sensor filter, nonuniform samples, or an input that is neither a zero-order hold nor linear
+    /// over each pulse.
     pub(crate) fn new(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         let structures = model.structures(&point.orders);
         let is_fixed = |weights: &[f64]| {
@@ -548,7 +549,7 @@ impl IntegerOrders {
 
 /// Return a signal after its delay, saturation or dead zone, as the input of a companion form.
 ///
-/// It has one mean per pulse if it is held, and one value per pulse edge if it is linear.
+/// It has one mean per pulse for a zero-order hold, and one value per pulse edge if it is linear over each pulse.
 pub(crate) fn source_input<'a>(
     model: &FreeModel,
     experiment: &'a Experiment,

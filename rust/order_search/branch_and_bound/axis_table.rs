@@ -42,8 +42,8 @@ pub(super) struct CoefficientSums {
 pub(super) struct Level {
     /// Largest sum of coefficient moduli, by interval of grid values.
     pub(super) coefficient_sums: Vec<CoefficientSums>,
-    /// Largest second differences of the coefficients of the normalized column (orthogonal to the fixed-order columns,
-    /// of unit norm) on the fixed-order columns. The entries are sorted by interval, then by fixed-order column.
+    /// Largest second differences of the coefficients of the fixed-order columns in the normalized column, which is
+    /// orthogonal to them and has unit norm. The entries are sorted by interval, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
     /// Maxima of quantities of the test vectors, by interval of grid values, then by group of test vectors.
     pub(super) nodes: Vec<Node>,
@@ -132,8 +132,8 @@ pub(super) struct AxisTable {
     /// Products of the regressor column (of unit norm) with the fixed-order columns, by grid value, then by fixed-order
     /// column.
     pub(super) fixed_products: Vec<f64>,
-    /// Coefficients, with the opposite sign, of the normalized column (orthogonal to the fixed-order columns, of unit
-    /// norm) on the fixed-order columns. The entries are sorted by grid value, then by fixed-order column.
+    /// Negated coefficients of the fixed-order columns in the normalized column, which is orthogonal to them and has
+    /// unit norm. The entries are sorted by grid value, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
     /// Sum, with the opposite sign, of two coefficients of the normalized column (orthogonal to the fixed-order
     /// columns, of unit norm), by grid value. They belong to the fixed-order output column and to the regressor column

@@ -9,7 +9,7 @@ use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPAN
 
 /// Number of columns of the subspace per term: the value and its derivatives.
 const SPANNED_DERIVATIVES: usize = 3;
-/// Maximum number of columns of a [`DerivativeSubspace`].
+/// Maximum number of basis columns of a [`DerivativeSubspace`], which are stored as rows.
 const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
 /// Ridge parameter times the largest admissible sum of squared coefficients, relative to the target of the bound. The
 /// ridge limits the coefficients of nearly dependent columns.

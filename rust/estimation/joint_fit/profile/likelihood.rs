@@ -16,7 +16,8 @@ use crate::signal::statistics::inner;
 pub const MAX_REFIT_EVALUATIONS: usize = 120;
 /// Maximum shift of the optimum, in standard errors, at which the profile is computed with twice the step of the fit.
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
-/// Maximum shift of the optimum, relative to the parameter. A shift within this or the previous limit is accepted.
+/// Maximum shift of the optimum, relative to the parameter. A shift within this limit or [`MAX_OPTIMUM_SHIFT_ERRORS`]
+/// is accepted.
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
 /// Convergence tolerance of a refit, as a fraction of the rise of the sum of squares at one standard error.
 const REFIT_TOLERANCE: f64 = 1e-4;
