@@ -45,7 +45,7 @@ impl Record {
     /// filter that the signals passed. It is applied to initial terms.
     ///
     /// # Errors
-    /// [`Error::Length`] for wrong lengths, [`Error::NotFinite`] with the number of the signal, [`Error::OutOfRange`]
+    /// [`Error::Length`] for wrong lengths, [`Error::NotFinite`] with the index of the signal, [`Error::OutOfRange`]
     /// for the step.
     pub fn new(step: f64, signals: Vec<PulseMeans>, filter: Option<Vec<f64>>) -> Result<Self> {
         Self::from_rows(step, signals.into_iter().map(PulseMeans::into_vec).collect(), filter)

@@ -37,20 +37,20 @@ struct WeightedColumns {
     columns: Rows,
     /// Norm of each column before the division by it.
     norms: Vec<f64>,
-    /// Column numbers of the terms without a prior.
+    /// Column indices of the terms without a prior.
     columns_without_prior: Vec<usize>,
 }
 
 impl OutputSimulation {
     /// Return the posterior mean of the initial terms that represent past inputs: (exponent, coefficient) by equation.
     ///
-    /// `exponents[i]` are the exponents of the powers of time in equation i, and `free[i]` are the exponents among
-    /// these whose terms have no prior. With `has_level`, the level of each output is a further term without a prior;
-    /// it has the exponent ∞ and belongs to the equation of the output. None if a response is not finite.
+    /// `exponents[i]` are the exponents of the powers of time in equation i, and `exponents_without_prior[i]` are those
+    /// among them whose terms have no prior. With `has_level`, the level of each output is a further term without a
+    /// prior; it has the exponent ∞ and belongs to the equation of the output. None if a response is not finite.
     ///
     /// # Errors
-    /// The errors of [`OutputSimulation::refine`]. [`Error::Length`] if `exponents` or `free` do not have one entry per
-    /// equation.
+    /// The errors of [`OutputSimulation::refine`]. [`Error::Length`] if `exponents` or `exponents_without_prior` do not
+    /// have one entry per equation.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};

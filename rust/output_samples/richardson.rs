@@ -16,7 +16,7 @@ const MIN_POWER_RATIO: f64 = 0.5;
 /// √2.
 const MIN_REDUCTION_FACTOR: f64 = 1.4;
 const MIN_EFFECTIVE_SAMPLES: f64 = 8.0;
-/// Number of grids that are needed to estimate a reduction factor and to test it.
+/// Number of grids that are needed to estimate a reduction factor of the changes ([`MIN_POWER_RATIO`]) and to test it.
 const RATIO_TEST_GRIDS: usize = 4;
 
 /// Function of the rows on a finer and on a coarser grid. It returns the largest change of each output, relative to the

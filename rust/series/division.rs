@@ -154,7 +154,7 @@ impl Transform {
 }
 
 impl Level {
-    /// Allocate a level of blocks of `len` terms for `n` unknown series of `m` terms.
+    /// Allocate the spectra for the block length `len` in a division with `n` unknown series of `m` terms.
     fn new(len: usize, n: usize, m: usize) -> Self {
         let transform = if len == BLOCK_TERMS { Transform::Block } else { Transform::Cyclic(fft::plan(2 * len)) };
         let capacity = m.div_ceil(len).min(MAX_LEVEL_BLOCKS);

@@ -63,7 +63,7 @@ pub struct Source<'a> {
     pub order: usize,
     /// Coefficient of the integral.
     pub weight: f64,
-    /// Series of the input.
+    /// Samples of the input series.
     pub series: &'a [f64],
 }
 

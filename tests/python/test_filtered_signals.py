@@ -446,9 +446,17 @@ def test_the_command_line_names_filtered_signals():
             "flexible-link:1",
             "apply to equations in words; the flexible link has --sensor-filter stock",
         ),
-        ({"filtered_signals": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
+        (
+            {"filtered_signals": ["theta12"]},
+            "arm",
+            "--filtered-signals: not used with --structure arm, which fixes these options; leave it out",
+        ),
         ({"sensor_filter": "2"}, "flexible-link:1", "the flexible link has --sensor-filter stock"),
-        ({"sensor_filter": "stock"}, "arm", "--sensor-filter: --structure arm has its own; leave it out"),
+        (
+            {"sensor_filter": "stock"},
+            "arm",
+            "--sensor-filter: not used with --structure arm, which fixes these options; leave it out",
+        ),
         ({}, "arm:3", "--structure 'arm:3' is not known; use arm:1, :2 or :both"),
     ]:
         with pytest.raises(ftlm.ModelError, match=words):

@@ -546,7 +546,7 @@ def test_what_cannot_be_a_response_is_refused_in_words():
             lambda: make([1.0], [1.0], frequency_unit="hz"),
             r"frequency_unit='hz' is unknown; the known ones are rad/s, Hz",
         ),
-        (lambda: make([1.0, 2.0], [1, 1], deviation=[1.0]), r"deviation has 1 values, frequency 2"),
+        (lambda: make([1.0, 2.0], [1, 1], deviation=[1.0]), r"deviation has 1 value, frequency 2"),
         (lambda: make([1.0, 2.0], [1, 1], deviation=[1.0, 0.0]), r"deviation is not above 0: 0.0 at row 1, 1 in all"),
         (lambda: arc().slice(1e6), r"there are no data from 1e\+06 to inf rad/s; the data cover"),
     ):

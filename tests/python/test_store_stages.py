@@ -160,9 +160,9 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
         with Store(forged, whole.requests) as kept:
             kept._append([CoupledTable(**{**stored, **change})])
         for call in (ftlm.resume_search, ftlm.search_status):
-            with pytest.raises(ftlm.DataError, match="its table belongs to another search"):
+            with pytest.raises(ftlm.DataError, match="the stored table belongs to another search"):
                 call(forged)
-    with Store(path) as kept, pytest.raises(ModelError, match="it has an unexpected final table"):
+    with Store(path) as kept, pytest.raises(ModelError, match="the search has an unexpected final table"):
         kept.contents.sections[0].add_frame(CoupledTable(**stored))
 
 

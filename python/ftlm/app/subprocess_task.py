@@ -126,5 +126,5 @@ class Task:
 def _describe_exit(code: int) -> str:
     """Return an error message for a process that exited with `code` without an answer."""
     if code >= 0:
-        return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"
-    return f"the process that worked on it crashed ({describe_crash(code)}); the page and all models are still here"
+        return f"the process of this task ended with code {code}, without an answer; try a smaller file"
+    return f"the process of this task crashed ({describe_crash(code)}); the page and all models are still here"

@@ -159,12 +159,10 @@ class StructureOptions:
         """Raise ModelError if an option is set that does not apply to a structure of `count` equations as text."""
         inapplicable = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if inapplicable:
-            owner = (
-                "the flexible link or of several equations" if inapplicable == ["--coupling"] else "the flexible link"
-            )
+            owner = "the flexible link or several equations" if inapplicable == ["--coupling"] else "the flexible link"
             kind = "one equation in words" if count == 1 else "equations in words"
             raise ModelError(
-                f"{', '.join(inapplicable)}: of {owner}, not used with {kind}; leave "
+                f"{', '.join(inapplicable)}: only used with {owner}, not with {kind}; leave "
                 f"{'it' if len(inapplicable) == 1 else 'them'} "
                 "out, or use --structure flexible-link:1, :2 or :both"
             )

@@ -533,11 +533,11 @@ def fractional_pid(
 
 
 def plant_of(
-    model: Model, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
+    model: Model, output: str | None, input_name: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
-    """Return the plant of a sampled loop from the input `driver` to an output of a model.
+    """Return the plant of a sampled loop from the input `input_name` to an output of a model.
 
-    If `output` or `driver` is None, the only output or input of the model is used. Other arguments are those of
+    If `output` or `input_name` is None, the only output or input of the model is used. Other arguments are those of
     :class:`Plant`. Raise ModelError if a name is unknown or missing, or the model is not linear.
     """
     check_model(model)
@@ -547,7 +547,7 @@ def plant_of(
     check_no_input_nonlinearity(model, "a loop's margin")
     inputs = response_inputs(model, coupled=is_coupled(coupling))
     names = []
-    for kind, name, choices in (("output", output, model.outputs), ("input", driver, inputs)):
+    for kind, name, choices in (("output", output, model.outputs), ("input", input_name, inputs)):
         if name is None and len(choices) == 1:
             names.append(choices[0])
         elif name is None:

@@ -199,14 +199,14 @@ def observer(
     )
 
 
-def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
+def plants_of(model: Model, input_name: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """Return the plants from one input of a model to each output that depends on the input.
 
     Arguments are those of :func:`plant_of`. Raise ModelError if the model is unstable, or if no output depends on the
     input.
     """
     check_model(model)
-    plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
+    plants = [plant_of(model, o, input_name, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
     controllable_plants = [p for p in plants if p.has_response()]
     if not controllable_plants:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ftlm.data.sampling import make_read_only
 from ftlm.errors import DataError
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, real_number
 
@@ -81,7 +82,8 @@ class FrequencyData:
             deviation = _column(f"{self.name}: deviation", self.deviation)
             if deviation.ndim == 1 and deviation.size != frequency.size:
                 raise DataError(
-                    f"{self.name}: deviation has {deviation.size} values, frequency {frequency.size}; give one each"
+                    f"{self.name}: deviation has {plural(deviation.size, 'value')}, frequency {frequency.size}; give "
+                    "one each"
                 )
             remedy = "leave such rows out, or weight without deviations"
             _reject(~(deviation > 0), deviation, f"{self.name}: deviation", "is not above 0", remedy)

@@ -101,7 +101,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     structs: list[str] = []
     for name, shape, kind in list_variables(matlab, path):
         if name in names:
-            raise UnreadableError(f"the variable {name!r} is in it twice")
+            raise UnreadableError(f"the variable {name!r} occurs twice")
         names.add(name)
         count = math.prod(map(int, shape))
         if kind == "struct" and count == 1:

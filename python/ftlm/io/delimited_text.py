@@ -265,9 +265,10 @@ def _dialect_with_empty_rows(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """Return an assumption with its words extended by a remark (comment line above the table).
+    """Return an assumption about the header with a comment line above the table (`remark`) added to its evidence.
 
-    This applies to an assumption about the header, if the remark has as many words as the table has columns (`width`).
+    This applies if the comment has as many words as the table has columns (`width`). Any other assumption is returned
+    unchanged.
     """
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):

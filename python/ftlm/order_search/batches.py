@@ -664,7 +664,7 @@ def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Tabl
             if progress is not None and not (state.core_reports_progress and executor is None):
                 progress(state.done, state.total, pruned)
     if section is not None and section.law and section.processed_count != state.total:
-        raise ModelError(f"it has {section.processed_count} of {state.total} candidates")
+        raise ModelError(f"the search has {section.processed_count} of {state.total} candidates")
     if progress is not None:
         progress(state.total, state.total, 0)
     return state.table()
@@ -713,7 +713,7 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
         and all([len(p[3]) for p in parts] == coefficient_counts for _, _, _, parts in joined.rows)
     )
     if not is_valid:
-        raise ModelError("its table belongs to another search")
+        raise ModelError("the stored table belongs to another search")
     table = msgspec.to_builtins({"rows": joined.rows, "counts": joined.counts, "failures": joined.failures})
     return cast("_core._FoundStage", {**table, "distinct": []})
 

@@ -212,7 +212,7 @@ class Section:
         belongs to another kind of search.
         """
         if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
-            raise ModelError("it has an unexpected final table")
+            raise ModelError("the search has an unexpected final table")
         if isinstance(frame, CoupledTable):
             self.table = frame
             return
@@ -311,7 +311,7 @@ def _contents_of_requests(frame: Requests | Frame, corruption: str | None) -> Co
         raise ModelError("the first record contains no request")
     if frame.algorithm != ALGORITHM_VERSION:
         writer = f"ftlm {frame.version} with algorithm {frame.algorithm}"
-        raise ModelError(f"it was written by {writer}, and this version has algorithm {ALGORITHM_VERSION}")
+        raise ModelError(f"the file was written by {writer}, and this version has algorithm {ALGORITHM_VERSION}")
     sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
     return Contents(frame.requests, sections, frame.version, corruption)
 

@@ -199,9 +199,9 @@ class Job:
         structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = record_signals(structure)
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
-            raise ModelError("it has no block-pulse records, or several equations without an order law")
+            raise ModelError("the search has no block-pulse records, or several equations without an order law")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
-            raise ModelError("its records lack a signal of its equation")
+            raise ModelError("the records of the search lack a signal of its equation")
         if any(n not in request.values for n in structure.order_names):
             raise ModelError("an order has no values")
         return cls(

@@ -331,6 +331,8 @@ def main_sections(
 
     Parameters
     ----------
+    findings
+        Findings of the page; alerts are shown as warnings, notes as plain text.
     compared
         (role, comparison) pairs; the role is "estimation" or "validation".
     validated

@@ -178,9 +178,8 @@ def _rate_of(controller: Controller, rate: float | None) -> float:
     )
     if controller_rate is not None and not same_rate(checked, controller_rate):
         raise ModelError(
-            f"{setting('rate')} {checked:g} Hz is not the {controller_rate:g} Hz that the controller is made for; "
-            "leave "
-            f"{parameter('rate')} out, or make a controller for {checked:g} Hz"
+            f"{setting('rate')} {checked:g} Hz is not the {controller_rate:g} Hz for which the controller was "
+            f"designed; leave {parameter('rate')} out, or design a controller for {checked:g} Hz"
         )
     return checked
 

@@ -88,7 +88,8 @@ class StartSettings:
         Variance inflation of the mean of the residuals (1 for white noise) above which the structure is regarded as
         incomplete.
     history_margin
-        Difference of :func:`start_score` above which a history is preferred although the residuals are colored.
+        Difference of :func:`start_score` above which initial terms of a history (past inputs) are preferred although
+        the residuals are colored.
     """
 
     quiet_rows: int = 5

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ftlm.errors import ModelError
+from ftlm.utils.formatting import plural
 from ftlm.utils.validation import Floats, real_number
 
 #: Effects on an input: delay, saturation, dead zone.
@@ -93,7 +94,8 @@ class InputNonlinearity:
         if isinstance(self.value, (tuple, list)):
             if len(self.value) != 2:
                 raise ModelError(
-                    f"{subject} = {self.value!r} has {len(self.value)} values; give one, or (minimum, maximum)"
+                    f"{subject} = {self.value!r} has {plural(len(self.value), 'value')}; give one, or (minimum, "
+                    "maximum)"
                 )
             low, high = (real_number(f"{subject}", v) for v in self.value)
             if not 0 <= low < high < math.inf:

@@ -24,6 +24,7 @@ from ftlm.structure.input_nonlinearity import (
 from ftlm.structure.order import Order, Values, format_shortest, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import plural
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import check_choice, check_known, real_number
 
@@ -188,9 +189,11 @@ class Structure:
             if not math.isfinite(real_number(f"delay of {name}", delay)):
                 raise ModelError(f"delay of {name} = {delay} s is not a finite number; give seconds")
         for name, (low, high) in self.free_delays.items():
-            numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
+            numbers = real_number(f"minimum delay of {name}", low), real_number(f"maximum delay of {name}", high)
             if not -math.inf < numbers[0] < numbers[1] < math.inf:
-                raise ModelError(f"delay of {name} from {low} to {high} s is not an interval; give two rising times")
+                raise ModelError(
+                    f"delay of {name} from {low} to {high} s is not an interval; give the smaller time first"
+                )
         check_known("limited input", [limit.signal for limit in self.limits], external)
         check_nonlinearities(self.limits, self.delay, self.free_delays)
         for item in self.free_input_parameters:
@@ -259,7 +262,9 @@ class Structure:
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
         names = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if names:
-            raise ModelError(f"{words}, and a coefficient law relates its {names[0]} to other coefficients; leave one of the two out")
+            raise ModelError(
+                f"{words}, and a coefficient law relates its {names[0]} to other coefficients; leave one of the two out"
+            )
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
                 f"{words}: powers of t for unknown past inputs are not used with friction; use "
@@ -466,7 +471,8 @@ class Structure:
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
                     raise ModelError(
-                        f"delay of {name} = {delay!r} has {len(delay)} values; give seconds, or (minimum, maximum)"
+                        f"delay of {name} = {delay!r} has {plural(len(delay), 'value')}; give seconds, or (minimum, "
+                        "maximum)"
                     )
                 free[name] = (delay[0], delay[1])
             else:

@@ -148,7 +148,7 @@ Answer = FitError | StoredFit | StoredTrial | StoredSubsets
 
 
 class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
-    """Result of one step as it is stored, with the digest of the step's arguments."""
+    """Record with the result of one step of a selection, and the digest of the step's arguments."""
 
     request: bytes
     answer: Answer

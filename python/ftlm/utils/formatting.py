@@ -53,7 +53,7 @@ _EXPONENT_PATTERN = re.compile(r"\^(?:\(([^()]*)\)|([-−]?\d+(?:\.\d+)?|[-−]?
 
 
 def split_exponents(text: str) -> list[str]:
-    """Return the parts of a text such as ``D^1.5 y``: text and exponents in turn, and D for ``D^1``."""
+    """Return alternately the texts and the exponents of an expression such as ``D^1.5 y``; ``D^1`` is written as D."""
     parts = [part for part in _EXPONENT_PATTERN.split(_FIRST_DERIVATIVE_PATTERN.sub("D", text)) if part is not None]
     return [symbol(part).replace("-", "−") if k % 2 else part for k, part in enumerate(parts)]
 

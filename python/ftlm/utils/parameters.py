@@ -42,7 +42,7 @@ FIELD_BY_PARAMETER = {
 
 
 class _CurrentInterface:
-    """Global variable for the interface whose syntax messages use."""
+    """Interface (Python, command line, …) whose syntax error messages use; a global variable."""
 
     interface: Interface = "python"
 
@@ -92,7 +92,7 @@ PART_COLUMNS = {Placeholder("part"): Placeholder("column")}
 
 
 def current_interface() -> Interface:
-    """Return the interface whose syntax messages use."""
+    """Return the interface (Python, command line, …) whose syntax error messages use."""
     return _CurrentInterface.interface
 
 

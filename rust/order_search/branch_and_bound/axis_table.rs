@@ -132,7 +132,7 @@ pub(super) struct AxisTable {
     /// Products of the regressor column (of unit norm) with the fixed-order columns, by grid value, then by fixed-order
     /// column.
     pub(super) fixed_products: Vec<f64>,
-    /// Negated coefficients of the fixed-order columns in the normalized column, which is orthogonal to them and has
+    /// Coefficients, negated, of the fixed-order columns in the normalized column, which is orthogonal to them and has
     /// unit norm. The entries are sorted by grid value, then by fixed-order column.
     pub(super) fixed_coefficients: Vec<f64>,
     /// Sum, with the opposite sign, of two coefficients of the normalized column (orthogonal to the fixed-order

@@ -48,7 +48,7 @@ impl<'a> RequiredRegressors<'a> {
         }
     }
 
-    /// Add the initial terms t^{from + i} for all integers i ≥ 0 below `order`.
+    /// Add the initial terms t^{`integration` + i} for all integers i ≥ 0 below `order`.
     fn add_powers(&mut self, integration: f64, order: f64) {
         let mut i = 0.0;
         while i < order - ORDER_GRAIN {

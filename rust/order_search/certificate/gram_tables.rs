@@ -36,7 +36,7 @@ pub(super) struct Cell {
     pub(super) inherited_bound: f64,
 }
 
-/// Intervals of the orders of integration of one signal, by bisection level: number of the first interval, and index of
+/// Intervals of the orders of integration of one signal, by bisection level: index of the first interval, and index of
 /// the midpoint (node) of that interval.
 type LevelIntervals = Vec<(usize, usize)>;
 
@@ -92,7 +92,7 @@ pub(super) fn cell_width(level: u8) -> f64 {
     MAX_CELL_WIDTH / f64::from(1_u32 << level)
 }
 
-/// Return the intervals of a bisection level that contain or touch orders in this range: the number of the first
+/// Return the intervals of a bisection level that contain or touch orders in this range: the index of the first
 /// interval, and their count.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
@@ -231,7 +231,7 @@ impl GramTables {
         (position * width, (position + 1.0) * width)
     }
 
-    /// Return the intervals of a term at the coarsest bisection level: the number of the first interval, and their
+    /// Return the intervals of a term at the coarsest bisection level: the index of the first interval, and their
     /// count.
     pub(super) fn initial_intervals(&self, region: &Region, term: usize) -> (usize, usize) {
         if self.has_fixed_order(term) {

@@ -102,7 +102,7 @@ pub(crate) struct LinearizedVector {
     /// Coefficients of the output terms of the candidate for which the vector is built.
     center: Vec<f64>,
     /// Coefficients of the kernel matrices F_i of the k output terms in the basis of orthogonalized matrices G_i: F_i =
-    /// G_i + Σ_{j<i} mix[i·k + j] G_j.
+    /// G_i + Σ_{j<i} `projections[i·k + j]` G_j.
     projections: Vec<f64>,
     /// Largest modulus of the values of each first-order correction of the test vector.
     peak_values: Vec<f64>,

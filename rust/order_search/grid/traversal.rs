@@ -30,7 +30,7 @@ pub(crate) struct Cursor<'a> {
     grid: &'a OrderGrid,
     /// Index of the block, which has one order α of the equation.
     block: usize,
-    /// For each group, the number of the combination of all its orders but the last.
+    /// For each group, the index of the combination of all its orders but the last.
     prefixes: Vec<usize>,
     /// For each group, the axis positions of its last order that are allowed with its other orders.
     completions: Vec<BitSet>,

@@ -331,7 +331,7 @@ pub(super) type ScoreTables = Vec<Vec<ScoreEntry>>;
 /// Candidates `first … last − 1` of one equation, to be evaluated up to a limit of their score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
-    /// Number of the equation.
+    /// Index of the equation.
     pub equation: usize,
     /// First candidate.
     pub first: usize,
@@ -374,7 +374,7 @@ impl Candidates {
         self.ids.len()
     }
 
-    /// Return the number of the candidate with these orders (α, then the terms). A new candidate is appended. `key` is
+    /// Return the index of the candidate with these orders (α, then the terms). A new candidate is appended. `key` is
     /// workspace.
     pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
         key.clear();
@@ -457,12 +457,12 @@ impl DistinctSums {
         self.count
     }
 
-    /// Return the number of a vector of contributions. `None` if it is not in the set.
+    /// Return the index of a vector of contributions in this set; `None` if it is not in the set.
     pub(super) fn find(&self, sums: &[f64]) -> Option<u32> {
         self.ids.get(&Self::key(sums)).copied()
     }
 
-    /// Iterate over the vectors of contributions in the sequence of their numbers.
+    /// Iterate over the vectors of contributions in the sequence of their indices.
     pub(super) fn iter(&self) -> impl Iterator<Item = &[f64]> {
         (0..self.count).map(|i| &self.values[i * self.width..(i + 1) * self.width])
     }

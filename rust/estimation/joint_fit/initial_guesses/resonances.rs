@@ -18,7 +18,7 @@ use crate::estimation::joint_fit::structure::{ParametricEquation, ParametricStru
 use crate::estimation::resonance_scan::fit_with_fixed_poles;
 use crate::signal::statistics::median;
 
-/// Frequencies of the scan relative to the bandwidth of the output, logarithmically spaced from 0.15 to 8.
+/// Frequencies of the resonance scan relative to the bandwidth of the output, logarithmically spaced from 0.15 to 8.
 const FREQUENCY_RATIOS: [f64; 14] = [
     0.15,
     0.203_674_807_750_629_52,
@@ -35,9 +35,9 @@ const FREQUENCY_RATIOS: [f64; 14] = [
     5.891_744_851_769_920_5,
     8.0,
 ];
-/// Damping ratios of the scan.
+/// Damping ratios at which the resonance scan is evaluated.
 const DAMPING_RATIOS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
-/// Maximum number of points of a scan that become candidates.
+/// Maximum number of points of a resonance scan that become candidates.
 const MAX_SCAN_CANDIDATES: usize = 4;
 /// Difference below which two exponents of t count as equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
@@ -112,7 +112,7 @@ fn resonance_coefficients(equation: &ParametricEquation, omega: f64, damping: f6
     Some(out).filter(|out| !out.is_empty())
 }
 
-/// Return the best points of the scan of one equation with fixed orders, sorted by root-mean-square output error.
+/// Return the best points of the resonance scan of one equation with fixed orders, sorted by root-mean-square output error.
 ///
 /// There is one point per frequency, with the best damping ratio for that frequency. The frequencies are relative to
 /// `frequency` \[rad/s\].
