@@ -159,7 +159,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         """
         if not isinstance(self.structure, (str, Structure)):
             raise ModelError(
-                f"structure is {type(self.structure).__name__}; give an equation in words or a structure, or 'auto'"
+                f"structure is {type(self.structure).__name__}; give an equation as text, or a structure, or 'auto'"
             )
         if not isinstance(self.structure, str):
             return self.structure.with_orders(self.orders or {})

@@ -447,7 +447,7 @@ def test_an_equation_is_a_structure(folder: Path) -> None:
     for words in (["--equation", EQUATION], [f"--equation={EQUATION}"]):
         found = run_command("identify", "square.csv", *words, cwd=folder)
         assert found.returncode == 2
-        assert "No such option: --equation; --structure takes equations in words" in found.stderr
+        assert "No such option: --equation; --structure takes equations as text" in found.stderr
     # Where there is no structure, it is as unknown as any other.
     assert "No such option: --equation" in run_command("doctor", "--equation", "x", cwd=folder).stderr
 

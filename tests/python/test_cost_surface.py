@@ -74,7 +74,7 @@ def test_held_the_cost_is_never_lower(fit):
     refitted, held = (output_error_landscape(fit, refit=r) for r in (True, False))
     assert np.all(held.scores >= refitted.scores - 0.5)
     assert held.scores.max() > 2 * refitted.scores.max()
-    assert "held at the optimum" in held.other_orders_note
+    assert "fixed at the optimum" in held.other_orders_note
 
 
 def test_the_pair_least_told_apart_is_named(fit):

@@ -444,7 +444,7 @@ def test_the_command_line_names_filtered_signals():
         (
             {"filtered_signals": ["theta12"]},
             "flexible-link:1",
-            "apply to equations in words; the flexible link has --sensor-filter stock",
+            "apply to equations as text; the flexible link has --sensor-filter stock",
         ),
         (
             {"filtered_signals": ["theta12"]},

@@ -521,7 +521,7 @@ def test_the_command_says_what_python_says(tmp_path):
         (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
         (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is given"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
-        (["--equation", ARC], 2, "--structure takes equations in words"),
+        (["--equation", ARC], 2, "--structure takes equations as text"),
     ):
         refused = run_command("identify-frequency", path, *words)
         assert refused.exit_code == code, refused.output

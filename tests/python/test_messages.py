@@ -70,7 +70,7 @@ def test_options_of_the_flexible_link_are_refused_with_an_equation(command, word
     done = run_command(command, saved, "--structure", FREE, *words)
     assert done.exit_code == 2
     assert words[0] in done.stderr
-    assert "not used with one equation in words; leave it out" in done.stderr
+    assert "not with one equation as text; leave it out" in done.stderr
 
 
 def test_what_is_identified_live_needs_live(tmp_path):

@@ -163,7 +163,7 @@ def test_bad_input_is_refused_in_words(record):
     for options, rows, error, words in (
         ({"structure": "D y = a y + b u + c v"}, X, ValueError, r"X has 1 columns; give those of the structure: u, v"),
         ({"structure": "D y = a y +"}, X, ftlm.ModelError, r"expected"),
-        ({"structure": 3}, X, ftlm.ModelError, r"structure is int; give an equation in words or a structure"),
+        ({"structure": 3}, X, ftlm.ModelError, r"structure is int; give an equation as text, or a structure"),
         ({"step": -1.0}, X, ftlm.DataError, r"step"),
         ({"orders": {"alfa": 1.0}}, X, ftlm.ModelError, r"alfa"),
         ({"method": "output error"}, X, ftlm.ModelError, r"method"),

@@ -215,7 +215,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
         [
             (0, wave + 1, 0, "are divided into other blocks"),
             (0, wave, 9, "of kinds do not match"),
-            (10**9, 10**9 + 1, 0, "it has"),
+            (10**9, 10**9 + 1, 0, "the search has"),
         ]
     ):
         path = tmp_path / f"{number}.ftlm"

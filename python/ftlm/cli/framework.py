@@ -152,7 +152,7 @@ class Command(TyperCommand):
         for option_name in (a.partition("=")[0] for a in args):
             if option_name not in names and OPTION_ALIASES.get(option_name) in names:
                 ctx.fail(
-                    f"No such option: {option_name}; {OPTION_ALIASES[option_name]} takes equations in words, and ftlm "
+                    f"No such option: {option_name}; {OPTION_ALIASES[option_name]} takes equations as text, and ftlm "
                     "identify-frequency takes circuits: fit each, and compare their AICc."
                 )
         ctx.meta["method"] = self._chosen_method(args)

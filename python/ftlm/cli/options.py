@@ -67,7 +67,7 @@ class StructureOptions:
     sensor_filter : stock|HZ[:DAMPING]
         Low-pass filter of the sensors; stock: 2 Hz, damping 0.9.
     filtered_signals : SIGNAL
-        Filtered signal of an equation in words.
+        Filtered signal of an equation as text.
     orders : NAME=VALUE
         Fix an order.
     saturation : INPUT=LIMIT
@@ -160,9 +160,9 @@ class StructureOptions:
         inapplicable = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if inapplicable:
             owner = "the flexible link or several equations" if inapplicable == ["--coupling"] else "the flexible link"
-            kind = "one equation in words" if count == 1 else "equations in words"
+            kind = "one equation as text" if count == 1 else "equations as text"
             raise ModelError(
-                f"{', '.join(inapplicable)}: only used with {owner}, not with {kind}; leave "
+                f"{', '.join(inapplicable)}: only valid with {owner}, not with {kind}; leave "
                 f"{'it' if len(inapplicable) == 1 else 'them'} "
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
@@ -220,7 +220,7 @@ class StructureOptions:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
         if self.filtered_signals or self.sensor_filter not in (None, "stock"):
             raise ModelError(
-                "--filtered-signals and --sensor-filter HZ apply to equations in words; the flexible link has "
+                "--filtered-signals and --sensor-filter HZ apply to equations as text; the flexible link has "
                 "--sensor-filter stock"
             )
         laws: dict[str, Sequence[Law]] = {
