@@ -392,7 +392,7 @@ class Own:
 )
 def test_a_controller_runs_at_its_own_rate_only(bench, make):
     for rate in (500.0, 100.0, 250.1):
-        with pytest.raises(ftlm.ModelError, match=rf"rate = {rate:g} Hz is not the 250 Hz that the controller is made"):
+        with pytest.raises(ftlm.ModelError, match=rf"rate = {rate:g} Hz is not the 250 Hz for which the controller"):
             rig.control(make(), HOLD, bench.board, arm=True, duration=0.1, rate=rate)
     assert bench.kind == "q8" or bench.board._page is None
     assert bench.kind == "virtual" or bench.hardware.log == []
