@@ -48,7 +48,7 @@ from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
 from ftlm.order_search.certificate import DEFAULT_MAX_CELLS, DEFAULT_MAX_TERM_RATIO, DEFAULT_TOLERANCE, certify_orders
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import Coefficients, OrderGrid, SearchSettings
+from ftlm.order_search.options import Coefficients, OrderGrid, SearchSettings, restrict_order_grid
 from ftlm.order_search.search import announce_time, job_of, make_job, resume_job, run_job, search_status
 from ftlm.progress import Progress
 from ftlm.structure.structure import Structure
@@ -297,7 +297,7 @@ def search(
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
-            name: make_job(runs, group, restrict_grid(full_grid, group), settings, m=m, threads=threads)
+            name: make_job(runs, group, restrict_order_grid(full_grid, group), settings, m=m, threads=threads)
             for name, group in groups.items()
         }
         open_store = None
@@ -309,7 +309,7 @@ def search(
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 result = run_job(replace(job, progress=progress), store=open_store, number=number)
             results[name] = with_verdict(
-                result, runs, groups[name], settings, restrict_grid(full_grid, groups[name]), m=m
+                result, runs, groups[name], settings, restrict_order_grid(full_grid, groups[name]), m=m
             )
     if out is None and report is None and not validation_data:
         show_by_output(results, as_json=as_json)
@@ -372,7 +372,7 @@ def certify(
             results[equation.output] = certify_orders(
                 runs,
                 single,
-                restrict_grid(full_grid, single),
+                restrict_order_grid(full_grid, single),
                 tolerance=tolerance,
                 min_separation=min_separation,
                 max_term_ratio=max_term_ratio,
@@ -390,11 +390,6 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
             raise ModelError(f"--order-grid {name!r} is not a free order; free are {free}")
-
-
-def restrict_grid(grid: OrderGrid, group: Structure) -> OrderGrid:
-    """Return the order grid restricted to ``alpha`` and the free orders of the structure `group`."""
-    return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in group.order_names})
 
 
 def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:

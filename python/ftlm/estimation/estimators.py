@@ -32,7 +32,7 @@ from ftlm.estimation.result import Task
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Estimate, Model
 from ftlm.order_search.checkpoint import Store
-from ftlm.order_search.options import OrderGrid, SearchSettings
+from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import announce_time, make_job, run_job
 from ftlm.progress import FractionTracker
@@ -373,7 +373,7 @@ def prior_findings(
 def fixed_orders(task: Task) -> set[str]:
     """Return the names of orders with a single grid value, which are not estimated."""
     groups = task.structure.independent_groups().values() if task.structure.order_names else []
-    axes = [(task.part_order_grid(group) or OrderGrid()).values(group) for group in groups]
+    axes = [task.part_order_grid(group).values(group) for group in groups]
     return {n for values in axes for n, v in values.items() if len(v) == 1}
 
 

@@ -172,7 +172,7 @@ class Task:
 
     def part_order_grid(self, group: Structure) -> OrderGrid:
         """Return the order grid restricted to the free orders of `group`, a structure with some of the equations."""
-        return restrict_order_grid(self.order_grid, group) or OrderGrid()
+        return restrict_order_grid(self.order_grid, group)
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,9 @@ def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None
             raise ModelError(f"order {name!r} of {parameter('order_grid')} is not a free order; free are {free}")
 
 
-def restrict_order_grid(grid: OrderGrid | None, group: Structure) -> OrderGrid | None:
-    """Return an order grid without orders that are not free in the structure `group`; None if the grid is None."""
-    if grid is None:
-        return None
-    names = (*group.order_names, "alpha")
+def restrict_order_grid(grid: OrderGrid | None, group: Structure) -> OrderGrid:
+    """Return an order grid, by default the default one, without orders that are not free in the structure `group`."""
+    grid, names = grid or OrderGrid(), (*group.order_names, "alpha")
     return replace(grid, orders={n: v for n, v in grid.orders.items() if n in names})
 
 

@@ -36,7 +36,7 @@ from ftlm.findings import (
 )
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
-from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS, OrderGrid
+from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult, search_summary, search_top
 from ftlm.order_search.search import landscape, score_profiles
 from ftlm.plot.comparison_charts import (
@@ -527,7 +527,7 @@ def _score_charts(task: Task, searches: Mapping[str, SearchResult]) -> list[Figu
     charts: list[Figure] = []
     for name, search in searches.items():
         group = task.structure if name == "stage" else task.structure.equation(name)
-        group_grid = task.part_order_grid(group) or OrderGrid()
+        group_grid = task.part_order_grid(group)
         charts += score_profiles(task.runs, group, search, group_grid)
         if sum(len(v) > 1 for v in group_grid.values(group).values()) >= 2:
             charts.append(landscape(task.runs, group, search, group_grid))
