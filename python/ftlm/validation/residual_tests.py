@@ -603,11 +603,12 @@ def _independence(
     )
 
 
-def is_independent(series: list[Floats], signals: Sequence[list[Floats]], lags: int = DEFAULT_LAGS) -> bool:
-    """Whether residuals (`series`, one array per run) are uncorrelated with all `signals` at delays up to `lags` rows.
+def is_independent(series: list[Floats], signals: Sequence[list[Floats]]) -> bool:
+    """Whether residuals (`series`, one array per run) are uncorrelated with all `signals` at the default delays.
 
     Also False if a run is too short for the test, or a signal is constant.
     """
+    lags = DEFAULT_LAGS
     if min(e.size for e in series) < 2 * lags + 1:
         return False
     return all(_independence(series, s, NoiseModel.fit(series, s, lags), lags, first_lag=0).passed for s in signals)
