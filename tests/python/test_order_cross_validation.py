@@ -16,9 +16,9 @@ from ftlm.reproduction.cross_validation import (
     dead_channel_notes,
     link_structure,
     rate_effect_table,
-    stages_in,
     verdict_sentence,
 )
+from ftlm.reproduction.simulated_arm import stages_with
 
 ROWS, STEP = 251, 0.02
 
@@ -248,10 +248,10 @@ def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
 
 
 def test_stages_are_those_that_all_runs_have(fractional):
-    assert stages_in(fractional.runs) == [1]
+    assert stages_with(fractional.runs, current=False) == [1]
     run = fractional.runs[0]
-    with pytest.raises(ftlm.DataError, match="no stage of the arm has both of its angles in all runs"):
-        stages_in([run, run.select(["theta12"])])
+    with pytest.raises(ftlm.DataError, match="no stage of the arm has all of its signals in every run"):
+        stages_with([run, run.select(["theta12"])], current=False)
     with pytest.raises(ftlm.DataError, match="give two or more"):
         cross_validate_orders([run])
     with pytest.raises(ftlm.DataError, match="do not have distinct names"):

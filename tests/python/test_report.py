@@ -471,7 +471,7 @@ def test_paper_table_has_the_papers_columns(identified):
     Page(html)
     assert "∞ diverged" in html
     assert sorted(table.headings) == [0, 6]
-    with pytest.raises(ftlm.ModelError, match="no output 'theta21'"):
+    with pytest.raises(ftlm.ModelError, match="output 'theta21' does not occur"):
         letters_of(identified.model, "theta21")
 
 

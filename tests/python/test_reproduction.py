@@ -17,10 +17,9 @@ from ftlm import DataError
 from ftlm.findings import make_finding
 from ftlm.report.html_report import grouped_findings
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.checks import checks, fractional_orders, make_check, table_3_coefficients
+from ftlm.reproduction.checks import checks, make_check, table_3_coefficients
 from ftlm.reproduction.report import reproduction_text
-from ftlm.reproduction.reproduction import stages_of
-from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, truth_of
+from ftlm.reproduction.simulated_arm import decimate_run, demo_plant, demo_run, stages_of, truth_of
 from ftlm.reproduction.stage import Cases, OrderComparison, compare_optimizers
 from ftlm.validation.comparison import compare_means
 from lagrange import truth
@@ -261,7 +260,7 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     assert whole.improves("y") is False
     assert replace(whole, gains={"y": 3.0}).improves("y") is None
     data = SimpleNamespace(cases=Cases((), (), (replace(better, is_degenerate=True),)), simulated=False)
-    claim = make_check(fractional_orders, data)
+    claim = make_check("fractional_orders", data)
     assert claim.verdict == "inconclusive"
     assert "Inconclusive in 1 cases" in claim.computed
 

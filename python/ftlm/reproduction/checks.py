@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.published_values import FIRST_P, LAST_P, PRIOR_COVARIANCES, page_text, prior_text, read_texts
 from ftlm.reproduction.simulated_arm import ANGLE_NAMES, STAGE_NUMBERS
-from ftlm.reproduction.stage import TRACE_EVERY, Trial, are_usable
+from ftlm.reproduction.stage import TRACE_EVERY, OptimizerErrors, Trial, are_usable
 from ftlm.utils.formatting import symbol
 from ftlm.validation.comparison import metrics
 
@@ -30,6 +30,8 @@ Word = Literal["holds", "does not hold", "depends on", "not decidable by a simul
 #: Case of a claim: whether the claim holds, and the level of each factor, such as the angle, by the factor's name. All
 #: cases of a claim have the same factors.
 Case = tuple[bool, dict[str, str]]
+#: Result on one angle of one record.
+ByAngle = TypeVar("ByAngle", Trial, OptimizerErrors)
 #: Factor that the author of the simulation chose: which arm is simulated. A claim that depends on it is not decidable.
 ARM_FACTOR = "the arm"
 #: Thresholds in the rules of claims.toml, by name; relative differences are in percent.
@@ -72,9 +74,9 @@ class ClaimVerdict:
         return f"{self.holding_cases} of {self.cases} cases" + (f"; {parts}" if parts else "")
 
 
-def case(holds: bool, **factors: str) -> Case:
+def case(holds: object, **factors: str) -> Case:
     """Return (whether the claim holds, level of each factor by name); "_" in a keyword becomes a space in the name."""
-    return holds, {name.replace("_", " "): level for name, level in factors.items()}
+    return bool(holds), {name.replace("_", " "): level for name, level in factors.items()}
 
 
 def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
@@ -173,20 +175,25 @@ def format_list(values: Iterable[float], digits: int = 3) -> str:
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
-def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
-    return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
+def _of_angles(holding: Mapping[str, bool]) -> list[Case]:
+    return [case(v, the_angle=symbol(o)) for o, v in holding.items()]
 
 
-def _of_rows(rows: Iterable[printed.PrintedModelRun], holds: Callable[[printed.PrintedModelRun], bool]) -> ClaimVerdict:
-    return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in rows])
+def _of_rows(rows: Iterable[printed.PrintedModelRun], holds: Callable[[printed.PrintedModelRun], bool]) -> list[Case]:
+    return [case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in rows]
 
 
-def _of_trials(trials: Iterable[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
-    def case_of(t: Trial) -> Case:
-        angle, record = symbol(t.output), str(t.seed)
-        return case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=angle, the_record=record)
+def _of_trials(trials: Iterable[Trial], holds: Callable[[Trial], Any]) -> list[Case]:
+    return [
+        case(holds(t), K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
+        for t in trials
+    ]
 
-    return combine_cases([case_of(t) for t in trials], **of)
+
+def _first_by_angle(results: Iterable[ByAngle]) -> dict[str, ByAngle]:
+    """Return the first result on each angle, that of the first record of the main arm, in the order of the angles."""
+    first = {r.output: r for r in reversed(list(results))}
+    return {o: first[o] for o in ANGLE_NAMES if o in first}
 
 
 def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
@@ -196,8 +203,8 @@ def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[fl
     """
     texts = []
     for prior in PRIOR_COVARIANCES:
-        first = {t.output: numbers(t) for t in reversed(reproduction.cases.trials) if t.prior == prior}
-        texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: first[o] for o in ANGLE_NAMES if o in first}, 4)}")
+        first = _first_by_angle(t for t in reproduction.cases.trials if t.prior == prior)
+        texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: numbers(t) for o, t in first.items()}, 4)}")
     return "; ".join(texts)
 
 
@@ -228,12 +235,12 @@ def deviation_text(reproduction: Reproduction) -> str:
     return page_text("deviations", ratios=middle, floors=floor, values=nr, count=count, rows=len(values))
 
 
-#: Verdict on a claim, and numbers for the placeholders in its texts in claims.toml.
-Evidence = tuple[ClaimVerdict, dict[str, Any]]
+#: Cases of a claim, and numbers for the placeholders in its texts in claims.toml.
+Evidence = tuple[Sequence[Case], dict[str, Any]]
 
 
 def movement(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the models printed in the paper move as much as the paper's arm.
+    """Return cases and numbers on the claim that the models printed in the paper move as much as the paper's arm.
 
     It holds if the ratio of standard deviations is within a factor of 2.
     """
@@ -248,7 +255,7 @@ def movement(reproduction: Reproduction) -> Evidence:
 
 
 def stability(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the models printed in the paper are stable."""
+    """Return cases and numbers on the claim that the models printed in the paper are stable."""
     rows = reproduction.printed_model_runs
     poles: dict[str, list[float]] = defaultdict(list)
     for r in rows:
@@ -257,7 +264,7 @@ def stability(reproduction: Reproduction) -> Evidence:
 
 
 def returned_coefficients(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that printed models can be recovered from their own simulated responses.
+    """Return cases and numbers on the claim that printed models can be recovered from their own simulated responses.
 
     It holds for a model if a fit at the printed orders returns its coefficient a within 2 %.
     """
@@ -274,7 +281,7 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
         if k in r.orders:
             found = ", ".join(f"{symbol(n)} {v:g}" for n, v in r.orders[k].items() if not n.startswith("alpha"))
             orders.append(f"{angle}, K0 = {K0}: {found}")
-    return combine_cases(cases), {
+    return cases, {
         "values": ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(a)}" for k, a in last.items()),
         "orders": "; ".join(orders),
         "printed_text": _printed_text("a", last[PRIOR_COVARIANCES[0]]),
@@ -282,7 +289,7 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
 
 
 def recomputed_tables(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that Tables 4 and 5 of the paper can be recomputed.
+    """Return cases and numbers on the claim that Tables 4 and 5 of the paper can be recomputed.
 
     It holds for an angle if recomputed coefficients and normalized residuals (NR) are within a factor of 1.25 of the
     printed ones, with equal signs.
@@ -298,7 +305,7 @@ def recomputed_tables(reproduction: Reproduction) -> Evidence:
 
 
 def printed_orders(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the orders printed in the paper are the best ones.
+    """Return cases and numbers on the claim that the orders printed in the paper are the best ones.
 
     It holds for an angle if no other orders on a grid around the printed ones have a smaller equation error.
     """
@@ -329,7 +336,7 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
 
 
 def innovation_length(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error."""
+    """Return cases and numbers on the claim that a larger innovation length p gives a smaller simulation error."""
     return _of_trials(reproduction.cases.trials, error_falls), {
         "errors": _by_prior(reproduction, lambda t: t.errors.values()),
         "printed_text": _printed_text("error", ANGLE_NAMES, printed.INNOVATION_LENGTHS),
@@ -337,7 +344,7 @@ def innovation_length(reproduction: Reproduction) -> Evidence:
 
 
 def convergence(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that a larger innovation length p converges in fewer recursion steps."""
+    """Return cases and numbers on the claim that a larger innovation length p converges in fewer recursion steps."""
     trials = reproduction.cases.trials
     comparable = [t for t in trials if converges_faster(t.convergence_steps) is not None]
     return _of_trials(comparable, lambda t: converges_faster(t.convergence_steps)), {
@@ -348,23 +355,24 @@ def convergence(reproduction: Reproduction) -> Evidence:
 
 
 def weak_prior(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error.
+    """Return cases and numbers on the claim that a larger innovation length p gives a smaller simulation error.
 
     Only results with a weak prior are used.
     """
     weak = [t for t in reproduction.cases.trials if t.prior == printed.WEAK_PRIOR]
-    ruling = _of_trials(weak, error_falls)
+    cases = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
     spread = [
         weak_prior_variation(each) for s in reproduction.stages.values() for each in s.weak_prior_coefficients.values()
     ]
     words = "no record that starts at rest"
     if ratios:
-        words = f"{ruling.counts}; errors of p = {LAST_P} over p = {FIRST_P}: {min(ratios):.4g} to {max(ratios):.4g}"
+        counts = combine_cases(cases).counts
+        words = f"{counts}; errors of p = {LAST_P} over p = {FIRST_P}: {min(ratios):.4g} to {max(ratios):.4g}"
     if spread:
         words += f"; coefficients at the same orders differ by at most {100 * max(spread):.2g} %"
     away = (f"{100 * printed.printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in ANGLE_NAMES)
-    return ruling, {"words": words, "away": ", ".join(away)}
+    return cases, {"words": words, "away": ", ".join(away)}
 
 
 def weak_prior_variation(each: Mapping[int, Mapping[str, float]]) -> float:
@@ -385,22 +393,21 @@ def has_smaller_error(error: float, seeds: Iterable[float]) -> bool:
 
 
 def optimizers(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
+    """Return cases and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
     comparisons = reproduction.cases.optimizer_errors
     cases = []
     for c in comparisons:
         for k, (name, errors) in product(c.order_grid, c.optimizers.items()):
             holds = has_smaller_error(c.order_grid[k], errors.values())
             cases.append(case(holds, K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_optimizer=name))
-    first = {c.output: c for c in reversed(comparisons)}
-    own = {o: first[o] for o in ANGLE_NAMES if o in first}
+    own = _first_by_angle(comparisons)
     of_seeds = (min, statistics.median, max)
     both = {
         o: (*c.order_grid.values(), *(f(each.values()) for each in c.optimizers.values() for f in of_seeds))
         for o, c in own.items()
     }
     seeds = [len(c.optimizers["genetic"]) for c in comparisons]
-    return combine_cases(cases), {
+    return cases, {
         "errors": by_angle(both),
         "budgets": ", ".join(dict.fromkeys(f"{c.candidates} candidates and evaluations a seed" for c in own.values())),
         "seeds": " to ".join(dict.fromkeys(map(str, (min(seeds), max(seeds))))),
@@ -409,28 +416,24 @@ def optimizers(reproduction: Reproduction) -> Evidence:
 
 
 def manual(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that multi-innovation is more accurate than the manufacturer's model.
+    """Return cases and numbers on the claim that multi-innovation is more accurate than the manufacturer's model.
 
-    It holds if the normalized residual (NR) of the model with innovation length 7 is smaller. With simulated arms, it
-    is decidable only if the outcome does not depend on the arm.
+    It holds if the normalized residual (NR) of the model with innovation length 7 is smaller.
     """
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
-    return _of_trials(reproduction.cases.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
+    return _of_trials(reproduction.cases.trials, lambda t: t.nr < t.manual), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
         "printed_text": by_angle(both, 4),
     }
 
 
 def fractional_orders(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that fractional orders improve the fit significantly.
-
-    With simulated arms, it is decidable only if the outcome does not depend on the arm.
-    """
+    """Return cases and numbers on the claim that fractional orders improve the fit significantly."""
     freed = reproduction.cases.order_comparisons
     verdicts = [(f, o, improves) for f in freed for o in f.free_nr if (improves := f.improves(o)) is not None]
     cases = [case(improves, the_arm=f.arm, the_angle=symbol(o)) for f, o, improves in verdicts]
     both = (f"{f.arm}: {by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr})}" for f in freed)
-    return combine_cases(cases, of_the_machine=reproduction.simulated), {
+    return cases, {
         "unknown": sum(len(f.free_nr) for f in freed) - len(verdicts),
         "errors": "; ".join(both),
         "orders": "; ".join(f"{f.arm}, stage {f.stage}: {f.fractional_text}" for f in freed),
@@ -438,7 +441,7 @@ def fractional_orders(reproduction: Reproduction) -> Evidence:
 
 
 def close_orders(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that models with the orders printed in the paper describe the arm.
+    """Return cases and numbers on the claim that models with the orders printed in the paper describe the arm.
 
     It holds for an angle if the normalized residual (NR) of the simulation is small, both in itself and relative to the
     NR of the equation error.
@@ -447,14 +450,14 @@ def close_orders(reproduction: Reproduction) -> Evidence:
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
     ratio, most = RULE_NUMBERS["error_ratio"], RULE_NUMBERS["explaining_nr"]
     holding = {o: free < ratio * equation and free < most for o, (equation, free) in nr.items()}
-    return _of_angles(holding, of_the_machine=reproduction.simulated), {
+    return _of_angles(holding), {
         "errors": by_angle(nr),
         "printed_text": _printed_text("nr", near, digits=4),
     }
 
 
 def published_form(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the published equations recover the orders of the arm.
+    """Return cases and numbers on the claim that the published equations recover the orders of the arm.
 
     The published equations are (22)-(25) of the paper. The arm is simulated by its eqs. (14)-(15). The claim holds for
     a joint if all order estimates are within four standard errors of the true values.
@@ -480,7 +483,7 @@ def published_form(reproduction: Reproduction) -> Evidence:
         count += len(result.orders)
         cases.append(case(not wrong, the_stage=str(number)))
     texts = {"listed": ", ".join(away) or "none", "fits": by_angle(fits, 4), "omitted": omitted}
-    return combine_cases(cases), {"away": len(away), "count": count, **texts}
+    return cases, {"away": len(away), "count": count, **texts}
 
 
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
@@ -500,14 +503,14 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
 
 
 def dropped_derivative(reproduction: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the paper may drop the derivative of the current.
+    """Return cases and numbers on the claim that the paper may drop the derivative of the current.
 
     Equations (19) and (21) drop it. The claim holds if the printed orders give this derivative the order 0.
     """
     orders = {n: printed.printed_numbers(n, LAST_P)[0] for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
     parts = [stage.dropped_derivative_effect for stage in reproduction.stages.values()]
-    return combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]), {
+    return [case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()], {
         "printed_orders": format_list(dropped.values(), 2),
         "orders": format_list(p.order for p in parts),
         "changed": ", ".join(f"{metrics(p.derived, p.published).nr:.3g} ({symbol(p.output)})" for p in parts),
@@ -516,7 +519,7 @@ def dropped_derivative(reproduction: Reproduction) -> Evidence:
 
 
 def table_3(_: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the parameters in Table 3 give the printed integer-order models.
+    """Return cases and numbers on the claim that the parameters in Table 3 give the printed integer-order models.
 
     It holds if all coefficients agree within 2 %.
     """
@@ -524,7 +527,7 @@ def table_3(_: Reproduction) -> Evidence:
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
     off = {n: r for n, r in ratios.items() if abs(r - 1) > RULE_NUMBERS["difference"] / 100}
     worst = max(off, key=lambda n: abs(math.log(abs(off[n]))))
-    return combine_cases([case(not off)]), {
+    return [case(not off)], {
         "off": len(off),
         "count": len(rows),
         "worst": worst,
@@ -535,7 +538,7 @@ def table_3(_: Reproduction) -> Evidence:
 
 
 def one_record(_: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that Table 7 of the paper is based on one record.
+    """Return cases and numbers on the claim that Table 7 of the paper is based on one record.
 
     It holds for an angle if both of its rows imply the same standard deviation (RMSE / NR) within 15 %.
     """
@@ -545,37 +548,32 @@ def one_record(_: Reproduction) -> Evidence:
 
 
 def possible_row(_: Reproduction) -> Evidence:
-    """Return verdict and numbers on the claim that the mean absolute error of one printed row is at most its RMSE.
+    """Return cases and numbers on the claim that the mean absolute error of one printed row is at most its RMSE.
 
     This inequality holds for any data.
     """
     row = printed.INTEGER_ROWS["theta22"]
     mean = row.error / printed.PULSE_COUNT
-    return combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]), {"mean": mean, "row": row}
+    return [case(mean <= row.rmse, the_angle="θ₂₂")], {"mean": mean, "row": row}
 
 
 #: Values of placeholders that the texts of several claims contain.
 SHARED_FIELDS = {"first_p": FIRST_P, "last_p": LAST_P, "trace_every": TRACE_EVERY, "published": printed, **RULE_NUMBERS}
 
 
-def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
-    """Evaluate the check of one claim, and return it with its texts from claims.toml."""
-    ruling, fields = check(reproduction)
-    texts, values = read_texts("claims")[check.__name__], {"counts": ruling.counts, **SHARED_FIELDS, **fields}
+def make_check(name: str, reproduction: Reproduction) -> Check:
+    """Evaluate the function of one claim, and return its verdict with its texts from claims.toml."""
+    texts = read_texts("claims")[name]
+    cases, fields = globals()[name](reproduction)
+    ruling = combine_cases(cases, of_the_machine=texts.get("of_the_machine", False) and reproduction.simulated)
+    values = {"counts": ruling.counts, **SHARED_FIELDS, **fields}
     return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
-
-
-#: Check function of each claim, by name, in the order of claims.toml and of the page.
-CLAIM_CHECKS: dict[str, Callable[[Reproduction], Evidence]] = {
-    name: globals()[name] for name in read_texts("claims") if name != "rules"
-}
 
 
 def checks(reproduction: Reproduction) -> list[Check]:
     """Return the checks of all claims of the paper; a claim is omitted if the reproduction lacks results for it."""
-    needs = {name: read_texts("claims")[name].get("needs", ()) for name in CLAIM_CHECKS}
     return [
-        make_check(check, reproduction)
-        for name, check in CLAIM_CHECKS.items()
-        if all(attrgetter(part)(reproduction) for part in needs[name])
+        make_check(name, reproduction)
+        for name, texts in read_texts("claims").items()
+        if name != "rules" and all(attrgetter(part)(reproduction) for part in texts.get("needs", ()))
     ]

@@ -19,20 +19,19 @@ from ftlm.estimation.identify import identify
 from ftlm.estimation.model_checks import dead_channel_findings
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import MIN_FIT_GAIN, have_common_value, improves_prediction, is_degenerate
-from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
 from ftlm.reproduction.published_values import page_text, read_texts
-from ftlm.reproduction.report import angle_chart, make_section, make_table, table_text
-from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
+from ftlm.reproduction.report import fit_chart, make_section, make_table, table_text
+from ftlm.reproduction.simulated_arm import StageNumber, decimate_run, letter_of, stages_with
+from ftlm.reproduction.stage import JOINT_METHOD
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_writable
 from ftlm.utils.formatting import Cell, Exact, attributes, finite, format_bound, json_value, symbol, symbol_html
-from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads, join_names
 from ftlm.validation.comparison import Comparison
@@ -334,12 +333,11 @@ def cross_validate_orders(
     ModelError
         If a fit with integer orders fails.
     """
-    runs = [run if run.name else replace(run, name=f"run {k}") for k, run in enumerate(runs, 1)]
     if len(runs) < 2:
         raise DataError(f"cross-validation needs at least two runs, and there is {len(runs)}; give two or more")
     if len({run.name for run in runs}) < len(runs):
         raise DataError(f"runs {join_names(r.name for r in runs)} do not have distinct names; rename a file")
-    stages = stages_in(runs)
+    stages = stages_with(runs, current=False)
     both = len(stages) == 2
     structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
     notes: list[str] = []
@@ -365,7 +363,8 @@ def cross_validate_orders(
             log(f"{output}{suffix}: {kind}, fitted to {run.name}")
             fixed = {n: integer_order(n) for n in structure.order_names if letter_of(n) not in free}
             try:
-                result = identify(run, structure.with_orders(fixed), threads=threads, progress=progress)
+                restricted = structure.with_orders(fixed)
+                result = identify(run, restricted, method=JOINT_METHOD, threads=threads, progress=progress)
                 fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in own})
             except FtlmError as error:
                 if kind == INTEGER_KIND:
@@ -381,25 +380,6 @@ def cross_validate_orders(
             deflection = replace(deflection, without_rate=cross_validate(less, f", {WITHOUT_RATE_LABEL}"))
         deflections[deflection.output] = deflection
     return OrderCrossValidation(tuple(used), deflections, filtered, tuple(notes))
-
-
-def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
-    """Return the numbers of the joints (stages) for which every run contains both angles.
-
-    Raises
-    ------
-    DataError
-        If there is no such joint.
-    """
-    stages = [n for n in STAGE_NUMBERS if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
-    if not stages:
-        have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
-        raise DataError(
-            f"no stage of the arm has both of its angles in all runs ({have}); needed are theta11 and theta12, or "
-            f"theta21 and theta22: name their columns with {parameter('columns')}, or "
-            f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
-        )
-    return stages
 
 
 def verdict_sentence(output: str, verdict: Verdict) -> str:
@@ -419,21 +399,18 @@ def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> l
     The simulations are by the structures with integer orders and with both orders fractional.
     """
     charts, output = [], deflection.output
-    names = [run.name or "" for run in result.runs]
+    names = [run.name for run in result.runs]
     for run, other in zip(names, names[1:] + names[:1], strict=True):
-        measured = deflection.fits[INTEGER_KIND][run].comparisons[other]
-        lines, words = [("measured", measured.measured[output][0])], []
-        for kind in (INTEGER_KIND, CHARTED_KIND):
-            fit = deflection.fits[kind].get(run)
-            if fit is None:
-                words.append(f"{kind}: no fit")
-                continue
-            lines.append((kind, fit.comparisons[other].simulated[output][0]))
-            words.append(f"{kind} {percent(fit.fit(other))} % with {fit.parameter_count} parameters")
-        caption, title = "; ".join(words), f"{symbol(output)} on {other}, fitted to {run}"
+        fits = {kind: deflection.fits[kind].get(run) for kind in (INTEGER_KIND, CHARTED_KIND)}
+        models = [(kind, fit.comparisons[other]) for kind, fit in fits.items() if fit is not None]
+        words = [
+            f"{kind} {percent(fit.fit(other))} % with {fit.parameter_count} parameters" if fit else f"{kind}: no fit"
+            for kind, fit in fits.items()
+        ]
+        title = f"{symbol(output)} on {other}, fitted to {run}"
+        caption = "; ".join(words)
         caption = f"{caption[0].upper()}{caption[1:]}."
-        size = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
-        charts.append(angle_chart(pulse_times(measured), lines, output, title, caption, **size))
+        charts.append(fit_chart(models, output, title, caption, points=LINE_POINTS, width=SMALL_WIDTH_PX))
     return charts
 
 
@@ -543,7 +520,7 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
         *(_deflection_section(d) for d in result.deflections.values()),
         _method_section(result),
     ]
-    names = ", ".join(run.name or "" for run in result.runs)
+    names = ", ".join(run.name for run in result.runs)
     lead = page_text("cross_validation_lead", names=names)
     return write_page(path, title="Integer against fractional orders", sections=sections, lead=lead, force=force)
 

@@ -166,8 +166,8 @@ def run_demo(
         work = StageWork(stage, square, sine, preset, log, steps)
         models = {"integer order": work.euler_candidate(work.manual())}
         models |= work.searches()
-        words = "all orders and coefficients together by output error, from the current alone"
-        models["output error"] = work.joint(work.coupled, words)
+        work.begin("all orders and coefficients together by output error, from the current alone", "output error")
+        models["output error"] = work.identify_candidate(work.estimation_run, work.coupled)
         traces = work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS})
         derived = work.dropped_derivative(models["output error"].model)
         demo.stages[stage] = Stage(stage, models, traces, {}, {}, work.printed_orders(), derived, None)

@@ -52,8 +52,10 @@ ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b"
 WEAK_PRIOR = 1e10
 #: Prior covariances K0 that are compared: that of the paper (identity matrix), and a weak prior.
 PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
-#: Options of every order search. They are given explicitly, so that new defaults would not change a table.
-SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"}
+#: Options of every order search, and of every recursion of multi-innovation. They are given explicitly, so that new
+#: defaults would not change a table.
+SEARCH_OPTIONS: dict[str, Any] = {"criterion": "output-error", "norm": "l1"}
+RECURSION_OPTIONS: dict[str, Any] = {"row_basis": "haar"}
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ def best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: flo
 
     `p` is the innovation length, `prior` the prior covariance K0, and `work` are further options.
     """
-    options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, **SEARCH_OPTIONS, **work}
+    options = {"innovation_length": p, "prior_covariance": prior, **RECURSION_OPTIONS, **SEARCH_OPTIONS, **work}
     return rank_orders(run, single, grid, top=1, coefficients="multi-innovation", **options)
 
 

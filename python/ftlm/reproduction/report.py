@@ -18,7 +18,6 @@ import numpy as np
 from markupsafe import Markup
 
 from ftlm.arm.flexible_link import ORDER_OF, PARAMETER_SETS
-from ftlm.errors import ModelError
 from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.model.model import Model
 from ftlm.plot.comparison_charts import error_chart, pulse_times
@@ -48,7 +47,7 @@ from ftlm.utils.formatting import (
     symbol_html,
     truncate_text,
 )
-from ftlm.utils.validation import Floats
+from ftlm.utils.validation import Floats, check_known
 from ftlm.validation.comparison import Comparison, Metrics, metrics
 
 if TYPE_CHECKING:
@@ -88,11 +87,12 @@ def fit_chart(
     title: str,
     caption: str = "",
     reference_label: str = "measured",
+    **options: Any,
 ) -> LineChart:
     """Return a chart of a measured (or reference) angle and its simulations by the models (label, comparison).
 
     Simulated values far outside the range of this angle are omitted, and the caption reports this. `reference_label` is
-    the label of its line.
+    the label of its line, and `options` are those of LineChart.
     """
     first = models[0][1]
     measured, time = first.measured[output][0], pulse_times(first)
@@ -109,7 +109,7 @@ def fit_chart(
         if out_of_range.size < response.size:
             lines.append((label, response))
     words = " ".join(part for part in (caption, "; ".join(remarks) + "." if remarks else "") if part)
-    return angle_chart(time, lines, output, title, words)
+    return angle_chart(time, lines, output, title, words, **options)
 
 
 def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
@@ -118,9 +118,10 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
     Each chart also has the angle of the simulated arm, scaled to the standard deviation that the paper implies.
     """
     charts: list[Figure] = []
-    rows_by_output = printed_runs_by_output(reproduction)
-    for output in (o for o in rows_by_output if o.endswith("1")):
-        rows, last = rows_by_output[output], rows_by_output[output][-1]
+    for output, rows in reproduction.printed_runs_by_output.items():
+        if not output.endswith("1"):
+            continue
+        last = rows[-1]
         caption = page_text("printed_model_caption", table=3 + int(output[-2]), run=last)
         lines = [("simulated arm", last.arm), *((f"printed, p = {r.p}", r.response) for r in rows)]
         title = f"{symbol(output)}: the printed models under the paper's current"
@@ -166,22 +167,20 @@ def derivative_chart(derived: DroppedDerivative, reference: str = "simulated arm
 
 def _fits_chart(
     models: Mapping[str, Candidate], output: str, place: str, reference: str, *, on_validation_run: bool
-) -> list[Figure]:
-    """Return a list with one chart of an angle simulated by several models on one run; empty if the run is absent.
+) -> Figure:
+    """Return a chart of an angle simulated by several models on one run.
 
     The run is the validation run (`on_validation_run`) or the estimation run. `place` is the number of the paper's
     figure.
     """
-    compared = {label: c.validation if on_validation_run else c.estimation for label, c in models.items()}
-    present = [(label, c) for label, c in compared.items() if c is not None]
-    if not present:
-        return []
-    fits = ", ".join(f"{label} {format_bound(c.output_error[output].fit, '.4g')} %" for label, c in present)
+    parts = {label: c.validation if on_validation_run else c.estimation for label, c in models.items()}
+    compared = [(label, part) for label, part in parts.items() if part is not None]
+    fits = ", ".join(f"{label} {format_bound(c.output_error[output].fit, '.4g')} %" for label, c in compared)
     caption = f"Fit: {fits}."
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
         caption += f" {page_text('filtered_rows')}"
     title = f"Figure {place}. {symbol(output)}, {'sine' if on_validation_run else 'square'} input"
-    return [fit_chart(present, output, title, caption, reference)]
+    return fit_chart(compared, output, title, caption, reference)
 
 
 def _comparison_models(stage: Stage) -> dict[str, Candidate]:
@@ -207,7 +206,7 @@ def stage_figures(stage: Stage, reference: str) -> list[Figure]:
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
         number = f"{first + 2}({letter})"
-        figures += _fits_chart(_comparison_models(stage), output, number, reference, on_validation_run=False)
+        figures.append(_fits_chart(_comparison_models(stage), output, number, reference, on_validation_run=False))
     return figures
 
 
@@ -217,11 +216,11 @@ def _place(figure: int, output: str) -> str:
 
 def sine_figures(reproduction: Reproduction) -> list[Figure]:
     """Return the charts that correspond to Figure 10 of the paper: simulations of every angle on the sine run."""
-    figures = []
-    for stage, output in reproduction.angles:
-        models, place = _comparison_models(stage), _place(10, output)
-        figures += _fits_chart(models, output, place, reproduction.reference_label, on_validation_run=True)
-    return figures
+    reference = reproduction.reference_label
+    return [
+        _fits_chart(_comparison_models(stage), output, _place(10, output), reference, on_validation_run=True)
+        for stage, output in reproduction.angles
+    ]
 
 
 def optimizer_comparison_figures(reproduction: Reproduction) -> list[Figure]:
@@ -230,13 +229,11 @@ def optimizer_comparison_figures(reproduction: Reproduction) -> list[Figure]:
     They show the validation run if there is one, otherwise the estimation run.
     """
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
+    reference, validated = reproduction.reference_label, reproduction.sine is not None
     figures = []
     for output, comparison in reproduction.optimizer_comparisons.items():
         models = {names.get(n, n): c for n, c in comparison.models.items() if n != "differential evolution"}
-        has_validation = comparison.models["genetic"].validation is not None
-        figures += _fits_chart(
-            models, output, _place(11, output), reproduction.reference_label, on_validation_run=has_validation
-        )
+        figures.append(_fits_chart(models, output, _place(11, output), reference, on_validation_run=validated))
     return figures
 
 
@@ -297,17 +294,12 @@ def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, f
     ModelError
         If the model has no such output.
     """
-    item = next((e for e in model.equations if e.output == output), None)
-    if item is None:
-        raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
-    orders, coefficients = {"alpha": item.order.constant}, {}
-    for term in item.terms:
-        letter = letter_of(term.name or "")
-        if letter in COEFFICIENT_LETTERS:
-            coefficients[letter] = float(term.coefficient) + 0.0
-        if letter in ORDER_OF:
-            orders[ORDER_OF[letter]] = term.order.constant
-    return orders, coefficients
+    check_known("output", [output], model.outputs)
+    item = next(e for e in model.equations if e.output == output)
+    terms = {letter_of(term.name or ""): term for term in item.terms}
+    orders = {ORDER_OF[letter]: term.order.constant for letter, term in terms.items() if letter in ORDER_OF}
+    coefficients = {n: float(term.coefficient) + 0.0 for n, term in terms.items() if n in COEFFICIENT_LETTERS}
+    return {"alpha": item.order.constant, **orders}, coefficients
 
 
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
@@ -486,14 +478,6 @@ def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
     return make_table("as_printed", groups, table=3 + stage.number, settings=settings, scales=scales)
 
 
-def printed_runs_by_output(reproduction: Reproduction) -> dict[str, list[printed.PrintedModelRun]]:
-    """Return the simulations of the models printed in the paper, by angle."""
-    rows: dict[str, list[printed.PrintedModelRun]] = {}
-    for row in reproduction.printed_model_runs:
-        rows.setdefault(row.output, []).append(row)
-    return rows
-
-
 def printed_runs_table(reproduction: Reproduction) -> Table:
     """Return a table on simulations of the models printed in the paper: unstable poles, standard deviations, refits."""
 
@@ -502,7 +486,7 @@ def printed_runs_table(reproduction: Reproduction) -> Table:
         refits = map(r.returned_a.get, printed.PRIOR_COVARIANCES)
         return [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, r.row.a, *refits]
 
-    return make_table("printed_models", {o: map(cells, r) for o, r in printed_runs_by_output(reproduction).items()})
+    return make_table("printed_models", {o: map(cells, r) for o, r in reproduction.printed_runs_by_output.items()})
 
 
 def case_tables(reproduction: Reproduction) -> list[Table]:

@@ -6,14 +6,14 @@ import json
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ftlm.data.run import Run
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import ModelError
 from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolution, load_pygad
 from ftlm.model.model import Model
 from ftlm.order_search.options import OrderGrid
@@ -22,14 +22,21 @@ from ftlm.reproduction import stage as computation
 from ftlm.reproduction.checks import Check, checks
 from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, page_text, run_printed_models
 from ftlm.reproduction.report import reproduction_page
-from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
+from ftlm.reproduction.simulated_arm import (
+    MAIN_ARM,
+    STAGE_NUMBERS,
+    StageNumber,
+    demo_run,
+    other_arms,
+    stages_of,
+    truth_of,
+)
 from ftlm.reproduction.stage import Cases, OptimizerComparison, Preset, Stage, StageWork
 from ftlm.reproduction.workload import COMPARISON_INCREMENT, TotalProgress, WorkerProgress, seconds_of_all
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
-from ftlm.utils.parameters import Placeholder, parameter, setting
-from ftlm.utils.resources import estimate_duration
-from ftlm.utils.validation import check_integer, check_threads, join_names, nearest, real_number
+from ftlm.utils.resources import estimate_duration, interruptible_pool
+from ftlm.utils.validation import check_threads, real_number
 
 #: Label in verdicts for the arm of measured runs.
 MEASURED_LABEL = "as measured"
@@ -37,8 +44,6 @@ MEASURED_LABEL = "as measured"
 ALWAYS_SAVED = ("square.csv", "sine.csv", "tables.json")
 #: Duration of each wait for the workers, after which Ctrl-C can take effect [s].
 INTERRUPT_POLL_S = 0.1
-#: Maximum number of simulated records of one arm.
-MAX_RECORDS = 1000
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,11 @@ class Reproduction:
     def angles(self) -> list[tuple[Stage, str]]:
         """Pairs (results of a joint, name of one of its angles) for all angles."""
         return [(stage, output) for stage in self.stages.values() for output in stage.outputs]
+
+    @property
+    def printed_runs_by_output(self) -> dict[str, list[PrintedModelRun]]:
+        """Simulations of the models printed in the paper, by angle."""
+        return {o: [run for run in self.printed_model_runs if run.output == o] for _, o in self.angles}
 
     @property
     def optimizer_comparisons(self) -> dict[str, OptimizerComparison]:
@@ -247,7 +257,7 @@ def reproduce(
             "genetic: the order grid and the norm are those of the comparison; leave order_grid and norm out"
         )
     simulated = square is None
-    others, grid = _other_arms(arms, records), OrderGrid(increment=increment, alpha=computation.GRID_ALPHA)
+    others, grid = other_arms(arms, records), OrderGrid(increment=increment, alpha=computation.GRID_ALPHA)
     for each in (increment, real_number("comparison_increment", comparison_increment)):
         replace(grid, increment=each).values(computation.published_structure(1))
     if square is None and sine is not None:
@@ -288,13 +298,10 @@ def reproduce(
 
     jobs: list[Job] = [partial(compute_stage, n) for n in numbers]
     jobs += [partial(compute_cases, a, n) for a in ([MAIN_ARM, *others] if simulated else []) for n in numbers]
-    whole = StageOutcome(notes=tuple(omitted))
-    for outcome in run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress):
-        whole += outcome
-    notes = tuple(dict.fromkeys(whole.notes))
-    return Reproduction(
-        square, sine, simulated, whole.stages, grid, notes, whole.cases, whole.printed_model_runs, whole.as_printed
-    )
+    outcomes = run_jobs(jobs, 1 if threads == 1 else len(STAGE_NUMBERS), seconds, progress)
+    whole = sum(outcomes, StageOutcome(notes=tuple(omitted)))
+    results = {**vars(whole), "notes": tuple(dict.fromkeys(whole.notes))}
+    return Reproduction(square, sine, simulated, order_grid=grid, **results)
 
 
 @dataclass(frozen=True)
@@ -312,32 +319,13 @@ class StageOutcome:
     notes: tuple[str, ...] = ()
 
     def __add__(self, other: StageOutcome) -> StageOutcome:
-        stages, tables = {**self.stages, **other.stages}, {**self.as_printed, **other.as_printed}
-        return StageOutcome(
-            self.cases + other.cases,
-            stages,
-            self.printed_model_runs + other.printed_model_runs,
-            tables,
-            self.notes + other.notes,
-        )
+        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        sums: list[Any] = [{**a, **b} if isinstance(a, dict) else a + b for a, b in pairs]
+        return StageOutcome(*sums)
 
 
 #: Job of a worker thread, a function of the progress to which it reports.
 Job = Callable[[WorkerProgress], StageOutcome]
-
-
-def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
-    """Return the names of the simulated arms other than the main one, by default all.
-
-    Raise ModelError if a name is unknown or `records` is out of range.
-    """
-    if isinstance(arms, str):
-        raise ModelError(f"{setting('arms')} {arms!r} is a text; give a list of names, such as [{arms!r}]")
-    for name in arms or ():
-        if name not in ARM_VARIANTS:
-            raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
-    check_integer("records", records, 1, MAX_RECORDS)
-    return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 
 def run_jobs(
@@ -356,49 +344,16 @@ def run_jobs(
         steps.begin(0.0)
         return result
 
-    if workers == 1:
-        ended = [done_by(job) for job in jobs]
-    else:
-        with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
-            under_way = [pool.submit(done_by, job) for job in jobs]
-            try:
-                finished: set[Future[StageOutcome]] = set()
-                # On some systems Ctrl-C does not interrupt a wait without a timeout.
-                while len(finished) < len(jobs) and not any(f.exception() for f in finished):
-                    finished, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
-            finally:
-                stop.set()
-                for future in under_way:
-                    future.cancel()
-            # After a failure the other jobs raise KeyboardInterrupt, so only finished jobs are read.
-            ended = [f.result() for f in under_way if f in finished]
+    finished: set[Future[StageOutcome]] = set()
+    with interruptible_pool(workers) as pool:
+        under_way = [pool.submit(done_by, job) for job in jobs]
+        try:
+            # On some systems Ctrl-C does not interrupt a wait without a timeout.
+            while len(finished) < len(jobs):
+                finished, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
+                # After a failure the other jobs raise KeyboardInterrupt, so only finished jobs are read.
+                ended = [future.result() for future in under_way if future in finished]
+        finally:
+            stop.set()
     whole.end()
     return ended
-
-
-def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
-    """Return the numbers of the joints (stages) for which the square run contains all signals.
-
-    Raises
-    ------
-    DataError
-        If there is no such joint, or the sine run lacks a signal of one.
-    """
-    signals_by_stage = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGE_NUMBERS}
-    stages = [n for n, names in signals_by_stage.items() if all(s in square.signals for s in names)]
-    if not stages:
-        listed = ", ".join(square.signals)
-        raise DataError(
-            f"run {square.name!r} has signals {listed}; a stage of the arm needs I1, theta11 and theta12, or I2, "
-            f"theta21 and theta22: name its columns with {parameter('columns')}, or "
-            f"{parameter('inputs', {'I1': Placeholder('COLUMN')})} "
-            f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
-        )
-    if sine is not None:
-        lacking = [s for n in stages for s in signals_by_stage[n] if s not in sine.signals]
-        if lacking:
-            raise DataError(
-                f"the sine run, {sine.name!r}, lacks {', '.join(lacking)}, which the square run, {square.name!r}, has; "
-                "both runs need the same names"
-            )
-    return stages

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -9,11 +10,12 @@ import numpy as np
 
 from ftlm.arm.flexible_link import Form, link_model
 from ftlm.data.run import Run
-from ftlm.errors import ModelError
+from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.arm_parameters import PARAMETER_SETS, ArmParameters, StageParameters
 from ftlm.rig.recording import record
-from ftlm.utils.parameters import setting
+from ftlm.utils.parameters import Placeholder, parameter, setting
+from ftlm.utils.validation import check_integer, join_names, nearest
 
 StageNumber = Literal[1, 2]
 STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
@@ -25,6 +27,8 @@ CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
 DEMO_PARAMETERS = ArmParameters.load("linear")
 #: Parameters of the manufacturer's arm, with fractional damping and friction.
 EFFECTIVE_PARAMETERS = PARAMETER_SETS["effective"]
+#: Maximum number of simulated records of one arm.
+MAX_RECORDS = 1000
 #: Default seed of the noise on the angles.
 DEFAULT_SEED = 1
 
@@ -59,6 +63,64 @@ PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 def letter_of(name: str) -> str:
     """Return the name of an order or coefficient without its index, such as alpha for alpha1."""
     return name.rstrip("0123456789")
+
+
+def signals_of(stage: StageNumber, *, current: bool = True) -> list[str]:
+    """Return the names of the signals of one joint: its motor current, if `current`, and its two angles."""
+    return [*[f"I{stage}"] * current, f"theta{stage}1", f"theta{stage}2"]
+
+
+def stages_with(runs: Sequence[Run], *, current: bool) -> list[StageNumber]:
+    """Return the numbers of the joints (stages) of which every run contains all signals; see :func:`signals_of`.
+
+    Raises
+    ------
+    DataError
+        If there is no such joint.
+    """
+    needed = {n: signals_of(n, current=current) for n in STAGE_NUMBERS}
+    stages = [n for n, names in needed.items() if all(s in run.signals for run in runs for s in names)]
+    if not stages:
+        have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
+        inputs = f"{parameter('inputs', {'I1': Placeholder('COLUMN')})} " if current else ""
+        raise DataError(
+            f"no stage of the arm has all of its signals in every run ({have}); a stage of the arm needs "
+            f"{', or '.join(map(join_names, needed.values()))}: name its columns with {parameter('columns')}, or "
+            f"{inputs}{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
+        )
+    return stages
+
+
+def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
+    """Return the numbers of the joints (stages) for which the square run contains all signals.
+
+    Raises
+    ------
+    DataError
+        If there is no such joint, or the sine run lacks a signal of one.
+    """
+    stages = stages_with([square], current=True)
+    lacking = [s for n in stages for s in signals_of(n) if sine is not None and s not in sine.signals]
+    if sine is not None and lacking:
+        raise DataError(
+            f"the sine run, {sine.name!r}, lacks {', '.join(lacking)}, which the square run, {square.name!r}, has; "
+            "both runs need the same names"
+        )
+    return stages
+
+
+def other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
+    """Return the names of the simulated arms other than the main one, by default all.
+
+    Raise ModelError if a name is unknown or `records` is out of range.
+    """
+    if isinstance(arms, str):
+        raise ModelError(f"{setting('arms')} {arms!r} is a text; give a list of names, such as [{arms!r}]")
+    for name in arms or ():
+        if name not in ARM_VARIANTS:
+            raise ModelError(f"arm {name!r} is not known{nearest(name, ARM_VARIANTS)}; use {join_names(ARM_VARIANTS)}")
+    check_integer("records", records, 1, MAX_RECORDS)
+    return [name for name in (ARM_VARIANTS if arms is None else dict.fromkeys(arms)) if name != MAIN_ARM]
 
 
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:

@@ -20,17 +20,23 @@ from ftlm.data.run import Run
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.cost_surface import output_error_landscape
 from ftlm.estimation.estimators import estimate_output_error
-from ftlm.estimation.fit import ProgressCallback
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.genetic import GeneticAlgorithm, GeneticRun, differential_evolution_search, genetic_search
 from ftlm.estimation.identify import assess_fit, identify
 from ftlm.estimation.linear import MultiInnovationTrace, multi_innovation_trace
-from ftlm.estimation.methods import EstimationMethod, InstrumentalVariables, OutputError, method_with_options
+from ftlm.estimation.methods import (
+    EstimationMethod,
+    InstrumentalVariables,
+    LeastSquares,
+    MultiInnovation,
+    OrderSearchMethod,
+    OutputError,
+)
 from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import improves_prediction, is_degenerate
 from ftlm.kernels import pulse_means
 from ftlm.model.model import Model
-from ftlm.order_search.options import OrderGrid
+from ftlm.order_search.options import OrderGrid, restrict_order_grid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
@@ -60,6 +66,8 @@ CONVERGENCE_MARGIN = 0.02
 ROW_STRIDE = 4
 #: Method of joint fits (of both equations of a joint): output error with squared residuals and white noise.
 JOINT_METHOD = OutputError(loss="squares", intervals="auto", noise="white")
+#: Method of joint fits of the published equations, of which only standard errors are used.
+PUBLISHED_METHOD = replace(JOINT_METHOD, intervals="quadratic")
 #: Increment of the order grids with which claims on the innovation length are tested (:class:`Trial`).
 TRIAL_INCREMENT = 0.25
 #: Radius [increments] of the search by instrumental variables around the orders of least squares. It is small because
@@ -287,7 +295,7 @@ def compare_optimizers(
     work: dict[str, Any] = {"threads": threads, "progress": progress}
     searches = {k: printed.best_orders(run, single, order_grid, LAST_P, k, **work) for k in PRIOR_COVARIANCES}
     count = searches[PRIOR_COVARIANCES[0]].candidates
-    settings = optimizer or GeneticAlgorithm(seeds=seeds_for(count))
+    settings = optimizer or GeneticAlgorithm(seeds=seeds_for(count), population=200, norm="l1")
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
     records = prepare([run], single, None, power_of_two=True)
@@ -483,38 +491,12 @@ def traces_of(
 
     `prior` is the prior covariance, and `every` the number of recursion steps between two stored values.
     """
-    options: dict[str, Any] = {"prior_covariance": prior, "row_basis": "haar", "every": every}
+    options = {"prior_covariance": prior, "every": every, **printed.RECURSION_OPTIONS}
     traces = {}
     for p, model in models.items():
         structure = single.with_orders({n: model.orders[n] for n in single.order_names})
         traces[p] = multi_innovation_trace(run, structure, innovation_length=p, **options)
     return traces
-
-
-def compare_orders(
-    stage: StageNumber, square: Run, arm: str, *, validation: Run, threads: int | None, progress: ProgressCallback
-) -> OrderComparison:
-    """Fit a joint of a simulated arm with integer and with free orders, and compare both fits on a validation run.
-
-    The estimation run `square` starts at rest and is decimated for the fits.
-
-    Raises
-    ------
-    ConvergenceError
-        If no initial guess of one of the fits converges.
-    """
-    arm_structure = flexible_link(stage=stage, form="lagrange", coupling="simulated", parameters="effective")
-    structure = replace(arm_structure, initial="rest")
-    own, other = (run.select(list(structure.signals)) for run in (square, validation))
-    run = decimate_run(own, ROW_STRIDE)
-    m, candidates = default_m([own], power_of_two=True), []
-    for item in (integer_orders(structure), structure):
-        # Coefficients of fits with integer orders may overflow on an arm with fractional orders.
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            fit = identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
-        model = replace(fit.model, m=m)
-        candidates.append(Candidate(model, compare_means(model, own), compare_means(model, other), {}, fit))
-    return OrderComparison.of(arm, stage, *candidates)
 
 
 def cases_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Cases:
@@ -556,25 +538,18 @@ def simulated_cases(
     Comparisons of optimizers and of orders use only the first record. They are omitted for the main arm, because
     :func:`cases_of` returns them.
     """
-    cases, structure = Cases(), published_structure(stage)
-    execution_options: dict[str, Any] = {"threads": preset.threads, "progress": progress}
+    cases = Cases()
     for seed in seeds:
         recording = partial(demo_run, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm])
-        run, validation = recording("square"), recording("sine")
+        square, sine = map(recording, ("square", "sine"))
+        work = StageWork(stage, square, sine, preset, lambda _: None, progress, simulated=True)
         progress.begin(preset.seconds_of("trials"))
-        cases += Cases(tuple(trials_of(stage, run, arm, seed, preset.threads)))
-        if arm == MAIN_ARM or seed != seeds[0]:
-            continue
-        own, grid = run.select(list(structure.signals)), preset.comparison_order_grid
-        if grid is not None:
-            for output in structure.outputs:
-                progress.begin(preset.seconds_of("optimizers"))
-                comparison = compare_optimizers(
-                    own, structure.equation(output), grid, preset.genetic, **execution_options
-                )
-                cases += Cases(optimizer_errors=(OptimizerErrors.of(arm, output, comparison),))
-        progress.begin(preset.seconds_of("order comparison"))
-        cases += Cases(order_comparisons=(compare_orders(stage, run, arm, validation=validation, **execution_options),))
+        cases += Cases(tuple(trials_of(stage, square, arm, seed, preset.threads)))
+        if arm != MAIN_ARM and seed == seeds[0]:
+            comparisons = work.compare_optimizers().items()
+            progress.begin(preset.seconds_of("order comparison"))
+            errors = tuple(OptimizerErrors.of(arm, o, comparison) for o, comparison in comparisons)
+            cases += Cases((), errors, (work.compare_orders(arm),))
     return cases
 
 
@@ -624,12 +599,12 @@ class StageWork:
         exact = self.manual()
         candidates = {"integer, Euler": self.euler_candidate(exact), "integer, exact": exact}
         whole = integer_orders(self.coupled)
-        candidates["integer, identified"] = self.best("integer, identified", whole, "integer orders", "integer orders")
+        candidates["integer, identified"] = self.joint("integer, identified", whole, "integer orders", "integer orders")
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
-        joint = candidates["output error"] = self.best("output error", self.coupled, "free orders")
+        joint = candidates["output error"] = self.joint("output error", self.coupled, "free orders")
         label = "published, output error"
-        candidates[label] = self.best(label, self.published, "free orders, (22)–(25)", "published", joint.model)
+        candidates[label] = self.joint(label, self.published, "free orders, (22)–(25)", "published", joint.model)
         self.begin("convergence", "traces")
         traces, weak_prior_traces = Traces(), Traces()
         if self.measured.initial == "rest":
@@ -647,10 +622,12 @@ class StageWork:
         near = self.printed_orders()
         return Stage(self.number, candidates, traces, weak_prior_traces, comparisons, near, derived, landscape)
 
-    def candidate(self, model: Model, result: Identification | None = None) -> Candidate:
+    def candidate(self, found: Model | Identification) -> Candidate:
         """Return a model with its errors on both runs; a coupled model is also simulated from the currents alone."""
+        result = found if isinstance(found, Identification) else None
         # The error of the paper is a sum over its block pulses, so its value depends on their number.
-        model = replace(model, m=default_m([self.estimation_run], power_of_two=True))
+        m = default_m([self.estimation_run], power_of_two=True)
+        model = replace(found.model if isinstance(found, Identification) else found, m=m)
         runs = [run for run in (self.estimation_run, self.validation_run) if run is not None]
         estimation, *validation = (compare_means(model, run) for run in runs)
         alone = {}
@@ -661,8 +638,7 @@ class StageWork:
 
     def identify_candidate(self, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD) -> Candidate:
         """Identify a model from a run, by default by output error, and return it with its errors on both runs."""
-        result = identify(run, structure, method=method, **self.execution_options)
-        return self.candidate(result.model, result)
+        return self.candidate(identify(run, structure, method=method, **self.execution_options))
 
     def manual(self) -> Candidate:
         """Return the integer-order model of the manufacturer's manual, with its errors on both runs."""
@@ -678,43 +654,38 @@ class StageWork:
             errors = alone[run.name] = {n: metrics(by_pulses.measured[n][0], mean) for n, mean in means.items()}
             simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, by_pulses.equation_error, errors)]
             compared.append(replace(by_pulses, simulated=simulated, output_error=errors, per_run=parts, findings=()))
-        estimation, validation = compared[0], compared[1] if exact.validation is not None else None
-        return replace(exact, estimation=estimation, validation=validation, input_driven=alone)
+        estimation, *validation = compared
+        return replace(exact, estimation=estimation, validation=next(iter(validation), None), input_driven=alone)
 
     def searches(self) -> dict[str, Candidate]:
         """Return the best models on the order grid, by label: multi-innovation with each p, and least squares.
 
         p is the innovation length.
         """
-        recursion = {"coefficients": "multi-innovation", "prior_covariance": PRIOR_COVARIANCES[0]}
-        kinds: dict[str, dict[str, Any]] = {
-            **{f"p = {p}": {"innovation_length": p, **recursion} for p in INNOVATION_LENGTHS},
-            "least squares": {"coefficients": "least-squares"},
+        shared = {"order_grid": self.preset.order_grid, "top": self.preset.top or 1, **printed.SEARCH_OPTIONS}
+        recursion = {"prior_covariance": PRIOR_COVARIANCES[0], **printed.RECURSION_OPTIONS, **shared}
+        methods: dict[str, OrderSearchMethod] = {
+            f"p = {p}": MultiInnovation(innovation_length=p, **recursion) for p in INNOVATION_LENGTHS
         }
-        candidates, grid, top = {}, self.preset.order_grid, self.preset.top
-        for label, options in kinds.items():
+        methods["least squares"] = LeastSquares(**shared)
+        candidates = {}
+        for label, method in methods.items():
             self.begin(f"orders on the grid, {label}", "search")
-            if top is None:
-                candidates[label] = self.search_candidate(label, grid, **options)
+            if self.preset.top is None:
+                candidates[label] = self.search_candidate(label, method)
             else:
-                method = method_with_options(options.pop("coefficients"), {"order_grid": grid, "top": top, **options})
                 candidates[label] = self.identify_candidate(self.estimation_run, self.measured, method)
         return candidates
 
-    def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
-        """Return the model with the best orders of each equation on an order grid, without standard errors.
-
-        `options` are options of the order search.
-        """
+    def search_candidate(self, label: str, method: OrderSearchMethod) -> Candidate:
+        """Return the model with the best orders of each equation by a method, without standard errors."""
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
         for single in map(self.measured.equation, self.measured.outputs):
-            own = replace(order_grid, orders={n: v for n, v in order_grid.orders.items() if n in single.order_names})
-            best = self._best_orders(single, own, {**printed.SEARCH_OPTIONS, **options})
+            best = self._best_orders(single, method)
             orders |= best.orders
             coefficients |= best.coefficients
-        structure = self.measured.with_orders(orders).with_coefficients(coefficients)
-        run = self.estimation_run
+        structure, run = self.measured.with_orders(orders).with_coefficients(coefficients), self.estimation_run
         about = {"origin": label, "run": run.name}
         return self.candidate(Model(structure, orders=orders, units=run.units, about=about))
 
@@ -722,25 +693,29 @@ class StageWork:
         """Return the model with least-squares coefficients at the orders that the paper prints for p = 7."""
         axes = {n: [v] for n, v in printed.printed_numbers(self.number, LAST_P)[0].items()}
         grid = replace(self.preset.order_grid, orders=axes)
-        return self.search_candidate("printed orders", grid, coefficients="least-squares")
+        return self.search_candidate("printed orders", LeastSquares(order_grid=grid, top=1, **printed.SEARCH_OPTIONS))
 
-    def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
+    def _best_orders(self, single: Structure, method: OrderSearchMethod) -> SearchResult:
         """Return the result of an order search of one equation, whose first row is the best candidate.
 
         With prior covariance 1 the simulated deflection is nearly zero. All candidates then have errors close to that
         of a zero output, so no candidate can be excluded by a bound on its error. The fine grid is therefore searched
         only around the best candidate of a coarser grid.
         """
-        run, search_options = self.estimation_run, {**self.execution_options, **options}
+        grid = restrict_order_grid(method.order_grid, single)
+
+        def search(order_grid: OrderGrid, **changes: int) -> SearchResult:
+            options = {**self.execution_options, **vars(method.settings()), **changes}
+            return rank_orders(self.estimation_run, single, order_grid, **options)
+
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
-        is_expensive = own_terms > 1 and options["coefficients"] == "multi-innovation"
-        if not (is_expensive and own.increment < COARSE_INCREMENT and not own.orders):
-            return rank_orders(run, single, own, top=1, **search_options)
-        values, ends, radius = own.values(single), [], 2 * COARSE_INCREMENT - 1e-9
-        coarse = replace(own, increment=COARSE_INCREMENT)
-        for row in rank_orders(run, single, coarse, top=REFINED_CANDIDATES, **search_options).table:
+        is_expensive = own_terms > 1 and isinstance(method, MultiInnovation)
+        if not (is_expensive and grid.increment < COARSE_INCREMENT and not grid.orders):
+            return search(grid)
+        values, ends, radius = grid.values(single), [], 2 * COARSE_INCREMENT - 1e-9
+        for row in search(replace(grid, increment=COARSE_INCREMENT), top=REFINED_CANDIDATES).table:
             near = {n: [v for v in values[n] if abs(v - at) < radius] for n, at in row.orders.items()}
-            ends.append(rank_orders(run, single, replace(own, orders=near), top=1, **search_options))
+            ends.append(search(replace(grid, orders=near)))
         return min(ends, key=attrgetter("score"))
 
     def instrumental(self, start: Candidate) -> Candidate:
@@ -751,18 +726,20 @@ class StageWork:
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
             near = printed.neighboring_values(value, grid.increment, steps)
             axes[name] = [v for v in near if 0 <= v <= grid.alpha[1]]
-        method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=1)
+        method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=1, **printed.SEARCH_OPTIONS)
         return self.identify_candidate(self.estimation_run, self.measured, method)
 
     def joint(
-        self, structure: Structure, words: str, step: str = "output error", near: Model | None = None
+        self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Return a model of both equations fitted by output error, with its errors on both runs.
+        """Return a model of both equations fitted by output error from the current alone, with its errors on both runs.
 
-        A long run is decimated first. `words` describe the step in the log, and `step` gives its expected time. `near`
-        is a model by eqs. (14)-(15) of the paper whose parameters give the initial guess for eqs. (22)-(25).
+        If no fit converges, a model with measured coupling is fitted, in which the measured other angle is an input of
+        each equation, and a note is added. A long run is decimated first. `what` describes the step in the log, and
+        `step` gives its expected time. `near` is a model by eqs. (14)-(15) of the paper whose parameters give the
+        initial guess for eqs. (22)-(25).
         """
-        self.begin(words, step)
+        self.begin(f"{what}, by output error", step)
         run = self.estimation_run
         if step == "integer orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
             run = decimate_run(run, run.length // INTEGER_FIT_SAMPLES)
@@ -770,36 +747,44 @@ class StageWork:
             every = -(-run.length // DECIMATED_SAMPLES)
             self.notes.append(page_text("decimated", run=run, every=every, step=every * run.step))
             run = decimate_run(run, every)
+        try:
+            return self.fit_jointly(run, structure, near)
+        except ConvergenceError as error:
+            self.notes.append(page_text("measured_coupling", stage=self.number, label=label, error=error))
+        return self.fit_jointly(run, replace(structure, coupling="measured"), near)
+
+    def fit_jointly(self, run: Run, structure: Structure, near: Model | None) -> Candidate:
+        """Return a model of both equations fitted by output error to a run; `near` is as in `joint`."""
         if near is None:
             return self.identify_candidate(run, structure)
         # Only standard errors of the published form are used. From automatic initial guesses, rounding decides which
         # optimum is found. The parameters of (14)-(15) lead to the optimum whose residuals are the noise.
         guess = self.published_values(near)
         if self.simulated:
-            task, options = Task((run,), structure), (None, check_threads(self.preset.threads), self.progress)
-            fit = estimate_output_error(task, *options, intervals="quadratic", begin=guess, single_start=True)
-            result = assess_fit(fit)
-            return self.candidate(result.model, result)
+            task, threads = Task((run,), structure), check_threads(self.preset.threads)
+            method: dict[str, Any] = {"loss": PUBLISHED_METHOD.loss, "intervals": PUBLISHED_METHOD.intervals}
+            options = {"begin": guess, "single_start": True, **method}
+            fit = estimate_output_error(task, None, threads, self.progress, **options)
+            return self.candidate(assess_fit(fit))
         try:
-            return self.identify_candidate(run, structure, OutputError(intervals="quadratic", start=guess))
+            return self.identify_candidate(run, structure, replace(PUBLISHED_METHOD, start=guess))
         except ModelError:
             # The initial guess is outside the parameter bounds of (22)-(25).
-            return self.identify_candidate(run, structure, OutputError(intervals="quadratic"))
+            return self.identify_candidate(run, structure, PUBLISHED_METHOD)
 
-    def best(
-        self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
-    ) -> Candidate:
-        """Return a model of both equations fitted by output error from the current alone; arguments as in `joint`.
+    def compare_orders(self, arm: str) -> OrderComparison:
+        """Fit the joint with integer and with free orders, and compare both fits on the validation run.
 
-        If no fit converges, a model with measured coupling is fitted, in which the measured other angle is an input of
-        each equation, and a note is added.
+        The runs are simulated with the arm of this name. The estimation run is decimated for the fits. Raise
+        ConvergenceError if no initial guess of one of the fits converges.
         """
-        words = f"{what}, by output error"
-        try:
-            return self.joint(structure, words, step, near)
-        except ConvergenceError as error:
-            self.notes.append(page_text("measured_coupling", stage=self.number, label=label, error=error))
-        return self.joint(replace(structure, coupling="measured"), words, step, near)
+        structure = flexible_link(stage=self.number, form="lagrange", coupling="simulated", parameters="effective")
+        structure, candidates = replace(structure, initial="rest"), []
+        for item in (integer_orders(structure), structure):
+            # Coefficients of fits with integer orders may overflow on an arm with fractional orders.
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                candidates.append(self.identify_candidate(decimate_run(self.estimation_run, ROW_STRIDE), item))
+        return OrderComparison.of(arm, self.number, *candidates)
 
     def traces(self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]) -> Traces:
         """Return the convergence of multi-innovation by output and innovation length p, at the orders of `models`."""

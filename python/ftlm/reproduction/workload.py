@@ -47,19 +47,16 @@ def seconds_of(step: str, increment: float, comparison_increment: float | None =
     The time of an order search is proportional to the inverse fourth power of the increment. `comparison_increment` is
     the increment of the optimizer comparison; None without one.
     """
-    scale = 1.0
+    seconds = STEP_COSTS[step][0]
     if step == "search":
-        scale = (0.05 / increment) ** 4
-    elif step == "optimizers":
-        candidates = 0
-        if comparison_increment is not None:
-            candidates = round(
-                COMPARISON_CANDIDATES * (COMPARISON_INCREMENT / max(increment, comparison_increment)) ** 4
-            )
-        scale = (
-            candidates * len(seeds_for(candidates)) / (COMPARISON_CANDIDATES * len(seeds_for(COMPARISON_CANDIDATES)))
-        )
-    return STEP_COSTS[step][0] * scale
+        return seconds * (0.05 / increment) ** 4
+    if step != "optimizers":
+        return seconds
+    if comparison_increment is None:
+        return 0.0
+    scale = (COMPARISON_INCREMENT / max(increment, comparison_increment)) ** 4
+    candidates = round(COMPARISON_CANDIDATES * scale)
+    return seconds * candidates * len(seeds_for(candidates)) / (COMPARISON_CANDIDATES * MAX_SEEDS)
 
 
 def seconds_of_all(
