@@ -1,7 +1,7 @@
 """Verdicts of the reproduction: their rule, the other optimizers, the printed models simulated, the paper's tables."""
 
 import threading
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -353,6 +353,20 @@ def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
         assert mine < 1.01 * every.score
         if output == "theta11":
             assert {n: found.model.orders[n] for n in every.orders} == every.orders
+
+
+def test_searches_name_every_option_so_that_no_later_default_changes_a_table(monkeypatch):
+    named = []
+    for kind in (ftlm.MultiInnovation, ftlm.LeastSquares):
+        monkeypatch.setattr(
+            f"ftlm.reproduction.stage.{kind.__name__}", lambda kind=kind, **options: named.append((kind, options))
+        )
+    monkeypatch.setattr("ftlm.reproduction.stage.StageWork.search_candidate", lambda *_: None)
+    preset = Preset(ftlm.OrderGrid(increment=0.25), threads=1)
+    StageWork(1, demo_run("square"), None, preset, lambda _: None, silent_progress()).searches()
+    assert [kind.name for kind, _ in named] == ["multi-innovation"] * 4 + ["least-squares"]
+    for kind, options in named:
+        assert options.keys() >= {option.name for option in fields(kind) if option.default is not None}
 
 
 def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):

@@ -32,7 +32,7 @@ from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS, OrderGrid
 from ftlm.order_search.result import SearchResult
 from ftlm.order_search.search import rank_orders
 from ftlm.plot.comparison_charts import pulse_times
-from ftlm.reproduction.simulated_arm import ANGLE_NAMES, PAPERS_ARM, StageNumber, demo_run
+from ftlm.reproduction.simulated_arm import ANGLE_NAMES, PAPERS_ARM, StageNumber, demo_run, signals_of
 from ftlm.simulation.discretization import record, sensor_series
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import Order
@@ -566,7 +566,7 @@ def one_angle(output: str, p: int) -> Model:
 
 def papers_current(stage: StageNumber) -> Run:
     """Return a run whose input is the paper's square current of one joint; its simulated angles are not used."""
-    return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
+    return demo_run("square", noise=0.0).select(signals_of(stage))
 
 
 def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,8 +22,11 @@ StageNumber = Literal[1, 2]
 STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
 #: Angles of the arm, in the order of the paper's indices n = 1 … 4.
 ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
-#: Amplitudes [A] of the paper's motor currents, by shape of the signal.
-CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
+#: Amplitude [A] and period [s] of the paper's motor currents, by shape of the signal.
+PAPER_CURRENTS: dict[str, dict[str, float]] = {
+    "square": {"amplitude": 0.3, "period": 2.0},
+    "sine": {"amplitude": 0.6, "period": 2 * math.pi / 6.3},
+}
 #: Parameters of the demonstration's arm: the manufacturer's effective coefficients, fractional damping, no friction.
 DEMO_PARAMETERS = ArmParameters.load("linear")
 #: Parameters of the manufacturer's arm, with fractional damping and friction.
@@ -82,10 +86,11 @@ def stages_with(runs: Sequence[Run], *, current: bool) -> list[StageNumber]:
     stages = [n for n, names in needed.items() if all(s in run.signals for run in runs for s in names)]
     if not stages:
         have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
+        wanted = ", or ".join(" and ".join(", ".join(names).rsplit(", ", 1)) for names in needed.values())
         inputs = f"{parameter('inputs', {'I1': Placeholder('COLUMN')})} " if current else ""
         raise DataError(
-            f"no stage of the arm has all of its signals in every run ({have}); a stage of the arm needs "
-            f"{', or '.join(map(join_names, needed.values()))}: name its columns with {parameter('columns')}, or "
+            f"no stage of the arm has all of its signals in every run ({have}); a stage of the arm needs {wanted}: "
+            f"name its columns with {parameter('columns')}, or "
             f"{inputs}{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
     return stages
@@ -204,13 +209,11 @@ def demo_run(
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ModelError(f"{setting('noise')} {noise} rad is not a standard deviation; give a number of at least 0")
-    if shape not in CURRENT_AMPLITUDES_A:
+    if shape not in PAPER_CURRENTS:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
-    amplitude, rate = CURRENT_AMPLITUDES_A[shape], 1.0 / step
-    recorded = record(
-        input=shape, amplitude=amplitude, duration=duration, limit=duration, rate=rate, seed=seed, parameters=parameters
-    )
-    rng = np.random.default_rng([seed, list(CURRENT_AMPLITUDES_A).index(shape)])
+    timing: dict[str, Any] = {"duration": duration, "limit": duration, "rate": 1.0 / step, **PAPER_CURRENTS[shape]}
+    recorded = record(input=shape, **timing, seed=seed, parameters=parameters)
+    rng = np.random.default_rng([seed, list(PAPER_CURRENTS).index(shape)])
     return Run.from_arrays(
         step=step,
         inputs={name: recorded[name] for name in ("I1", "I2")},

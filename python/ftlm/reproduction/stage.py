@@ -469,7 +469,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
     structure, grid = published_structure(stage), OrderGrid(increment=TRIAL_INCREMENT, alpha=GRID_ALPHA)
     run, trials = square.select(list(structure.signals)), []
     m = default_m([run], power_of_two=True)
-    manual = euler_means(link_model(stage=stage, form="published"), run, m)
+    manual = euler_means(link_model(stage=stage, form="published", parameters="effective"), run, m)
     for output in structure.outputs:
         single, manual_nr = structure.equation(output), metrics(pulse_means(run[output], m), manual[output]).nr
         for prior in PRIOR_COVARIANCES:
@@ -642,7 +642,7 @@ class StageWork:
 
     def manual(self) -> Candidate:
         """Return the integer-order model of the manufacturer's manual, with its errors on both runs."""
-        return self.candidate(link_model(stage=self.number, form="published"))
+        return self.candidate(link_model(stage=self.number, form="published", parameters="effective"))
 
     def euler_candidate(self, exact: Candidate) -> Candidate:
         """Return the candidate `exact` with the errors of simulations by explicit Euler, the method of the paper."""
