@@ -286,7 +286,8 @@ def identify_pieces(
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
     """Raise ModelError if ``offset="auto"`` is not possible: with friction or a checkpoint file.
 
-    With non-linear terms it is only possible with :class:`OutputError`, whose fits with and without offset are compared.
+    With non-linear terms it is only possible with :class:`OutputError`, whose fits with and without offset are
+    compared.
 
     The offset test may require two fits, but the checkpoint file of a method stores only one search.
     """
