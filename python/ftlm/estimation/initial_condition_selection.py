@@ -283,6 +283,9 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
+    if not structure.is_linear and fit.task.structure.offset == "none":
+        # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a level.
+        margin = -START_SETTINGS.history_margin
 
     def is_preferred(joint: JointFit) -> bool:
         return fits_better(joint, best, margin)
