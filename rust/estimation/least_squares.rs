@@ -174,11 +174,14 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], required: usize) -> Result<(V
     independent.retain(|&i| scales[i] > 0.0 && scales[i].is_finite());
     let target_scale = norm(target).max(f64::MIN_POSITIVE);
     loop {
-        let mut scaled: Vec<Vec<f64>> =
-            independent.iter().map(|&i| columns[i].iter().map(|v| v / scales[i]).collect()).collect();
-        scaled.push(target.iter().map(|v| v / target_scale).collect());
-        let r = dense::triangular_factor(&scaled);
-        let stride = scaled.len();
+        let stride = independent.len() + 1;
+        let r = dense::triangular_factor_by_blocks((stride, target.len()), |position, rows, out| {
+            let (column, scale) = match independent.get(position) {
+                Some(&i) => (columns[i].as_slice(), scales[i]),
+                None => (target, target_scale),
+            };
+            out.extend(column[rows].iter().map(|v| v / scale));
+        });
         let dependent = (0..independent.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
         if let Some(position) = dependent {
             if independent[position] < required {

@@ -123,6 +123,11 @@ impl StarredTransform {
         }
     }
 
+    /// Number of frequency bins.
+    pub(crate) fn bins(&self) -> usize {
+        self.logarithms.len()
+    }
+
     /// Return the starred transform Σ f(kh) e^{−skh} of samples f(kh), one value per frequency bin. h is the sampling
     /// interval.
     pub(crate) fn transform(&self, samples: impl Iterator<Item = f64>) -> Vec<Bin> {

@@ -1,5 +1,7 @@
 //! Dense matrices: products, Gram matrices, QR factors and singular values. This is the only module that uses `faer`.
 
+use std::ops::Range;
+
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 
@@ -92,13 +94,35 @@ fn row_blocks(m: usize) -> Vec<(usize, usize)> {
 /// Columns with fewer than k rows are padded with zero rows, which leaves R unchanged.
 #[must_use]
 pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
-    if let Some(factor) = orthogonal::triangular_factor(columns) {
+    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
+    triangular_factor_by_blocks((columns.len(), m), |j, rows, out| {
+        let end = out.len() + rows.len();
+        out.extend_from_slice(columns[j].get(rows.start..rows.end.min(columns[j].len())).unwrap_or_default());
+        out.resize(end, 0.0);
+    })
+}
+
+/// Return the upper-triangular factor R of the QR factorization of k columns with m rows, row-major k × k, without the
+/// columns in memory. O(k²m).
+///
+/// `append_rows(j, rows, out)` appends the elements `rows` of column j to `out`.
+#[must_use]
+pub fn triangular_factor_by_blocks(
+    (k, m): (usize, usize),
+    append_rows: impl Fn(usize, Range<usize>, &mut Vec<f64>),
+) -> Vec<f64> {
+    if let Some(factor) = orthogonal::triangular_factor((k, m), &append_rows) {
         return factor;
     }
     // The squares are out of range, so norms must be scaled.
-    let k = columns.len();
-    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
-    let x = Mat::from_fn(m.max(k), k, |i, j| columns[j].get(i).copied().unwrap_or(0.0));
+    let column = |j: usize| {
+        let mut column = Vec::with_capacity(m.max(k));
+        append_rows(j, 0..m, &mut column);
+        column.resize(m.max(k), 0.0);
+        column
+    };
+    let columns: Vec<Vec<f64>> = (0..k).map(column).collect();
+    let x = Mat::from_fn(m.max(k), k, |i, j| columns[j][i]);
     let qr = x.qr();
     let r = qr.thin_R();
     let mut out = vec![0.0; k * k];

@@ -1,5 +1,7 @@
 //! Orthonormal bases, projections and triangular factors of matrices with long columns, by vector instructions.
 
+use std::ops::Range;
+
 use crate::error::Result;
 use crate::parallel::{self, Stop};
 use crate::simd::{dispatch_simd, dot, SimdKernel};
@@ -54,23 +56,23 @@ impl SimdKernel for Reflections<'_> {
     }
 }
 
-/// Return the upper-triangular QR factor of k columns, row-major k × k, computed by blocks of rows. O(k²m) for m rows.
+/// Return the upper-triangular QR factor of k columns with m rows, row-major k × k, computed by blocks of rows. O(k²m).
 ///
-/// `None` if a squared norm is outside [`MIN_SQUARED_NORM`] to [`MAX_SQUARED_NORM`].
-pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
-    let k = columns.len();
-    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
+/// `append_rows(j, rows, out)` appends the elements `rows` of column j to `out`. The columns are therefore never stored
+/// together. `None` if a squared norm is outside [`MIN_SQUARED_NORM`] to [`MAX_SQUARED_NORM`].
+pub(crate) fn triangular_factor(
+    (k, m): (usize, usize),
+    append_rows: impl Fn(usize, Range<usize>, &mut Vec<f64>),
+) -> Option<Vec<f64>> {
     // The triangle R of the processed rows is on top, and the next rows follow below.
     let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + QR_BLOCK_ROWS.min(m)); k];
     stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
     for from in (0..m).step_by(QR_BLOCK_ROWS) {
-        for (j, (column, source)) in stacked.iter_mut().zip(columns).enumerate() {
+        for (j, column) in stacked.iter_mut().enumerate() {
             // A reflection leaves its vector below the triangle.
             column.truncate(k);
             column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
-            let rows = source.get(from..source.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
-            column.extend_from_slice(rows);
-            column.resize(k + QR_BLOCK_ROWS.min(m - from), 0.0);
+            append_rows(j, from..m.min(from + QR_BLOCK_ROWS), column);
         }
         if !dispatch_simd(Reflections { columns: &mut stacked }) {
             return None;

@@ -1,12 +1,17 @@
 //! Refinement of the step until samples have converged. Each step defines a grid of block pulses. Long records are
-//! simulated by superposition of responses to single samples, and these responses are refined only where they change.
+//! simulated by superposition of responses to single samples. These responses are computed by transforms, or refined
+//! only where they change.
 
 use std::sync::Arc;
 
 use super::initial_terms::{fit_initial_terms, OutputSamples};
 use super::richardson::{add_multiple, combine, peak, relative_change, RichardsonTable, Rows};
 use super::simulation::{Grid, InitialTerms, OutputSimulation, ORDER_TOLERANCE};
+use crate::equation::Equation;
 use crate::error::{check_memory, Error, Kind, Result};
+use crate::estimation::output_error::stability::is_unstable;
+use crate::fft::Bin;
+use crate::fractional::starred_transform::{LaplacePoint, StarredTransform};
 use crate::parallel::Stop;
 use crate::recording::Role;
 use crate::series;
@@ -28,12 +33,17 @@ const FINEST_FULL_GRID: usize = 4;
 /// as unstable, because the sum of responses would lose digits.
 const MAX_GROWTH_RATIO: f64 = 1e3;
 
+/// Bound of the error of responses that are computed by transforms, relative to the largest magnitude of the output.
+const TRANSFORM_ERROR: f64 = 1e-7;
+/// Frequency above which no pole may lie if responses are computed by transforms, relative to the Nyquist frequency.
+const MAX_POLE_FREQUENCY_RATIO: f64 = 0.5;
+
 /// Samples of a simulation, extrapolated to zero step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RefinedSamples {
     /// Samples and initial terms in the limit of zero step.
     pub samples: OutputSamples,
-    /// Number of pulses per sampling interval of the finest grid of block pulses.
+    /// Number of pulses per sampling interval of the finest grid of block pulses; 1 without a grid.
     pub refinement: usize,
     /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
     /// output. It is infinite if fewer than three steps were simulated.
@@ -261,6 +271,66 @@ impl<'a> SampleResponses<'a> {
         OutputSimulation { recording, ..self.simulation.clone() }
     }
 
+    /// Return the responses of [`Self::compute`] without a grid, by the starred transform of each response.
+    ///
+    /// None for coupled equations, sensor filters, and inputs that are delayed or not zero-order holds. None also for
+    /// unstable equations, and for poles that are too close to the Nyquist frequency or above it.
+    fn transform(&self) -> Option<Rows> {
+        let OutputSimulation { recording, equations, .. } = self.simulation;
+        let is_usable = |(signal, _, is_linear): &(usize, Vec<f64>, bool)| {
+            !is_linear && recording.channels()[*signal].delay.unwrap_or(0.0) == 0.0
+        };
+        if recording.filter.is_some()
+            || (recording.is_coupled && equations.len() > 1)
+            || !self.inputs.iter().all(is_usable)
+            || self.units.iter().any(|unit| unit.1 < 0.0)
+            || !equations.iter().all(|equation| has_smooth_aliases(equation, recording.step()))
+        {
+            return None;
+        }
+        let transform = StarredTransform::new(recording.len(), recording.step());
+        let response = |equation: &Equation, start: f64, numerator: &dyn Fn(LaplacePoint) -> Bin| {
+            let spectra = transform.spectra(&[start], |point, values| {
+                let denominator =
+                    terms_of(equation, equation.structure.output).map(|(c, eta)| point.integration(eta) * c);
+                values[0] = numerator(point) / (Bin::from(1.0) - denominator.sum::<Bin>());
+            });
+            spectra.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()
+        };
+        let mut rows = Rows::new();
+        for (signal, ..) in &self.inputs {
+            for equation in equations {
+                let terms: Vec<(f64, f64)> = terms_of(equation, *signal).collect();
+                if *signal == equation.structure.output || terms.is_empty() {
+                    rows.push(vec![0.0; recording.len()]);
+                    continue;
+                }
+                let feedthrough: f64 = terms.iter().filter(|(_, eta)| *eta <= ORDER_TOLERANCE).map(|(c, _)| c).sum();
+                // The transform of a jump has its mean value.
+                let mut row = response(equation, 0.5 * feedthrough, &|point| {
+                    terms.iter().map(|&(c, eta)| point.integration(eta + 1.0) * c).sum()
+                });
+                row[0] = feedthrough;
+                // A sample of a zero-order hold is a step and an opposite step one interval later.
+                (1..row.len()).rev().for_each(|k| row[k] -= row[k - 1]);
+                rows.push(row);
+            }
+        }
+        for &(i, exponent) in &self.units {
+            for (j, equation) in equations.iter().enumerate() {
+                if i == j {
+                    let gain = libm::tgamma(exponent + 1.0);
+                    let mut row = response(equation, 0.0, &|point| point.integration(exponent + 1.0) * gain);
+                    row[0] = f64::from(u8::from(exponent == 0.0));
+                    rows.push(row);
+                } else {
+                    rows.push(vec![0.0; recording.len()]);
+                }
+            }
+        }
+        Some(rows)
+    }
+
     fn first_samples(&self) -> impl Iterator<Item = f64> + '_ {
         self.inputs.iter().filter(|(_, samples, is_linear)| *is_linear && samples[0] != 0.0).map(|(_, s, _)| s[0])
     }
@@ -330,6 +400,12 @@ fn refine_long_record(
     let Some(responses) = SampleResponses::new(simulation, simulation.unit_terms(&exponents)?, stop) else {
         return Ok(None);
     };
+    if options.tolerance >= TRANSFORM_ERROR
+        && let Some(rows) = responses.transform().filter(has_small_growth)
+    {
+        let change = vec![TRANSFORM_ERROR; responses.outputs()];
+        return Ok(Some(RefinedSamples { samples: responses.samples(&rows, initial)?, refinement: 1, change }));
+    }
     let rows_by_refinement =
         FULL_GRID_REFINEMENTS.iter().map(|&pulses_per_sample| responses.compute(pulses_per_sample, intervals));
     let rows_by_refinement = rows_by_refinement.collect::<Result<Vec<_>>>()?;
@@ -392,6 +468,26 @@ fn refine_long_record(
         }
     };
     Ok(Some(RefinedSamples { samples: responses.samples(&limit_rows, initial)?, refinement, change }))
+}
+
+/// Coefficient and integration order of each term of a signal in an equation.
+fn terms_of(equation: &Equation, signal: usize) -> impl Iterator<Item = (f64, f64)> + '_ {
+    let structure = &equation.structure;
+    let pairs = structure.terms.iter().zip(&equation.coefficients).filter(move |(term, _)| term.signal == signal);
+    pairs.map(|(term, c)| (*c, structure.order - term.order))
+}
+
+/// True if a stable equation has no poles near the Nyquist frequency or above it, so that the alias terms of its
+/// transform are smooth.
+fn has_smooth_aliases(equation: &Equation, step: f64) -> bool {
+    let structure = &equation.structure;
+    let (output, order) = (structure.output, structure.order);
+    let terms: Vec<(f64, f64)> = terms_of(equation, output).map(|(c, eta)| (c, order - eta)).collect();
+    let frequency = MAX_POLE_FREQUENCY_RATIO * std::f64::consts::PI / step;
+    // Above this frequency the terms of the output decrease further, so that the denominator has no zero.
+    terms_of(equation, output).all(|(_, eta)| eta > ORDER_TOLERANCE)
+        && terms_of(equation, output).map(|(c, eta)| c.abs() * libm::pow(frequency, -eta)).sum::<f64>() < 1.0
+        && !is_unstable(order, &terms)
 }
 
 /// Divide responses over `intervals` sampling intervals into time ranges. Return (first sample, end) of each range.

@@ -245,8 +245,8 @@ pub fn nonuniform_means<'py>(
 /// Return the runs of a fit. Return an error if a run does not have the given numbers of signals and free input
 /// parameters, and the given outputs.
 pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], free: usize) -> Result<Recordings> {
-    let runs = Recordings::new(runs.iter().map(|run| recording::Recording::clone(&run.get().inner)).collect())?;
-    if let Some(run) = runs.runs().first() {
+    let runs = Recordings::new(runs.iter().map(|run| Arc::clone(&run.get().inner)).collect())?;
+    if let Some(run) = runs.runs().next() {
         check_length("signals of a run", signals, run.channels().len())?;
         check_length("free input parameters of a run", free, run.free_inputs.len())?;
         if run.outputs() != outputs {

@@ -1,5 +1,7 @@
 //! Recordings of one structure: the measured runs of a joint fit.
 
+use std::sync::Arc;
+
 use super::channel::{Channel, Role};
 use super::run::{Recording, Sampling};
 use crate::error::{check_length, check_memory, Error, Result};
@@ -7,10 +9,10 @@ use crate::estimation::output_error::Experiment;
 use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 
-/// Recordings with the same signals and outputs: the runs of a joint fit.
+/// Recordings with the same signals and outputs: the runs of a joint fit, shared with other fits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recordings {
-    runs: Vec<Recording>,
+    runs: Vec<Arc<Recording>>,
     memory: usize,
 }
 
@@ -34,7 +36,8 @@ impl Recordings {
     /// # Ok(())
     /// # }
     /// ```
-    pub fn new(runs: Vec<Recording>) -> Result<Self> {
+    pub fn new<R: Into<Arc<Recording>>>(runs: Vec<R>) -> Result<Self> {
+        let runs: Vec<Arc<Recording>> = runs.into_iter().map(Into::into).collect();
         for pair in runs.windows(2) {
             check_length("signals of a run", pair[0].channels().len(), pair[1].channels().len())?;
             check_length("free input parameters of a run", pair[0].free_inputs.len(), pair[1].free_inputs.len())?;
@@ -68,9 +71,8 @@ impl Recordings {
     }
 
     /// The recordings, one per run.
-    #[must_use]
-    pub fn runs(&self) -> &[Recording] {
-        &self.runs
+    pub fn runs(&self) -> impl ExactSizeIterator<Item = &Recording> {
+        self.runs.iter().map(Arc::as_ref)
     }
 
     /// Return the sampling interval and the duration of each run \[s\].
@@ -151,7 +153,7 @@ impl Recordings {
     /// ```
     pub fn samples(&self, signal: usize) -> Result<Vec<&[f64]>> {
         let samples_of_run = |run| Recording::channel(run, signal).map(|channel| channel.samples.as_slice());
-        self.runs.iter().map(samples_of_run).collect()
+        self.runs().map(samples_of_run).collect()
     }
 
     /// Return the record of each run over `m` block pulses, with all signals filtered by the sensor filter. Missing
@@ -179,6 +181,6 @@ impl Recordings {
             with_inputs.is_coupled = false;
             with_inputs.pulses(m, true)?.into_record()
         };
-        self.runs.iter().map(record_of_run).collect()
+        self.runs().map(record_of_run).collect()
     }
 }

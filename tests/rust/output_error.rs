@@ -1,5 +1,7 @@
 //! Joint output error: its Jacobian against differences, recovery of known models, statistics of its estimates.
 
+use std::sync::Arc;
+
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::{
@@ -313,7 +315,7 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
     let m = experiment.record.m();
     let logged: Record = {
         let filtered = series::multiply(&low_pass(m), experiment.record.signal(1), m);
-        experiment.samples[1] = point_samples(&filtered);
+        Arc::make_mut(&mut experiment.samples)[1] = point_samples(&filtered);
         with_signal(&experiment.record, 1, filtered)
     };
     experiment.record = logged.into();
@@ -338,7 +340,7 @@ fn delayed_experiment(delay: f64, every: usize, noise: f64, seed: u64) -> Experi
         let clean: Vec<f64> = point_samples(&means).into_iter().step_by(every).collect();
         let sigma = noise * deviation(&clean);
         experiment.weights[i] = if noise > 0.0 { 1.0 / sigma } else { 1.0 / deviation(&clean) };
-        experiment.samples[i] = clean.iter().map(|y| y + sigma * random.normal()).collect();
+        Arc::make_mut(&mut experiment.samples)[i] = clean.iter().map(|y| y + sigma * random.normal()).collect();
         experiment.record = with_signal(&experiment.record, i, means).into();
     }
     experiment
@@ -696,7 +698,7 @@ fn unexcited_parameters_keep_their_values() {
     let (model, experiments) = driven_problem();
     let still = |e: &Experiment| {
         let signals = with_signal(&e.record, 2, vec![0.0; e.record.m()]);
-        Experiment::new(signals, 1, e.samples.clone(), vec![1.0]).unwrap()
+        Experiment::new(signals, 1, e.samples.to_vec(), vec![1.0]).unwrap()
     };
     let experiments: Vec<Experiment> = experiments.iter().map(still).collect();
     let found = fit(&model, &experiments, &point(&[], &[-4.0, 3.0, 7.5]), MinimizationSettings::default()).unwrap();

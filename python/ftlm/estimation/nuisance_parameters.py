@@ -616,6 +616,8 @@ def refit_after_screening(
         )
         if not accepts(optimistic):
             return None
+        # Jacobian and samples of the screening would take much of the memory of a fit of a long record.
+        del objective, screening, optimistic
         fit = fit_output_error(runs, structure, initial_fit=joint, loss=loss, refine=False)
         if refine and accepts(fit):
             # The refinement of a fit is that of the finer of its two last grids.

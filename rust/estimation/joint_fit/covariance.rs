@@ -3,7 +3,8 @@
 use super::objective::Objective;
 use super::problem::OptimizationResult;
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::linalg::dense;
+use crate::linalg::dense::{self, triangular_factor_by_blocks};
+use crate::linalg::orthogonal::extend_orthonormal;
 use crate::signal::statistics::{
     burg_filter, filter_autocovariances, inner, is_white, multiply_toeplitz, robust_deviation, sum, HUBER_THRESHOLD,
     WHITENESS_LAGS,
@@ -148,20 +149,21 @@ pub fn covariance_of_residuals(
             }
         })
         .collect();
-    let mut columns = Vec::with_capacity(p);
-    for (row, row_norm) in jacobian.iter().zip(&norms) {
+    for row in jacobian {
         check_length("a row of a Jacobian", count, row.len())?;
         check_finite("a column", row)?;
-        let mut column: Vec<f64> = row.iter().map(|v| v / row_norm).collect();
-        column.resize(count.max(p), 0.0);
-        columns.push(column);
     }
     let singular_value_error = || Error::Structure {
         what: "singular values of a Jacobian are not found".into(),
         remedy: "scale the parameters".into(),
     };
-    let dense::SingularValues { left: rows, values: singular_values, right } =
-        dense::singular_values(&columns).ok_or_else(singular_value_error)?;
+    // The triangular factor has the same singular values and right singular vectors.
+    let factor = triangular_factor_by_blocks((p, count), |i, range, out| {
+        out.extend(jacobian[i][range].iter().map(|v| v / norms[i]));
+    });
+    let factor_columns: Vec<Vec<f64>> = (0..p).map(|j| (0..p).map(|i| factor[i * p + j]).collect()).collect();
+    let dense::SingularValues { values: singular_values, right, .. } =
+        dense::singular_values(&factor_columns).ok_or_else(singular_value_error)?;
     let largest = singular_values.iter().copied().fold(0.0, f64::max);
     let rounding_level = f64::EPSILON * (count.max(1) as f64).sqrt() * largest;
     let significant: Vec<usize> = (0..singular_values.len()).filter(|&k| singular_values[k] > rounding_level).collect();
@@ -180,9 +182,20 @@ pub fn covariance_of_residuals(
     let inverse: Vec<Vec<f64>> =
         (0..p).map(|i| significant.iter().map(|&k| right[k][i] / singular_values[k]).collect()).collect();
     let samples = count.saturating_sub(priors);
-    let prior_basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][samples..count]).collect();
-    let prior_rows: Vec<Vec<f64>> =
-        inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, count - samples)).collect();
+    let passes_test = series.iter().all(|e| is_white(e, WHITENESS_LAGS));
+    let is_white_noise = passes_test && series.iter().all(|e| is_long_enough_for_test(e));
+    // Orthonormal basis of the columns of the scaled Jacobian: its left singular vectors.
+    let mut basis: Vec<Vec<f64>> = Vec::new();
+    for &k in if is_white_noise && priors == 0 { &[][..] } else { &significant } {
+        let mut vector = vec![0.0; count];
+        for (row, (component, norm)) in jacobian.iter().zip(right[k].iter().zip(&norms)) {
+            let weight = component / singular_values[k];
+            vector.iter_mut().zip(row).for_each(|(v, slope)| *v += weight * (slope / norm));
+        }
+        extend_orthonormal(&mut basis, vector, 0.0);
+    }
+    let prior_basis: Vec<Vec<f64>> = basis.iter_mut().map(|vector| vector.split_off(samples)).collect();
+    let prior_rows: Vec<Vec<f64>> = inverse.iter().map(|row| weighted_row_sum(row, &prior_basis, priors)).collect();
     let prior_contribution = |at: usize| inner(&prior_rows[at / p], &prior_rows[at % p]);
     // Number of parameters that the samples determine; the priors determine the others.
     let sample_degrees = p as f64 - prior_basis.iter().map(|row| inner(row, row)).sum::<f64>();
@@ -190,18 +203,22 @@ pub fn covariance_of_residuals(
     let for_white_noise: Vec<f64> = (0..p * p)
         .map(|index| level * (inner(&inverse[index / p], &inverse[index % p]) - prior_contribution(index)))
         .collect();
-    let passes_test = series.iter().all(|e| is_white(e, WHITENESS_LAGS));
-    let mut scaled_covariance: Vec<f64> = if passes_test && series.iter().all(|e| is_long_enough_for_test(e)) {
+    let mut scaled_covariance: Vec<f64> = if is_white_noise {
         for_white_noise
     } else {
         check_length("residuals", samples, series.iter().map(Vec::len).sum())?;
-        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..samples]).collect();
-        let pseudoinverse_rows = inverse.iter().map(|row| weighted_row_sum(row, &basis, samples)).collect::<Vec<_>>();
-        let autoregressive = autoregressive_covariance(&pseudoinverse_rows, &basis, series);
+        // The outer factor is the same for any middle factor, so the latter is computed in the singular basis.
+        let sandwich = |middle: &[f64]| -> Vec<f64> {
+            let middle_rows: Vec<Vec<f64>> = middle.chunks(basis.len().max(1)).map(<[f64]>::to_vec).collect();
+            let products: Vec<Vec<f64>> =
+                inverse.iter().map(|row| weighted_row_sum(row, &middle_rows, basis.len())).collect();
+            (0..p * p).map(|index| inner(&products[index / p], &inverse[index % p])).collect()
+        };
+        let autoregressive = sandwich(&autoregressive_covariance(&basis, series));
         if passes_test {
             widen_covariance(for_white_noise, &autoregressive)
         } else {
-            widen_covariance(autoregressive, &long_run_covariance(&pseudoinverse_rows, series)?)
+            widen_covariance(autoregressive, &sandwich(&long_run_covariance(&basis, series)?))
         }
     };
     scaled_covariance.iter_mut().enumerate().for_each(|(index, value)| *value += prior_contribution(index));
@@ -219,10 +236,10 @@ pub fn covariance_of_residuals(
 }
 
 /// Return Σ weight · row, the weighted sum of rows with `count` elements each.
-fn weighted_row_sum(weights: &[f64], rows: &[&[f64]], count: usize) -> Vec<f64> {
+fn weighted_row_sum(weights: &[f64], rows: &[Vec<f64>], count: usize) -> Vec<f64> {
     let mut out = vec![0.0; count];
     for (weight, row) in weights.iter().zip(rows) {
-        out.iter_mut().zip(*row).for_each(|(v, r)| *v += weight * r);
+        out.iter_mut().zip(row).for_each(|(v, r)| *v += weight * r);
     }
     out
 }
@@ -240,18 +257,18 @@ fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
     (0..p * p).map(|index| 0.5 * (product(index / p, index % p) + product(index % p, index / p))).collect()
 }
 
-/// Return the covariance of least-squares estimates for noise that is modeled by an autoregression of the residuals.
+/// Return the covariance of the products of an orthonormal basis of the regressors with noise that is modeled by an
+/// autoregression of the residuals.
 ///
-/// `pseudoinverse_rows` contains the rows of the pseudoinverse of the Jacobian, one per parameter. `basis` is an
-/// orthonormal basis of the regressors, and `series` contains the residuals by run and output. The result is row-major.
+/// `series` contains the residuals by run and output. The result is row-major.
 ///
 /// The regressors do not depend on the noise, so the autocovariances of the noise determine the covariance. An
 /// autoregression describes them with few parameters. Sums over lags would miss slow correlations such as 0.9 per
 /// sample. The fit removes the noise along `basis` from the residuals. The result is corrected for this loss, which is
 /// larger if the noise has the spectrum of the regressors.
 #[allow(clippy::cast_precision_loss)]
-fn autoregressive_covariance(pseudoinverse_rows: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
-    let mut total = vec![0.0; pseudoinverse_rows.len() * pseudoinverse_rows.len()];
+fn autoregressive_covariance(basis: &[Vec<f64>], series: &[Vec<f64>]) -> Vec<f64> {
+    let mut total = vec![0.0; basis.len() * basis.len()];
     let mut start = 0;
     for residuals in series {
         let range = start..start + residuals.len();
@@ -265,16 +282,11 @@ fn autoregressive_covariance(pseudoinverse_rows: &[Vec<f64>], basis: &[&[f64]], 
         if covariances[0].is_nan() || covariances[0] <= 0.0 {
             continue;
         }
-        let directions: Vec<&[f64]> = basis.iter().map(|row| &row[range.clone()]).collect();
-        let filtered_directions = multiply_toeplitz(&directions, &covariances);
-        let explained =
-            filtered_directions.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
+        let rows: Vec<&[f64]> = basis.iter().map(|row| &row[range.clone()]).collect();
+        let contribution = quadratic_form(&rows, &covariances);
+        let explained = contribution.iter().step_by(basis.len() + 1).sum::<f64>() / covariances[0];
         let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_RATIO);
-        let rows: Vec<&[f64]> = pseudoinverse_rows.iter().map(|row| &row[range.clone()]).collect();
-        total
-            .iter_mut()
-            .zip(quadratic_form(&rows, &covariances))
-            .for_each(|(sum, contribution)| *sum += contribution / remainder);
+        total.iter_mut().zip(contribution).for_each(|(sum, value)| *sum += value / remainder);
     }
     total
 }

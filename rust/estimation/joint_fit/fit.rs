@@ -67,8 +67,8 @@ impl OutputScale {
     /// # Errors
     /// [`Error::Structure`] for an output that does not exist.
     pub fn from_recordings(source: &Recordings) -> Result<Vec<Self>> {
-        let compared: Vec<Vec<Vec<f64>>> = source.runs().iter().map(Recording::recorded_rows).collect();
-        let outputs = source.runs().first().map_or(&[][..], Recording::outputs);
+        let compared: Vec<Vec<Vec<f64>>> = source.runs().map(Recording::recorded_rows).collect();
+        let outputs = source.runs().next().map_or(&[][..], Recording::outputs);
         let scale = |(k, &output): (usize, &usize)| {
             let uniform: Vec<Vec<f64>> = source.samples(output)?.into_iter().map(<[f64]>::to_vec).collect();
             let compared: Vec<Vec<f64>> = compared.iter().map(|rows| rows[k].clone()).collect();
@@ -167,12 +167,11 @@ impl<'a> FitProblem<'a> {
         Ok(if refine { objective } else { objective.for_comparison() })
     }
 
-    /// Return the objective with equal weights of all outputs relative to their standard deviations.
+    /// Return equal weights of all outputs relative to their standard deviations.
     ///
     /// The optimum depends on the noise levels, but a search far from the optimum does not need them.
-    fn equally_weighted_objective(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
-        let weights = self.scales.iter().map(|scale| 1.0 / (COARSE_RESIDUAL_RATIO * scale.deviation)).collect();
-        self.objective(weights, sampling, refine)
+    fn equal_weights(&self) -> Vec<f64> {
+        self.scales.iter().map(|scale| 1.0 / (COARSE_RESIDUAL_RATIO * scale.deviation)).collect()
     }
 
     /// Mean square of the weighted residuals if they are white noise alone, with equal weights of the outputs.
@@ -188,7 +187,7 @@ impl<'a> FitProblem<'a> {
     /// listener if it returns one. [`Error::Interrupted`] after a stop request.
     pub fn run_multistart(&self, threads: usize, progress: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
         let noise_floor = self.noise_floor();
-        let weights: Vec<f64> = self.scales.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
+        let weights = self.equal_weights();
         let shared_progress = std::cell::RefCell::new(progress);
         let listener = |count, total| {
             shared_progress.borrow_mut().advance_within(
@@ -241,7 +240,8 @@ pub struct EquationFit {
 /// invalid. [`Error::Overflow`] if squares of residuals overflow.
 pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -> Result<EquationFit> {
     let runs = Recordings::new(runs)?;
-    let signals = runs.runs()[0].channels().iter().map(|channel| channel.name.clone()).collect();
+    let signals =
+        runs.runs().next().into_iter().flat_map(Recording::channels).map(|channel| channel.name.clone()).collect();
     let scales = equations
         .iter()
         .map(|equation| {
@@ -358,7 +358,7 @@ pub fn fit(
         }
         objective = finer;
     }
-    let mut best_candidate = select_on_part(problem, &survivors, objective.sampling, settings.refine)?;
+    let mut best_candidate = select_on_part(problem, &survivors, &objective, settings.refine)?;
     if problem.scales.len() > 1 {
         // With a single output, the optimum does not depend on the noise level.
         let iterate = &best_candidate.result.iterate;
@@ -426,13 +426,13 @@ fn reweight_candidate<'a>(
 fn select_on_part(
     problem: FitProblem<'_>,
     survivors: &[Candidate],
-    sampling: Sampling,
+    objective: &Objective<'_>,
     refine: bool,
 ) -> Result<Candidate> {
-    let full_objective = problem.equally_weighted_objective(sampling, refine)?;
+    let full_objective = objective.with_weights(Weights { outputs: problem.equal_weights(), robust_weights: None })?;
     if let Some(intervals) = leading_part(problem.parameter_set, problem.source, SELECTION_INTERVALS)? {
-        let part_objective =
-            problem.equally_weighted_objective(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
+        let sampling = Sampling { leading_intervals: Some(intervals), ..objective.sampling };
+        let part_objective = problem.objective(problem.equal_weights(), sampling, refine)?;
         let selection = select_best_candidate(problem, survivors, &part_objective).and_then(|best_candidate| {
             let iterate = &best_candidate.result.iterate;
             let problem = problem.parameter_set.problem_at(iterate, true, &[]);

@@ -93,15 +93,17 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// [`Error::Length`] for a wrong number of robust weights.
     pub fn with_weights(&self, weights: Weights) -> Result<Self> {
-        let mut experiments = Vec::clone(&self.experiments);
         if let Some(robust_weights) = &weights.robust_weights {
-            check_length("runs with robust weights", experiments.len(), robust_weights.len())?;
+            check_length("runs with robust weights", self.experiments.len(), robust_weights.len())?;
         }
-        for (k, experiment) in experiments.iter_mut().enumerate() {
-            experiment.sample_weights.clone_from(&self.sample_mask[k]);
+        let weighted_experiment = |(k, experiment): (usize, &Experiment)| {
             let run_weights = weights.robust_weights.as_ref().map(|runs| runs[k].as_slice());
-            *experiment = experiment.clone().with_weights(&weights.outputs, run_weights)?;
-        }
+            let mut experiment = experiment.clone();
+            experiment.sample_weights.clone_from(&self.sample_mask[k]);
+            experiment.with_weights(&weights.outputs, run_weights)
+        };
+        let experiments: Vec<Experiment> =
+            self.experiments.iter().enumerate().map(weighted_experiment).collect::<Result<_>>()?;
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
 
@@ -204,7 +206,7 @@ impl<'a> Objective<'a> {
     #[must_use]
     pub fn is_exact(&self, iterate: &Iterate) -> bool {
         let is_whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
-        let runs = self.source.runs().iter().zip(self.source.intervals_and_durations());
+        let runs = self.source.runs().zip(self.source.intervals_and_durations());
         self.sampling.decimation == 1
             && self.problem.is_linear()
             && runs

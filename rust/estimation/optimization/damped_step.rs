@@ -9,6 +9,8 @@
 //! sum of the last steps is multiplied and tried as one extrapolation step. Ordinary steps follow from there. If they
 //! do not soon reach a lower cost, the search returns to the point before the extrapolation.
 
+use std::ops::Range;
+
 use crate::error::Result;
 use crate::linalg::dense;
 use crate::linalg::orthogonal::norm;
@@ -59,22 +61,38 @@ impl LinearizedProblem {
             (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
         let eliminated_count = order.len();
         order.extend(other_parameters);
-        let mut columns = Vec::with_capacity(jacobian.len() + 1);
-        let mut scales = Vec::with_capacity(jacobian.len());
-        for &i in &order {
-            let factor = problem.coordinate_derivative(point, i);
-            let mut column: Vec<f64> = jacobian[i].iter().map(|v| v * factor).collect();
-            for (other, slope) in problem.coupled_derivatives(point, i) {
-                column.iter_mut().zip(&jacobian[other]).for_each(|(v, w)| *v += slope * w);
+        // Columns are computed where they are needed: stored, they would take as much memory as the Jacobian.
+        let factors: Vec<f64> = order.iter().map(|&i| problem.coordinate_derivative(point, i)).collect();
+        let couplings: Vec<_> = order.iter().map(|&i| problem.coupled_derivatives(point, i)).collect();
+        let append_column = |column: usize, rows: Range<usize>, out: &mut Vec<f64>| {
+            let first = out.len();
+            out.extend(jacobian[order[column]][rows.clone()].iter().map(|v| v * factors[column]));
+            for (other, slope) in &couplings[column] {
+                out[first..].iter_mut().zip(&jacobian[*other][rows.clone()]).for_each(|(v, w)| *v += slope * w);
             }
-            let column_norm = norm(&column);
-            let scale = if column_norm > 0.0 { 1.0 / column_norm } else { 0.0 };
-            column.iter_mut().for_each(|v| *v *= scale);
-            columns.push(column);
+        };
+        let (mut scales, mut gradient) = (Vec::with_capacity(jacobian.len()), Vec::with_capacity(jacobian.len()));
+        let (rows, mut buffer) = (residuals.len(), Vec::with_capacity(residuals.len()));
+        let inverse_of = |scale: f64| if scale > 0.0 { 1.0 / scale } else { 0.0 };
+        for column in 0..jacobian.len() {
+            buffer.clear();
+            append_column(column, 0..rows, &mut buffer);
+            let column_norm = norm(&buffer);
+            let scale = inverse_of(column_norm);
+            gradient.push(buffer.iter().zip(residuals).map(|(v, e)| (v * scale) * e).sum::<f64>());
             scales.push(column_norm);
         }
-        let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
-        columns.push(residuals.to_vec());
+        let r = dense::triangular_factor_by_blocks((jacobian.len() + 1, rows), |column, rows, out| {
+            let first = out.len();
+            match scales.get(column) {
+                None => out.extend_from_slice(&residuals[rows]),
+                Some(&column_norm) => {
+                    append_column(column, rows, out);
+                    let scale = inverse_of(column_norm);
+                    out[first..].iter_mut().for_each(|v| *v *= scale);
+                }
+            }
+        });
         let scale_distances = |(lower, upper): (f64, f64), scale: f64| (lower * scale, upper * scale);
         let distance_to_bounds: Vec<(f64, f64)> = order
             .iter()
@@ -101,7 +119,7 @@ impl LinearizedProblem {
             })
             .collect();
         Self {
-            r: dense::triangular_factor(&columns),
+            r,
             order,
             scales,
             gradient,
@@ -372,6 +390,11 @@ pub trait LeastSquaresProblem {
     /// The minimization shortens the step after an error that ends the simulation, and terminates after any other
     /// error.
     fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
+
+    /// Release the intermediate results of an evaluation that only its derivatives need.
+    ///
+    /// The minimization calls this after [`Self::jacobian`].
+    fn release(&self, _evaluation: &mut Self::Evaluation) {}
 
     /// Move a point by steps in the coordinates, within bounds.
     ///

@@ -134,7 +134,7 @@ pub fn minimize<P: LeastSquaresProblem>(
     if settings.evaluations == 0 {
         return Ok(state.into_minimum(1, Status::Exhausted));
     }
-    state.jacobian = search.checked_jacobian(&state.point, &state.evaluation)?;
+    state.jacobian = search.checked_jacobian(&state.point, &mut state.evaluation)?;
     let mut valley = ValleyExtrapolation::new();
     loop {
         let final_status = match search.advance(&mut state)? {
@@ -205,8 +205,10 @@ struct Search<'a, P> {
 }
 
 impl<P: LeastSquaresProblem> Search<'_, P> {
-    fn checked_jacobian(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
+    /// Return the Jacobian of an evaluation, and release the intermediate results of the latter.
+    fn checked_jacobian(&self, point: &P::Point, evaluation: &mut P::Evaluation) -> Result<Vec<Vec<f64>>> {
         let jacobian = self.problem.jacobian(point, evaluation)?;
+        self.problem.release(evaluation);
         let rows = self.problem.residuals(evaluation).len();
         jacobian.iter().try_for_each(|column| check_length("column of the Jacobian", rows, column.len()))?;
         Ok(jacobian)
@@ -246,7 +248,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         let next_point = self.problem.apply_step(&start.point, extrapolation_step).0;
         self.evaluations += 1;
         let outcome = self.start(next_point).and_then(|mut iterate| {
-            iterate.jacobian = self.checked_jacobian(&iterate.point, &iterate.evaluation)?;
+            iterate.jacobian = self.checked_jacobian(&iterate.point, &mut iterate.evaluation)?;
             Ok(iterate)
         });
         match outcome {
@@ -346,7 +348,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             self.evaluations += 1;
             let is_admissible = problem.is_admissible(&next_point);
             // A step that does not decrease the cost or overflows is shortened.
-            let trial = problem.evaluate(&next_point).and_then(|trial_evaluation| {
+            let trial = problem.evaluate(&next_point).and_then(|mut trial_evaluation| {
                 let trial_cost = cost(problem.residuals(&trial_evaluation));
                 if !trial_cost.is_finite() || (state.is_admissible && !is_admissible) {
                     return Err(Error::Diverged { what: "step".into(), index: 0 });
@@ -355,12 +357,11 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                     return Ok(None);
                 }
                 let trial_point = problem.point_of_evaluation(&trial_evaluation, next_point.clone());
-                Ok(Some((
-                    self.checked_jacobian(&trial_point, &trial_evaluation)?,
-                    trial_evaluation,
-                    trial_cost,
-                    trial_point,
-                )))
+                // The linearization replaces the Jacobian of this point. On long records, two of them would take most of
+                // the memory.
+                state.jacobian = Vec::new();
+                let jacobian = self.checked_jacobian(&trial_point, &mut trial_evaluation)?;
+                Ok(Some((jacobian, trial_evaluation, trial_cost, trial_point)))
             });
             match trial {
                 Ok(Some((jacobian, trial_evaluation, trial_cost, next_point))) => {
@@ -379,7 +380,14 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                     return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
                 Ok(None) => self.has_left_domain = false,
-                Err(error) if error.ends_simulation() => self.has_left_domain = true,
+                Err(error) if error.ends_simulation() => {
+                    self.has_left_domain = true;
+                    if state.jacobian.is_empty() {
+                        // The derivatives of the trial are not finite.
+                        let mut evaluation = problem.evaluate(&state.point)?;
+                        state.jacobian = self.checked_jacobian(&state.point, &mut evaluation)?;
+                    }
+                }
                 Err(error) => return Err(error),
             }
             state.damping *= DAMPING_FACTOR;

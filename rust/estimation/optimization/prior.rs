@@ -51,6 +51,10 @@ impl<P: LeastSquaresProblem> LeastSquaresProblem for ProblemWithPriors<'_, P> {
         Ok(jacobian)
     }
 
+    fn release(&self, evaluation: &mut Self::Evaluation) {
+        self.problem.release(&mut evaluation.0);
+    }
+
     fn apply_step(&self, point: &P::Point, steps: &[f64]) -> (P::Point, f64) {
         self.problem.apply_step(point, steps)
     }

@@ -73,10 +73,19 @@ impl<P> Evaluation<P> {
                     residual.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
                 }
             }
-            self.residuals.extend(residual);
+            append(&mut self.residuals, residual);
             self.initial.push(initial);
         }
         Ok(())
+    }
+}
+
+/// Append the values of one experiment to those of the previous ones, without a copy for the first experiment.
+pub(crate) fn append(all: &mut Vec<f64>, values: Vec<f64>) {
+    if all.is_empty() {
+        *all = values;
+    } else {
+        all.extend(values);
     }
 }
 
@@ -93,7 +102,8 @@ pub(crate) type LinearSide<'a> = (&'a [f64], &'a [Vec<f64>], Vec<&'a [f64]>);
 /// The initial terms of each experiment are projected out. [`Error::Diverged`] if a step is not finite.
 pub(crate) fn solve_linear_steps(linear_sides: &[LinearSide<'_>]) -> Result<Vec<f64>> {
     let count = linear_sides.first().map_or(0, |(_, _, effects)| effects.len());
-    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
+    let rows: usize = linear_sides.iter().map(|(residuals, _, _)| residuals.len()).sum();
+    let mut columns: Vec<Vec<f64>> = (0..=count).map(|_| Vec::with_capacity(rows + count)).collect();
     for (residuals, basis, effects) in linear_sides {
         for (column, column_part) in columns.iter_mut().zip(effects.iter().chain([residuals])) {
             let first = column.len();
@@ -109,7 +119,6 @@ pub(crate) fn solve_linear_steps(linear_sides: &[LinearSide<'_>]) -> Result<Vec<
             column.iter_mut().for_each(|v| *v *= scale);
             scales.push(scale);
         }
-        let rows = column.len();
         column.resize(rows + count, 0.0);
         if index < count {
             column[rows + index] = COLLINEARITY_DAMPING;

@@ -17,14 +17,14 @@ pub struct Experiment {
     /// Number of block pulses per sampling interval.
     pub pulses_per_sample: usize,
     /// Samples of the output of each equation. The number of uniform samples is the number of sampling intervals plus
-    /// one.
-    pub samples: Vec<Vec<f64>>,
+    /// one. Shared like the record.
+    pub samples: Arc<Vec<Vec<f64>>>,
     /// Sensor filter of the simulated outputs, if any: its series, one value per pulse, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
     /// Weight 1/σ of the output of each equation, with its noise standard deviation σ.
     pub weights: Vec<f64>,
     /// Values of each signal at the sample times, for direct feedthrough; empty if only pulse means are known.
-    pub point_values: Vec<PointValues>,
+    pub point_values: Arc<Vec<PointValues>>,
     /// Relative weight of each compared sample of each output, 0 for a missing sample; empty for unit weights.
     pub sample_weights: Vec<Vec<f64>>,
     /// Nonuniform sample times; None for uniform samples.
@@ -79,11 +79,11 @@ impl Experiment {
     }
 
     fn new_unchecked(record: Record, pulses_per_sample: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Self {
-        let (filter, point_values, sample_weights, nonuniform) = (None, Vec::new(), Vec::new(), None);
+        let (filter, point_values, sample_weights, nonuniform) = (None, Arc::default(), Vec::new(), None);
         Self {
             record: Arc::new(record),
             pulses_per_sample,
-            samples,
+            samples: Arc::new(samples),
             filter,
             weights,
             point_values,
@@ -140,7 +140,7 @@ impl Experiment {
     /// [`Error::Length`] if the values do not match the signals or samples. [`Error::NotFinite`] if a value is not
     /// finite.
     pub fn with_point_values(mut self, point_values: Vec<PointValues>) -> Result<Self> {
-        self.point_values = point_values;
+        self.point_values = Arc::new(point_values);
         self.check()?;
         Ok(self)
     }
@@ -249,7 +249,7 @@ impl Experiment {
     /// Add `shifts` to the compared samples of each output. Shifts that are not finite are ignored.
     pub(crate) fn shift_samples(&mut self, shifts: &[Vec<f64>]) {
         let first = usize::from(self.nonuniform.is_none());
-        for (samples, shifts) in self.samples.iter_mut().zip(shifts) {
+        for (samples, shifts) in Arc::make_mut(&mut self.samples).iter_mut().zip(shifts) {
             let pairs = samples[first..].iter_mut().zip(shifts).filter(|(_, shift)| shift.is_finite());
             pairs.for_each(|(sample, shift)| *sample += shift);
         }

@@ -112,6 +112,8 @@ struct OutputErrorProblem<'a> {
     exact: Option<IntegerOrders>,
     /// Exact simulation of other orders on long records; None if it is not possible.
     sampled: Option<FractionalOrders>,
+    /// True if the result of the fit contains the responses to the initial terms.
+    returns_initial_responses: bool,
     /// Caches of the evaluations, by experiment.
     caches: RefCell<Vec<EvaluationCache>>,
     /// Cancellation flag.
@@ -160,6 +162,15 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
             Simulation::Pulses(evaluation) => {
                 self.model.jacobian(self.experiments, &mut self.caches.borrow_mut(), &self.linear, evaluation)
             }
+        }
+    }
+
+    fn release(&self, evaluation: &mut Simulation<'a>) {
+        match evaluation {
+            _ if self.returns_initial_responses => {}
+            Simulation::Exact(evaluation) => evaluation.parts.clear(),
+            Simulation::Sampled(evaluation) => evaluation.parts.clear(),
+            Simulation::Pulses(evaluation) => evaluation.parts.clear(),
         }
     }
 
@@ -383,6 +394,7 @@ pub fn fit_until(
         RefCell::new(if needs_pulses { EvaluationCache::for_experiments(experiments, stop)? } else { Vec::new() });
     let time_unit = TimeUnit::from_experiments(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| time_unit.factor(j, &point.orders) * c).collect();
+    let returns_initial_responses = settings.evaluations <= 1;
     let problem = OutputErrorProblem {
         model: &model,
         experiments,
@@ -393,6 +405,7 @@ pub fn fit_until(
         linear,
         exact,
         sampled,
+        returns_initial_responses,
         caches,
         stop,
     };
@@ -404,7 +417,7 @@ pub fn fit_until(
         jacobian: optimum.jacobian,
         initial: optimum.evaluation.initial_terms().0.to_vec(),
         exponents: optimum.evaluation.initial_terms().1.to_vec(),
-        initial_responses: if settings.evaluations > 1 { Vec::new() } else { optimum.evaluation.initial_responses() },
+        initial_responses: if returns_initial_responses { optimum.evaluation.initial_responses() } else { Vec::new() },
         evaluations: optimum.evaluations,
         status: optimum.status,
     })

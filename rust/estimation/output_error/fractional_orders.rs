@@ -7,9 +7,10 @@
 //! coefficients are functions of s as well. A sample at a jump is the mean of both sides; [`Feedthrough`] corrects it.
 
 use std::collections::HashMap;
+use std::ops::Range;
 use std::rc::Rc;
 
-use super::evaluation::{Evaluation, RANK_TOLERANCE};
+use super::evaluation::{append, Evaluation, RANK_TOLERANCE};
 use super::experiment::Experiment;
 use super::feedthrough::{add_feedthrough_derivative, Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
 use super::jacobian::initial_exponent_slopes;
@@ -24,6 +25,11 @@ use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 
 /// Minimum number of pulses for exact samples. For shorter experiments, block pulses are faster.
 pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
+
+/// Maximum memory of the transforms that are computed together \[bytes\].
+///
+/// Transforms that are computed together share the powers of s. On long records, they would take most of the memory.
+const MAX_BATCH_BYTES: usize = 1 << 25;
 
 /// Equations of any orders with zero-order-hold inputs, on experiments with uniform samples.
 pub(crate) struct FractionalOrders {
@@ -310,18 +316,19 @@ impl FractionalOrders {
                     let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
                     (0..terms.eta_indices.len()).map(slope).collect()
                 }));
-                let (sums, units) = run.responses(experiment, &terms, &weight_sets, &out.exponents[i]);
-                let targets = std::iter::once(&mut remainders).chain(&mut simulation.effects);
-                for (index, (target, samples)) in targets.zip(sums).enumerate() {
-                    let sign = if index == 0 { -1.0 } else { 1.0 };
-                    add_weighted(experiment, i, sign, &samples, target);
-                }
-                for samples in units {
-                    let mut column = vec![0.0; sample_count];
-                    add_weighted(experiment, i, 1.0, &samples, &mut column);
-                    extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
-                    initial.push((Some(i), column));
-                }
+                let (basis, effects) = (&mut simulation.basis, &mut simulation.effects);
+                run.responses(experiment, &terms, &weight_sets, &out.exponents[i], |column, samples| {
+                    match (column, column.checked_sub(1 + linear.len())) {
+                        (0, _) => add_weighted(experiment, i, -1.0, &samples, &mut remainders),
+                        (column, None) => add_weighted(experiment, i, 1.0, &samples, &mut effects[column - 1]),
+                        (_, Some(_)) => {
+                            let mut unit_response = vec![0.0; sample_count];
+                            add_weighted(experiment, i, 1.0, &samples, &mut unit_response);
+                            extend_orthonormal(basis, unit_response.clone(), RANK_TOLERANCE);
+                            initial.push((Some(i), unit_response));
+                        }
+                    }
+                });
             }
             if let Some(feedthrough) = &feedthrough {
                 remainders.iter_mut().zip(feedthrough.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
@@ -360,7 +367,7 @@ impl FractionalOrders {
         let structures = model.structures(&point.orders);
         let parameters: Vec<usize> =
             (0..count).filter(|p| !p.checked_sub(orders).is_some_and(|j| linear.contains(&j))).collect();
-        let mut jacobian = vec![Vec::with_capacity(evaluation.residuals.len()); count];
+        let mut jacobian = vec![Vec::new(); count];
         for (index, (run, experiment)) in self.runs.iter().zip(experiments).enumerate() {
             let mut columns = vec![vec![0.0; structures.len() * experiment.compared_count()]; count];
             for (&j, effect) in linear.iter().zip(&evaluation.parts[index].effects) {
@@ -381,11 +388,9 @@ impl FractionalOrders {
                         (term_slopes(model, i, point, p), initial_slopes.unwrap_or_default())
                     })
                     .collect();
-                for (&parameter, samples) in
-                    parameters.iter().zip(run.sensitivities(experiment, &terms, &initial, &requests))
-                {
-                    add_weighted(experiment, i, 1.0, &samples, &mut columns[parameter]);
-                }
+                run.sensitivities(experiment, &terms, &initial, &requests, |request, samples| {
+                    add_weighted(experiment, i, 1.0, &samples, &mut columns[parameters[request]]);
+                });
             }
             if let Some(feedthrough) = Feedthrough::new(model, experiment, &structures, point, &[])? {
                 for &parameter in &parameters {
@@ -405,7 +410,8 @@ impl FractionalOrders {
                     return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
                 }
                 // Residuals are measured minus simulated samples.
-                out.extend(column.iter().map(|v| -v));
+                column.iter_mut().for_each(|v| *v = -*v);
+                append(out, column);
             }
         }
         Ok(jacobian)
@@ -434,62 +440,60 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Return two lists of compared samples of one equation.
+    /// Call `emit` with the responses of one equation at the compared samples.
     ///
-    /// The first has the response from zero initial conditions for each list of coefficients in `weight_sets`. The
-    /// second has the response to each initial term t^e with e in `exponents`.
+    /// Column i is the response from zero initial conditions for the list of coefficients `weight_sets[i]`, unless it is
+    /// zero. The responses to the initial terms t^e with e in `exponents` are the next columns.
     fn responses(
         &self,
         experiment: &Experiment,
         terms: &Terms,
         weight_sets: &[Vec<f64>],
         exponents: &[f64],
-    ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
-        // The index of a set of weights, the input, and the weighted sum of powers for this input.
-        let mut functions: Vec<(usize, usize, PowerSum)> = Vec::new();
-        let mut initial_jumps = Vec::new();
+        emit: impl FnMut(usize, Vec<f64>),
+    ) {
+        let (mut functions, mut sums, mut initial_jumps) = (Vec::new(), Vec::new(), Vec::new());
         for (set_index, weights) in weight_sets.iter().enumerate() {
             for input in terms.signals() {
                 let sum = terms.sum(Some(input), |k| (weights[k], 0.0));
                 if !sum.is_zero() {
-                    functions.push((set_index, input, sum));
+                    functions.push((set_index, Some(input)));
+                    sums.push(sum);
                     initial_jumps.push(terms.initial_jump(input, |k| weights[k]));
                 }
             }
         }
-        initial_jumps.resize(functions.len() + exponents.len(), 0.0);
+        functions.extend((0..exponents.len()).map(|k| (weight_sets.len() + k, None)));
+        initial_jumps.resize(functions.len(), 0.0);
         let denominator_terms = terms.sum_of_coefficients(None);
         let mut powers = Vec::new();
         let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
-        let spectra = self.transform.spectra(&initial_jumps, |point, values| {
+        let transforms = |point: LaplacePoint, range: Range<usize>, values: &mut [Bin]| {
             terms.orders.powers(point, &mut powers);
             let response = (Bin::from(1.0) - denominator_terms.value_at(point.logarithm, &powers)).inv();
             let hold_response = response / point.s;
-            let (input_values, initial_values) = values.split_at_mut(functions.len());
-            for (value, (_, _, sum)) in input_values.iter_mut().zip(&functions) {
-                *value = sum.value_at(point.logarithm, &powers) * hold_response;
+            for (value, index) in values.iter_mut().zip(range) {
+                *value = match index.checked_sub(sums.len()) {
+                    None => sums[index].value_at(point.logarithm, &powers) * hold_response,
+                    Some(k) => response * point.integration(exponents[k] + 1.0) * units[k],
+                };
             }
-            for ((value, unit), e) in initial_values.iter_mut().zip(&units).zip(exponents) {
-                *value = response * point.integration(e + 1.0) * unit;
-            }
-        });
-        let mut spectra = spectra.into_iter();
-        let sources = functions.iter().map(|(set_index, input, _)| (*set_index, Some(*input)));
-        let responses = self.columns(experiment, weight_sets.len(), sources.zip(spectra.by_ref()));
-        let initial_responses = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
-        (responses, initial_responses)
+        };
+        self.columns(experiment, &functions, &initial_jumps, transforms, emit);
     }
 
-    /// Return the derivatives of the compared samples of an equation, one list of samples per request.
+    /// Call `emit` with the derivatives of the compared samples of an equation, one column per request.
     ///
-    /// A request contains the derivatives of the terms and of the initial exponents with respect to one parameter.
+    /// A request contains the derivatives of the terms and of the initial exponents with respect to one parameter. A
+    /// column of zeros is omitted.
     fn sensitivities(
         &self,
         experiment: &Experiment,
         terms: &Terms,
         initial: &InitialTerms,
         requests: &[(Slopes, Vec<f64>)],
-    ) -> Vec<Vec<f64>> {
+        emit: impl FnMut(usize, Vec<f64>),
+    ) {
         let derivative = |request: usize, input: Option<usize>| {
             let slopes: &Slopes = &requests[request].0;
             terms.sum(input, |k| (slopes[k].0, terms.coefficients[k] * slopes[k].1))
@@ -519,7 +523,7 @@ impl Run {
         let (mut powers, mut transforms) = (Vec::new(), Vec::new());
         let (mut input_responses, mut denominator_changes) =
             (vec![Bin::default(); numerators.len()], vec![Bin::default(); requests.len()]);
-        let spectra = self.transform.spectra(&initial_jumps, |point, values| {
+        let values_at = |point: LaplacePoint, range: Range<usize>, values: &mut [Bin]| {
             let logarithm = point.logarithm;
             terms.orders.powers(point, &mut powers);
             let response = (Bin::from(1.0) - denominator_terms.value_at(logarithm, &powers)).inv();
@@ -531,7 +535,7 @@ impl Run {
             for (value, sum) in denominator_changes.iter_mut().zip(&denominators) {
                 *value = sum.value_at(logarithm, &powers) * response;
             }
-            for (value, (request, index, numerator)) in values.iter_mut().zip(&functions) {
+            for (value, (request, index, numerator)) in values.iter_mut().zip(&functions[range]) {
                 *value = match index {
                     Some(index) => {
                         input_responses[*index] * denominator_changes[*request]
@@ -543,36 +547,52 @@ impl Run {
                     }
                 };
             }
-        });
-        let functions = functions.iter().map(|(request, index, _)| (*request, index.map(|index| signals[index])));
-        self.columns(experiment, requests.len(), functions.zip(spectra))
+        };
+        let columns: Vec<(usize, Option<usize>)> =
+            functions.iter().map(|(request, index, _)| (*request, index.map(|index| signals[index]))).collect();
+        self.columns(experiment, &columns, &initial_jumps, values_at, emit);
     }
 
-    /// Return `count` columns of compared samples.
+    /// Call `emit` with columns of compared samples.
     ///
-    /// Column i is the inverse transform of the sum of the `functions` with index i. A function with an input is
-    /// multiplied by the transform of the jumps of that input. A function without an input is the response to initial
-    /// terms.
+    /// A column is the inverse transform of the sum of the adjacent `functions` with the same index. A function with an
+    /// input is multiplied by the transform of the jumps of that input. A function without an input is the response to
+    /// initial terms. `values_at(s, range, out)` writes the Laplace transforms of the functions `range` at s to `out`,
+    /// and `starts` contains their values at t = 0.
     fn columns(
         &self,
         experiment: &Experiment,
-        count: usize,
-        functions: impl Iterator<Item = ((usize, Option<usize>), Vec<Bin>)>,
-    ) -> Vec<Vec<f64>> {
-        let mut sums: Vec<Option<Vec<Bin>>> = vec![None; count];
-        for ((column, input), mut spectrum) in functions {
-            if let Some(jumps) = input.and_then(|input| self.jumps.get(&input)) {
-                spectrum.iter_mut().zip(jumps).for_each(|(v, jump)| *v *= jump);
-            }
-            match &mut sums[column] {
-                None => sums[column] = Some(spectrum),
-                Some(sum) => sum.iter_mut().zip(spectrum).for_each(|(sum, v)| *sum += v),
+        functions: &[(usize, Option<usize>)],
+        starts: &[f64],
+        mut values_at: impl FnMut(LaplacePoint, Range<usize>, &mut [Bin]),
+        mut emit: impl FnMut(usize, Vec<f64>),
+    ) {
+        let batch_size = (MAX_BATCH_BYTES / (self.transform.bins() * size_of::<Bin>())).max(1);
+        let mut last_sum: Option<(usize, Vec<Bin>)> = None;
+        for first in (0..functions.len()).step_by(batch_size) {
+            let range = first..functions.len().min(first + batch_size);
+            let spectra = self
+                .transform
+                .spectra(&starts[range.clone()], |point, values| values_at(point, range.clone(), values));
+            for (&(column, input), mut spectrum) in functions[range].iter().zip(spectra) {
+                if let Some(jumps) = input.and_then(|input| self.jumps.get(&input)) {
+                    spectrum.iter_mut().zip(jumps).for_each(|(v, jump)| *v *= jump);
+                }
+                match &mut last_sum {
+                    Some((last, sum)) if *last == column => {
+                        sum.iter_mut().zip(spectrum).for_each(|(sum, v)| *sum += v);
+                    }
+                    _ => {
+                        if let Some((last, sum)) = last_sum.replace((column, spectrum)) {
+                            emit(last, self.compared_samples(experiment, sum));
+                        }
+                    }
+                }
             }
         }
-        let samples = |sum: Option<Vec<Bin>>| {
-            sum.map_or_else(|| vec![0.0; experiment.compared_count()], |sum| self.compared_samples(experiment, sum))
-        };
-        sums.into_iter().map(samples).collect()
+        if let Some((last, sum)) = last_sum {
+            emit(last, self.compared_samples(experiment, sum));
+        }
     }
 
     /// Return the compared samples of the function whose transform is `spectrum`.

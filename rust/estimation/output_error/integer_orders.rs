@@ -12,7 +12,7 @@ use std::borrow::Cow;
 use std::cell::RefCell;
 use std::rc::Rc;
 
-use super::evaluation::{Evaluation, RANK_TOLERANCE};
+use super::evaluation::{append, Evaluation, RANK_TOLERANCE};
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, InputLaw, ParameterPoint};
 
@@ -164,15 +164,34 @@ impl Companion {
 
     /// Return the response of 1/A to an input, or to an impulse if `input` is None.
     ///
-    /// `series_output` is an output row with a direct gain. The output that they define is the input of a second system
-    /// 1/A in series. The response consists of the states at the compared samples, and the input just after each. None
-    /// on overflow.
+    /// The response consists of the states at the compared samples, and the input just after each. None on overflow.
     pub(crate) fn respond(
+        &self,
+        input: Option<&SourceInput<'_>>,
+        sampling: SampleGrid,
+    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        let mut states = Vec::with_capacity(self.order * sampling.1);
+        let mut values = Vec::with_capacity(sampling.1);
+        self.visit_response(input, None, sampling, |state, value| {
+            states.extend_from_slice(state);
+            values.push(value);
+        })?;
+        states.iter().all(|v| v.is_finite()).then_some((states, values))
+    }
+
+    /// Call `visit` with the states of the response of 1/A at each compared sample, and the input just after it. None
+    /// if the discretization overflows.
+    ///
+    /// The response is to an input, or to an impulse if `input` is None. `series_output` is an output row with a direct
+    /// gain. The output that they define is the input of a second system 1/A in series, whose states follow those of the
+    /// first.
+    fn visit_response(
         &self,
         input: Option<&SourceInput<'_>>,
         series_output: Option<(&[f64], f64)>,
         sampling: SampleGrid,
-    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        visit: impl FnMut(&[f64], f64),
+    ) -> Option<()> {
         let n = self.order;
         let total = if series_output.is_some() { 2 * n } else { n };
         let fraction = input.map_or(0.0, |input| input.delay - input.delay.floor());
@@ -181,7 +200,8 @@ impl Companion {
         if input.is_none() {
             start[n - 1] = 1.0;
         }
-        discretization.advance(start, input, sampling)
+        discretization.advance(start, input, sampling, visit);
+        Some(())
     }
 
     /// Return the discretization of 1/A, or of two systems 1/A in series; None on overflow.
@@ -233,7 +253,7 @@ impl Companion {
 }
 
 impl Discretization {
-    /// Return the states at the compared samples, and the input just after each; None on overflow.
+    /// Call `visit` with the states at each compared sample and the input just after it.
     ///
     /// `state` contains the states before the first pulse.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -242,9 +262,9 @@ impl Discretization {
         mut state: Vec<f64>,
         input: Option<&SourceInput<'_>>,
         (pulses_per_sample, count): SampleGrid,
-    ) -> Option<(Vec<f64>, Vec<f64>)> {
+        mut visit: impl FnMut(&[f64], f64),
+    ) {
         let n = state.len();
-        let (mut states, mut values) = (Vec::with_capacity(n * count), Vec::with_capacity(count));
         let lag = input.map_or(0, |input| {
             let is_fractional_delay = input.intersample == Intersample::Hold && input.delay > input.delay.floor();
             input.delay.floor().clamp(-1e15, 1e15) as isize + isize::from(is_fractional_delay)
@@ -258,8 +278,7 @@ impl Discretization {
         for k in 0..=count * pulses_per_sample {
             let (current_value, next_value) = (input_value(k), input_value(k + 1));
             if k > 0 && k % pulses_per_sample == 0 {
-                states.extend_from_slice(&state);
-                values.push(current_value);
+                visit(&state, current_value);
             }
             next_state.copy_from_slice(&state);
             if let Some(gains) = &self.gains {
@@ -272,7 +291,6 @@ impl Discretization {
             }
             std::mem::swap(&mut state, &mut next_state);
         }
-        states.iter().all(|v| v.is_finite()).then_some((states, values))
     }
 }
 
@@ -441,7 +459,7 @@ impl IntegerOrders {
             let mut sources = Vec::new();
             let mut add_source = |kind, input: Option<SourceInput<'a>>| -> Result<()> {
                 let (states, values) =
-                    companion.respond(input.as_ref(), None, (pulses_per_sample, count)).ok_or_else(overflow)?;
+                    companion.respond(input.as_ref(), (pulses_per_sample, count)).ok_or_else(overflow)?;
                 sources.push(Source { kind, input, states, values });
                 Ok(())
             };
@@ -506,7 +524,7 @@ impl IntegerOrders {
         let point = &evaluation.point;
         let (orders, coefficients) = (point.orders.len(), point.coefficients.len());
         let count = orders + coefficients + point.inputs.len();
-        let mut jacobian = vec![Vec::with_capacity(evaluation.residuals.len()); count];
+        let mut jacobian = vec![Vec::new(); count];
         for (run, (experiment, simulation)) in experiments.iter().zip(&evaluation.parts).enumerate() {
             let responses = (0..self.equations.len())
                 .map(|i| {
@@ -540,7 +558,8 @@ impl IntegerOrders {
                     return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
                 }
                 // Residuals are measured minus simulated samples.
-                out.extend(column.iter().map(|v| -v));
+                column.iter_mut().for_each(|v| *v = -*v);
+                append(out, column);
             }
         }
         Ok(jacobian)
@@ -700,12 +719,14 @@ impl ExactSimulation<'_> {
                 continue;
             }
             let sampling = (experiment.pulses_per_sample, count);
-            let (states, _) = companion.respond(source.input.as_ref(), Some((&output_row, direct)), sampling)?;
-            for (sum, row) in total.chunks_exact_mut(n).zip(states.chunks_exact(2 * n)) {
-                sum.iter_mut().zip(&row[n..]).for_each(|(a, b)| *a += b);
-            }
+            let mut sums = total.chunks_exact_mut(n);
+            companion.visit_response(source.input.as_ref(), Some((&output_row, direct)), sampling, |state, _| {
+                if let Some(sum) = sums.next() {
+                    sum.iter_mut().zip(&state[n..]).for_each(|(a, b)| *a += b);
+                }
+            })?;
         }
-        Some(total)
+        total.iter().all(|v| v.is_finite()).then_some(total)
     }
 
     /// Add the contribution of the autoregressive terms to the derivative with respect to coefficient `j` to `column`.
@@ -769,7 +790,7 @@ impl ExactSimulation<'_> {
                 let sampling = (experiment.pulses_per_sample, count);
                 let (states, values) = simulation
                     .companion
-                    .respond(Some(&slope), None, sampling)
+                    .respond(Some(&slope), sampling)
                     .ok_or_else(|| Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 })?;
                 let (output_row, direct) = self.input_output(orders, (i, q), coefficient, 0);
                 Source { kind: SourceKind::Impulse, input: None, states, values }.add_output(

@@ -11,6 +11,7 @@
 
 use std::borrow::Cow;
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 use super::prefilter::cumulative_power_frequency;
 use crate::equation::AffineOrder;
@@ -191,7 +192,7 @@ fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment
 /// Return the experiment with output `i` alone.
 fn single_output(experiment: &Experiment, i: usize) -> Experiment {
     let mut single = experiment.clone();
-    single.samples = vec![experiment.samples[i].clone()];
+    single.samples = Arc::new(vec![experiment.samples[i].clone()]);
     single.weights = vec![experiment.weights[i]];
     single.sample_weights = experiment.sample_weights.get(i).cloned().into_iter().collect();
     single
@@ -509,7 +510,7 @@ impl<'a> Equation<'a> {
             let (count, step) = (experiment.compared_count(), experiment.record.step());
             let companion = Companion::of_width(&mut companions, &filter, step);
             let sampling = (experiment.pulses_per_sample, count);
-            let respond = |input: Option<&SourceInput<'_>>| companion.respond(input, None, sampling);
+            let respond = |input: Option<&SourceInput<'_>>| companion.respond(input, sampling);
             let apply_weights =
                 |column: Vec<f64>| column.iter().zip(experiment.weights_of(0)).map(|(v, w)| v * w).collect();
             let Some(output) = respond(Some(&measured_input(experiment))) else { return Ok(None) };
@@ -604,7 +605,7 @@ impl<'a> Equation<'a> {
         for (experiment, basis) in self.experiments.iter().zip(evaluation.parts.iter().map(ExactSimulation::basis)) {
             let companion = Companion::of_width(&mut companions, &autoregressive_terms, experiment.record.step());
             let sampling = (experiment.pulses_per_sample, experiment.compared_count());
-            let Some(output) = companion.respond(Some(&measured_input(experiment)), None, sampling) else {
+            let Some(output) = companion.respond(Some(&measured_input(experiment)), sampling) else {
                 return Ok(None);
             };
             for (index, (column, (_, factor))) in regressors.iter_mut().zip(&self.autoregressive_terms).enumerate() {
@@ -792,6 +793,10 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
         columns.extend(jacobian.drain(orders + evaluation.point.coefficients.len()..));
         columns.iter_mut().for_each(|column| project_out(&basis, column));
         Ok(columns)
+    }
+
+    fn release(&self, evaluation: &mut Evaluation<'a>) {
+        evaluation.parts.clear();
     }
 
     fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {

@@ -64,7 +64,7 @@ pub fn run_friction_multistart(parameter_set: &ParameterSet, context: Multistart
         return run_multistart(parameter_set, context);
     }
     check_motion(structure, context.source)?;
-    let shortest = context.source.runs().iter().map(Recording::len).min().unwrap_or(1);
+    let shortest = context.source.runs().map(Recording::len).min().unwrap_or(1);
     let sampling = Sampling { decimation: ((shortest - 1) / COARSE_SAMPLES).max(1), ..Sampling::default() };
     let weights = Weights { outputs: context.weights.to_vec(), robust_weights: None };
     let objective = Objective::new((&parameter_set.problem, context.source, context.stop), weights, sampling, false)?;
@@ -102,7 +102,7 @@ fn guesses_from_frictionless_optima(
 
 /// Return the parameter set and the recordings without friction.
 fn without_friction(structure: &ParametricStructure, source: &Recordings) -> Result<(ParameterSet, Recordings)> {
-    let mut runs = source.runs().to_vec();
+    let mut runs = source.runs().cloned().collect::<Vec<_>>();
     runs.iter_mut().for_each(|run| run.has_friction = false);
     Ok((ParameterSet::from_structure(with_friction(structure, |_| None))?, Recordings::new(runs)?))
 }
@@ -168,7 +168,7 @@ fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<
             high - low <= MIN_MOTION_NOISE_RATIO * white_noise_deviation(samples)
         };
         if source.samples(equation.output)?.iter().all(is_at_rest) {
-            let names: Vec<&str> = source.runs().iter().map(Recording::name).collect();
+            let names: Vec<&str> = source.runs().map(Recording::name).collect();
             let (output, names) = (&structure.signals[equation.output], names.join(", "));
             let what = format!(
                 "{output} never moves beyond its noise in {names}, and the friction of a body at rest has only a lower \
@@ -257,7 +257,7 @@ fn with_measured_inputs(
         };
         Ok(Channel { enters_others: equations.iter().any(is_input_of), ..run.channel(signal)?.clone() })
     };
-    let is_filtered = source.runs().iter().any(|run| signals.iter().any(|&signal| run.channels()[signal].is_filtered));
+    let is_filtered = source.runs().any(|run| signals.iter().any(|&signal| run.channels()[signal].is_filtered));
     let mut runs = Vec::new();
     for run in source.runs() {
         let channels = signals.iter().map(|&signal| channel(run, signal)).collect::<Result<Vec<_>>>()?;
@@ -479,7 +479,7 @@ fn fit_isolated_body(
     isolated_equation.order = isolated_equation.order.substitute(&fixed_orders);
     isolated_equation.terms.iter_mut().for_each(|term| term.order = term.order.substitute(&fixed_orders));
     let inputs = guess_at(parameter_set, values, String::new())?.result.iterate.point.inputs;
-    let mut runs = source.runs().iter().map(|run| run.with_free_inputs(&inputs)).collect::<Result<Vec<_>>>()?;
+    let mut runs = source.runs().map(|run| run.with_free_inputs(&inputs)).collect::<Result<Vec<_>>>()?;
     runs.iter_mut().for_each(|run| run.filter = None);
     let coefficients = fit_sliding_body(&runs, &isolated_equation, stop)?;
     Ok((fixed_orders, coefficients))

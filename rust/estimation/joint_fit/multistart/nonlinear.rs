@@ -170,7 +170,7 @@ fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, ha
         run_with_signals.free_inputs.clone_from(&run.free_inputs);
         Ok(run_with_signals)
     };
-    Recordings::new(source.runs().iter().map(add_derived_channels).collect::<Result<Vec<_>>>()?)
+    Recordings::new(source.runs().map(add_derived_channels).collect::<Result<Vec<_>>>()?)
 }
 
 fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_width: usize) -> Result<Channel> {

@@ -146,7 +146,7 @@ fn guess_samplings(
     let Some(leading_intervals_of_guess) = leading_part(parameter_set, source, INITIAL_GUESS_INTERVALS)? else {
         return Ok(Vec::new());
     };
-    let intervals = source.runs().iter().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
+    let intervals = source.runs().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / leading_intervals_of_guess;
     if decimation < 2 {
         return Ok(Vec::new());
