@@ -571,9 +571,8 @@ impl Run {
         let mut last_sum: Option<(usize, Vec<Bin>)> = None;
         for first in (0..functions.len()).step_by(batch_size) {
             let range = first..functions.len().min(first + batch_size);
-            let spectra = self
-                .transform
-                .spectra(&starts[range.clone()], |point, values| values_at(point, range.clone(), values));
+            let spectra =
+                self.transform.spectra(&starts[range.clone()], |point, values| values_at(point, range.clone(), values));
             for (&(column, input), mut spectrum) in functions[range].iter().zip(spectra) {
                 if let Some(jumps) = input.and_then(|input| self.jumps.get(&input)) {
                     spectrum.iter_mut().zip(jumps).for_each(|(v, jump)| *v *= jump);
