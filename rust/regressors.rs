@@ -655,7 +655,8 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
 }
 
 /// Split initial terms, given as (exponent, coefficient) pairs by equation, into terms of the equations and impulses of
-/// the sensors. Levels of the outputs, with the exponent ∞, are neither and are left out.
+/// the sensors. Levels of the outputs, marked by the exponent ∞, are omitted; the
+/// caller adds them to the samples.
 #[allow(clippy::type_complexity)]
 pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
     let finite = |terms: &Vec<(f64, f64)>| terms.iter().copied().filter(|(e, _)| e.is_finite()).collect::<Vec<_>>();

@@ -107,8 +107,9 @@ impl PowerSum {
 /// Return the powers of t in the derivative D^ρ of an equation's output as (exponent, coefficient). `order` is ρ, and
 /// `powers` holds the powers of t in every output. Return an error if the derivative has no mean over the first pulse.
 ///
-/// Where a term is computed as I^η D^ρ y, powers of t from y(0), y′(0), … are added, because D^ρ I^η y equals I^η D^ρ y
-/// plus these powers. They cancel the powers of the initial terms of Caputo derivatives.
+/// D^ρ I^η y equals I^η D^ρ y plus powers of t with coefficients from y(0), y′(0), …. These powers are added for terms
+/// that enter as I^η D^ρ y (`is_derived_from_output`). The initial terms of Caputo derivatives contain the same powers
+/// with opposite signs.
 pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
@@ -209,7 +210,7 @@ pub(super) enum InitialTerm {
     /// and derivatives of an impulse, at the sensor filter of the output.
     Power(usize, f64),
     /// Level that is added to the samples of the output of the equation with this index, and does not enter the
-    /// equations. Its exponent is ∞.
+    /// equations. The exponent ∞ marks it, because the power t^0 is an initial value of the equation.
     OutputLevel(usize),
 }
 

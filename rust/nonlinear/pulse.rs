@@ -115,9 +115,8 @@ impl<'a> Pulse<'a> {
         norm
     }
 
-    /// Set the initial guess `z` of the Newton iterations: the quadratic extrapolation of the last three pulses. For
-    /// the third pulse, it is the linear extrapolation of the first two, for the second the value of the first, and for
-    /// the first the forcing.
+    /// Set the initial guess `z` of the Newton iterations: the quadratic extrapolation of the last three pulses. The
+    /// degree is lower in the second and third pulse. The first pulse starts at the forcing.
     pub(super) fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {
@@ -203,7 +202,7 @@ impl<'a> Pulse<'a> {
             for a in 0..states {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
-                // A channel with small terms receives the rounding errors of channels with large terms.
+                // The inverse Jacobian propagates rounding errors of large state channels to small ones.
                 let rounding: f64 = row.iter().zip(&self.magnitudes).map(|(v, magnitude)| (v * magnitude).abs()).sum();
                 let tolerance = NEWTON_TOLERANCE * self.magnitudes[a] + ROUNDING_RATIO * rounding;
                 is_small &= self.step[a].abs() <= tolerance;

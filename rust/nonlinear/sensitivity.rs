@@ -260,8 +260,8 @@ impl Operators {
         Ok(OutputDerivatives { corrections: half_changes.collect(), means })
     }
 
-    /// Set the derivatives of the non-linear terms in `x` to those at constant states, and add their contributions to
-    /// the states to `free`. `inputs` holds indices of input channels and the derivatives of their means in the pulse.
+    /// Write the derivatives of the non-linear terms due to the inputs alone to `x`, and add their contributions to the
+    /// forcing `free`. `inputs` holds indices of input channels and the derivatives of their means in the pulse.
     fn add_inputs_of_terms(
         &self,
         slopes: &[f64],

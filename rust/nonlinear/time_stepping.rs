@@ -336,7 +336,7 @@ impl Operators {
     }
 
     /// Simulate with the given forcing of the state channels. With a `continuation` of the inputs, the pulses after
-    /// samples are also solved with continued inputs. Systems with friction have none.
+    /// samples are also solved with continued inputs. It is None for systems with friction.
     ///
     /// The second result is None for a complete run. If the simulation ends early, it holds the pulse and the reason,
     /// and the run consists of the pulses before it.

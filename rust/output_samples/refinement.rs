@@ -43,10 +43,11 @@ const MAX_POLE_FREQUENCY_RATIO: f64 = 0.5;
 pub struct RefinedSamples {
     /// Samples and initial terms in the limit of zero step.
     pub samples: OutputSamples,
-    /// Number of pulses per sampling interval of the finest grid of block pulses; 1 without a grid.
+    /// Number of pulses per sampling interval of the finest grid of block pulses; 1 if the samples are computed by
+    /// transforms, without a grid.
     pub refinement: usize,
-    /// Change of each output that is expected if the step is halved again, relative to the largest magnitude of the
-    /// output. It is infinite if fewer than three steps were simulated.
+    /// Estimated error of each output relative to its largest magnitude: the change that is expected if the step is
+    /// halved again, or a bound of the error of transforms. It is infinite if fewer than three steps were simulated.
     pub change: Vec<f64>,
 }
 
@@ -306,7 +307,7 @@ impl<'a> SampleResponses<'a> {
                     continue;
                 }
                 let feedthrough: f64 = terms.iter().filter(|(_, eta)| *eta <= ORDER_TOLERANCE).map(|(c, _)| c).sum();
-                // The transform of a jump has its mean value.
+                // At a jump, the inverse transform gives the mean of the values before and after it.
                 let mut row = response(equation, 0.5 * feedthrough, &|point| {
                     terms.iter().map(|&(c, eta)| point.integration(eta + 1.0) * c).sum()
                 });
@@ -484,7 +485,7 @@ fn has_smooth_aliases(equation: &Equation, step: f64) -> bool {
     let (output, order) = (structure.output, structure.order);
     let terms: Vec<(f64, f64)> = terms_of(equation, output).map(|(c, eta)| (c, order - eta)).collect();
     let frequency = MAX_POLE_FREQUENCY_RATIO * std::f64::consts::PI / step;
-    // Above this frequency the terms of the output decrease further, so that the denominator has no zero.
+    // The sum of |c| ω^−η decreases with ω. If it is below 1 here, the denominator 1 − Σ c s^−η has no zero above.
     terms_of(equation, output).all(|(_, eta)| eta > ORDER_TOLERANCE)
         && terms_of(equation, output).map(|(c, eta)| c.abs() * libm::pow(frequency, -eta)).sum::<f64>() < 1.0
         && !is_unstable(order, &terms)

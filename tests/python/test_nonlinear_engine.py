@@ -262,7 +262,7 @@ def test_derivatives_of_residuals_are_those_of_differences(name, initial, inters
 
 @pytest.mark.parametrize("velocity", [0.0, 0.75])
 def test_a_self_oscillation_stays_on_its_limit_cycle(velocity):
-    # The linear part is unstable: errors that the damping did not feel would grow with exp(0.75 t), 6e9 times.
+    # The linear part is unstable: without the non-linear damping, errors would grow as exp(0.75 t), by 6e9.
     def slope(_, x):
         return [x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]]
 
@@ -295,8 +295,8 @@ def test_a_self_oscillation_is_identified_with_intervals():
 
 #: Plants of order 1 whose outputs have a kink where the input jumps: equation, derivative of y, true coefficients.
 FIRST_ORDER = {
-    "input beside": ("D y = k y^2 + b u", lambda y, u: u - y**2, {"k": -1.0, "b": 1.0}),
-    "input inside": ("D y = k y*u + b u^2", lambda y, u: 0.7 * u**2 - 0.5 * y * u, {"k": -0.5, "b": 0.7}),
+    "added input": ("D y = k y^2 + b u", lambda y, u: u - y**2, {"k": -1.0, "b": 1.0}),
+    "input in a term": ("D y = k y*u + b u^2", lambda y, u: 0.7 * u**2 - 0.5 * y * u, {"k": -0.5, "b": 0.7}),
     "functions": ("D y = k tanh(y) + b tanh(u)", lambda y, u: np.tanh(u) - 2 * np.tanh(y), {"k": -2.0, "b": 1.0}),
 }
 

@@ -11,7 +11,7 @@ use ftlm::simulate::respond;
 use crate::common::{equation, record, with_signal, Random};
 use crate::search::{data, truth};
 
-/// A record and an equation on it, a third of them unstable, some with coefficients fitted and some far off.
+/// A record and an equation for it. A third of the equations are unstable; half have fitted coefficients.
 fn random_candidate(random: &mut Random) -> (Record, Equation) {
     let m = 30 + random.below(300);
     let step = 10.0_f64.powf(random.uniform(-3.0, 0.0));
@@ -40,7 +40,7 @@ fn random_candidate(random: &mut Random) -> (Record, Equation) {
 
 #[test]
 fn bound_is_tight_for_errors_along_a_test_vector() {
-    // A wrong gain under a square wave: the bound must see a good part of the error, or it would exclude nothing.
+    // A wrong gain under a square wave: a bound far below the error would exclude nothing.
     let mut random = Random::new(246);
     let current: Vec<f64> = (0..1024).map(|k| if k / 100 % 2 == 0 { 0.3 } else { -0.3 }).collect();
     let rest = record(0.01, vec![vec![0.0; 1024], random.steps(1024, 40), current]);
@@ -74,7 +74,7 @@ fn the_bound_never_exceeds_the_error() {
             let bounds = lower_bounds(&record, &equation, norm).unwrap();
             assert!(bounds.iter().all(|b| *b >= 0.0));
             for bound in bounds {
-                // A run that leaves floating point has no error to compare with.
+                // A simulation that overflows has no error to compare with.
                 assert!(bound <= error || !error.is_finite(), "bound {bound:e}, error {error:e}, {equation:?}");
                 if error.is_finite() {
                     closest[i] = closest[i].max(bound / error);
@@ -90,15 +90,15 @@ fn the_bound_never_exceeds_the_error() {
 #[test]
 fn test_vector_bounds_hold_for_other_equations_and_are_tight_for_its_own() {
     let mut random = Random::new(252);
-    let (mut telling, mut own, mut finite) = (0, 0, 0);
+    let (mut excluded_by_other, mut own, mut finite) = (0, 0, 0);
     for _ in 0..1500 {
         let (record, equation) = random_candidate(&mut random);
-        // Of the same orders and somewhat other coefficients, or of any.
-        let mut made_for = random_candidate(&mut random).1;
+        // Test vectors of an equation with the same orders and perturbed coefficients, or of an unrelated one.
+        let mut source_equation = random_candidate(&mut random).1;
         let alike = random.chance(0.7);
         if alike {
-            made_for = equation.clone();
-            made_for.coefficients.iter_mut().for_each(|c| *c *= 1.0 + 0.1 * random.normal());
+            source_equation = equation.clone();
+            source_equation.coefficients.iter_mut().for_each(|c| *c *= 1.0 + 0.1 * random.normal());
         }
         for norm in [Norm::L1, Norm::L2] {
             let error = raw_error(&record, &equation, norm);
@@ -107,15 +107,15 @@ fn test_vector_bounds_hold_for_other_equations_and_are_tight_for_its_own() {
             }
             finite += 1;
             let by = |other: &Equation, limit: f64| excluded_by(&record, other, &equation, norm, limit).unwrap();
-            assert!(!by(&made_for, error) && !by(&equation, error), "{error:e} is that of {equation:?}");
-            telling += usize::from(alike && by(&made_for, 0.5 * error));
+            assert!(!by(&source_equation, error) && !by(&equation, error), "{error:e} is that of {equation:?}");
+            excluded_by_other += usize::from(alike && by(&source_equation, 0.5 * error));
             own += usize::from(by(&equation, 0.999 * error));
         }
     }
     println!(
-        "of {finite} errors, half is excluded by a neighbour's vector {telling} times, nearly all by its own {own}"
+        "of {finite} errors, {excluded_by_other} are excluded by the vector of a similar equation, {own} by their own"
     );
-    assert!(telling > 300 && own > 1000 && finite > 1500);
+    assert!(excluded_by_other > 300 && own > 1000 && finite > 1500);
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn no_score_below_the_threshold_is_excluded() {
         let (record, equation) = random_candidate(&mut random);
         let (structure, coefficients) = (&equation.structure, &equation.coefficients);
         let fixed: Vec<Option<f64>> = coefficients.iter().map(|&c| random.chance(0.2).then_some(c)).collect();
-        // From the very coefficients, and from others.
+        // From the tested coefficients, and from perturbed ones.
         let elsewhere: Vec<f64> = coefficients.iter().map(|c| c * random.uniform(-1.0, 2.0)).collect();
         for norm in [Norm::L1, Norm::L2] {
             let error = raw_error(&record, &equation, norm);
@@ -135,10 +135,10 @@ fn no_score_below_the_threshold_is_excluded() {
             }
             finite += 1;
             for start in [coefficients, &elsewhere] {
-                let asked = |limit: f64| is_infeasible(&record, structure, &fixed, start, norm, limit).unwrap();
-                assert!(!asked(error), "{error:e} is reached by {equation:?}");
-                assert!(!asked(2.0 * error));
-                excluded += usize::from(asked(1e-3 * error));
+                let is_excluded = |limit: f64| is_infeasible(&record, structure, &fixed, start, norm, limit).unwrap();
+                assert!(!is_excluded(error), "{error:e} is reached by {equation:?}");
+                assert!(!is_excluded(2.0 * error));
+                excluded += usize::from(is_excluded(1e-3 * error));
             }
         }
     }
@@ -160,8 +160,8 @@ fn bounds_reject_invalid_equations() {
     assert!(matches!(lower_bounds(&record, &short, Norm::L1), Err(Error::Length { .. })));
     let missing = equation(0, 1.0, &[(7, 0.0, 1.0)]);
     assert!(matches!(lower_bounds(&record, &missing, Norm::L1), Err(Error::Structure { .. })));
-    for (made_for, equation) in [(&short, &truth()), (&truth(), &short)] {
-        assert!(matches!(excluded_by(&record, made_for, equation, Norm::L1, 1.0), Err(Error::Length { .. })));
+    for (source_equation, equation) in [(&short, &truth()), (&truth(), &short)] {
+        assert!(matches!(excluded_by(&record, source_equation, equation, Norm::L1, 1.0), Err(Error::Length { .. })));
     }
     assert!(matches!(excluded_by(&record, &missing, &truth(), Norm::L1, 1.0), Err(Error::Structure { .. })));
 }

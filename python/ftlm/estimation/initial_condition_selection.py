@@ -53,8 +53,8 @@ def fit_with_offset_decision(
 
     With ``offset="auto"``, the function `estimate` fits the structure, and a constant is added to each equation if it
     is significant. The structure with the constant is fitted first, because a fit that lacks a necessary constant may
-    end at any wrong optimum. With every other offset, and for non-linear models, for which there is no test of an
-    offset, the functions in `fits` fit the structure.
+    end at any wrong optimum. For a non-linear model, fits without offset, with a constant and with an output level are
+    compared. With every other offset, the functions in `fits` fit the structure as given.
     """
     if structure.offset == "auto" and not structure.is_linear:
         fit = _fit_with_start_decision(replace(structure, offset="none"), replace(fits, may_add_offset=True))
@@ -147,7 +147,7 @@ class InitialConditionFits:
 def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -> Fit:
     """Return the fit of a structure, with a constant, nonzero initial conditions or levels if they are significant."""
     fit = fits.fit(structure)
-    constant = _fit_with_constant(fit, structure, fits)
+    constant = _fit_with_offset(fit, structure, fits)
     if constant is not None:
         return constant
     restart = _fit_if_rest_rejected(fit, structure, fits)
@@ -171,12 +171,13 @@ def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -
     return replace(fit, findings=[*fit.findings, *offset_findings])
 
 
-def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return the fit with a constant in the equations; None if a level suffices or the constant is no improvement.
+def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
+    """Return the fit with a significant constant in the equations or output level; None if there is none.
 
+    A level is tried for non-linear models only. For a linear plant that does not integrate, the result is None, because
+    a level suffices and is tried later.
     No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
-    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum. For a
-    non-linear plant, the fit with a level of the outputs is returned if it is better still.
+    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
     """
     automatic = structure.initial == "auto" and structure.offset == "none" and fits.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":
@@ -205,7 +206,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
     joint = candidate.joint
     is_constant_better = joint is not None and joint.unstable_optimum is None and is_better(joint)
     if structure.has_nonlinear_terms:
-        # A non-linear model with an output level is no model with a constant in other coordinates.
+        # In a linear model, an output level is equivalent to a constant. In a non-linear model it is not.
         level = _fit_with_level(candidate if is_constant_better else fit, structure, fits, is_suggested=True)
         if level is not None:
             return level

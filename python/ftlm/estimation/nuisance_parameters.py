@@ -19,9 +19,9 @@ from ftlm.estimation.output_error import (
     JointFit,
     Loss,
     fit_output_error,
-    level_count,
     run_multistart,
     start_from_values,
+    uncounted_level_count,
 )
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -612,11 +612,11 @@ def refit_after_screening(
                 for run_residuals in objective.residuals(screening)
             ],
             initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run)
-            + level_count(runs, structure),
+            + uncounted_level_count(runs, structure),
         )
         if not accepts(optimistic):
             return None
-        # Jacobian and samples of the screening would take much of the memory of a fit of a long record.
+        # The Jacobian and samples of the screening are released before the fit, which needs as much memory.
         del objective, screening, optimistic
         fit = fit_output_error(runs, structure, initial_fit=joint, loss=loss, refine=False)
         if refine and accepts(fit):

@@ -372,16 +372,16 @@ def fit_output_error(
         starts=result["starts"],
         survivors=result["survivors"],
         initial=structure.initial,
-        initial_terms=result["initial_terms"] + level_count(runs, structure),
+        initial_terms=result["initial_terms"] + uncounted_level_count(runs, structure),
         unstable_optimum=None if result["unstable_optimum"] is None else UnstableOptimum(*result["unstable_optimum"]),
         prior_fractions=dict(zip((n for n in problem.names if n in priors), result["prior_fractions"], strict=True)),
     )
 
 
-def level_count(runs: Sequence[Run], structure: Structure) -> int:
-    """Return the number of output levels over all runs that the core does not count as initial terms.
+def uncounted_level_count(runs: Sequence[Run], structure: Structure) -> int:
+    """Return the number of output levels over all runs that are not among the initial terms of the compiled fit.
 
-    In a non-linear model the levels are initial states, which the core counts.
+    It is 0 for non-linear models, whose levels are initial states and counted as such.
     """
     return len(runs) * len(structure.outputs) if structure.offset == "level" and structure.is_linear else 0
 

@@ -207,7 +207,7 @@ pub fn covariance_of_residuals(
         for_white_noise
     } else {
         check_length("residuals", samples, series.iter().map(Vec::len).sum())?;
-        // The outer factor is the same for any middle factor, so the latter is computed in the singular basis.
+        // The covariance is B M Bᵀ. B does not depend on the noise, and M is computed in the basis of the regressors.
         let sandwich = |middle: &[f64]| -> Vec<f64> {
             let middle_rows: Vec<Vec<f64>> = middle.chunks(basis.len().max(1)).map(<[f64]>::to_vec).collect();
             let products: Vec<Vec<f64>> =

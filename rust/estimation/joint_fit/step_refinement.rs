@@ -143,10 +143,10 @@ pub fn refine_step<'a>(
 /// It is used for long records and for models with nonlinear terms other than friction, because both are slow to fit on
 /// fine pulse grids.
 ///
-/// At the optimum, the residuals on two finer pulse grids are extrapolated to zero pulse length. This limit minus the
-/// residuals on `objective` hardly depends on the parameters. It is added to the samples, and the model is fitted again
-/// on `objective`, until the estimate converges (Stetter, doi:10.1007/BF01432879). The finer pulse grids are simulated
-/// without derivatives.
+/// At the optimum, the residuals on two finer pulse grids are extrapolated to zero pulse length. The difference between
+/// this limit and the residuals on the pulse grid of `objective` hardly depends on the parameters. This difference is
+/// added to the samples, and the model is fitted again on the same grid, until the estimate converges (Stetter,
+/// doi:10.1007/BF01432879). The finer pulse grids are simulated without derivatives.
 ///
 /// # Errors
 /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]). An error if the runs cannot be sampled at a

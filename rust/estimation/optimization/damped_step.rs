@@ -61,7 +61,7 @@ impl LinearizedProblem {
             (0..jacobian.len()).partition(|&i| problem.is_eliminated(i));
         let eliminated_count = order.len();
         order.extend(other_parameters);
-        // Columns are computed where they are needed: stored, they would take as much memory as the Jacobian.
+        // Columns are computed where they are needed, because stored columns would double the memory of the Jacobian.
         let factors: Vec<f64> = order.iter().map(|&i| problem.coordinate_derivative(point, i)).collect();
         let couplings: Vec<_> = order.iter().map(|&i| problem.coupled_derivatives(point, i)).collect();
         let append_column = |column: usize, rows: Range<usize>, out: &mut Vec<f64>| {

@@ -357,8 +357,8 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                     return Ok(None);
                 }
                 let trial_point = problem.point_of_evaluation(&trial_evaluation, next_point.clone());
-                // The linearization replaces the Jacobian of this point. On long records, two of them would take most of
-                // the memory.
+                // The linearization replaces the Jacobian of this point, which is released first: two Jacobians would
+                // take most of the memory on long records.
                 state.jacobian = Vec::new();
                 let jacobian = self.checked_jacobian(&trial_point, &mut trial_evaluation)?;
                 Ok(Some((jacobian, trial_evaluation, trial_cost, trial_point)))

@@ -80,7 +80,7 @@ impl<P> Evaluation<P> {
     }
 }
 
-/// Append the values of one experiment to those of the previous ones, without a copy for the first experiment.
+/// Append the values of one experiment to those of the previous ones. Those of the first experiment are not copied.
 pub(crate) fn append(all: &mut Vec<f64>, values: Vec<f64>) {
     if all.is_empty() {
         *all = values;

@@ -182,8 +182,8 @@ impl Companion {
     /// Call `visit` with the states of the response of 1/A at each compared sample, and the input just after it. None
     /// if the discretization overflows.
     ///
-    /// The response is to an input, or to an impulse if `input` is None. `series_output` is an output row with a direct
-    /// gain. The output that they define is the input of a second system 1/A in series, whose states follow those of the
+    /// The response is to an input, or to an impulse if `input` is None. `series_output` holds C and D of an output
+    /// C x + D u. This output is the input of a second system 1/A in series, whose states are appended to those of the
     /// first.
     fn visit_response(
         &self,
