@@ -112,10 +112,10 @@ def test_every_step_of_the_way_out_is_tried(bench, failing, monkeypatch):
         ["the watchdog was allowed to expire instead, which sets 0 V"] if failing in ("write", "enable") else []
     )
     monkeypatch.undo()
-    # A watchdog that was not told to stop does not end by itself.
-    if getattr(bench.board, "_process", None) is not None:
-        bench.board._process.kill()
+    started = time.monotonic()
     shut_down(bench.board)
+    # A watchdog that was not told to stop while its board was open is not waited for.
+    assert time.monotonic() - started < 4.0
 
 
 def test_a_second_ctrl_c_does_not_cut_the_way_out_short(bench, monkeypatch):
@@ -390,7 +390,7 @@ def checked_writes(volts, rate, limits):
     return over.max(), jump.max(), heat.max()
 
 
-@pytest.mark.parametrize(("kind", "count"), [("virtual", 50_000), ("q8", 10_000)])
+@pytest.mark.parametrize(("kind", "count"), [("virtual", 20_000), ("q8", 10_000)])
 def test_no_write_is_outside_the_limits(kind, count, tmp_path, monkeypatch):
     bench = Bench(kind, tmp_path, monkeypatch, parameters=LOOSE, rate=8000.0)
     rng = np.random.default_rng(11)

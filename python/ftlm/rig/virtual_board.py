@@ -207,8 +207,9 @@ class VirtualBoard:
             self._page.set("timeout", 0.0)
             self._page.set("closed", 1)
         if self._process is not None:
+            # The process reads the request to end in the registers, which a closed board no longer has.
             try:
-                self._process.wait(timeout=5.0)
+                self._process.wait(timeout=0.0 if self._page is None else 5.0)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
