@@ -76,7 +76,7 @@ def with_faults(u, y, rng):
     yield "wrap", u, (4 * y / size + np.pi) % (2 * np.pi) - np.pi
 
 
-@slow_after(1, "seeds", [4, 20])
+@slow_after(1, "seeds", [2, 20])
 def test_injected_faults_are_found_and_clean_runs_raise_no_alarm(seeds):
     found, injected, alarms = {}, {}, []
     for seed, h, u, y, rng in clean_runs(seeds):

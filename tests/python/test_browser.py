@@ -284,7 +284,7 @@ def test_without_scripts_everything_but_zoom_and_sliders_is_there(browser, at, n
 
 
 #: Each page and each scheme; make test-slow takes all pairs.
-IN_SCHEMES = [("fit", "dark"), ("search", "light"), ("model", "dark")]
+IN_SCHEMES = [("fit", "dark"), ("search", "light")]
 
 
 @slow_after(

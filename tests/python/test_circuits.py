@@ -203,7 +203,7 @@ def test_an_exponent_ends_at_1_and_bounds_are_kept():
 
 
 @pytest.mark.parametrize("resistance", [0.0, *(pytest.param(r, marks=pytest.mark.slow) for r in (1e-6, 3e-6, 6e-6))])
-@slow_after(1, "seeds", [4, 20])
+@slow_after(1, "seeds", [2, 20])
 def test_a_small_resistance_has_an_interval_on_the_scale_of_the_data(resistance, seeds):
     frequency = np.geomspace(0.01, 1e4, 60)
     s = 2j * np.pi * frequency

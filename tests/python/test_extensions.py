@@ -64,7 +64,7 @@ def codes_of(run, equation="D y = a y + b u"):
     return {f.code for f in ftlm.identify(run, ftlm.equation(equation)).findings}
 
 
-@slow_after(1, "seeds", [2, 6])
+@slow_after(1, "seeds", [1, 6])
 @pytest.mark.parametrize("kind", MISSING)
 def test_what_a_first_order_model_lacks_is_named(kind, seeds):
     *plant, expected = MISSING[kind]
@@ -112,7 +112,7 @@ def test_a_given_delay_that_is_wrong_is_named_beside_the_right_one(rows, given):
     [[1.0], [1.0, -0.95], pytest.param([1.0, -1.92 * np.cos(0.2), 0.9216], marks=pytest.mark.slow)],
     ids=["white", "AR1", "AR2"],
 )
-@slow_after(1, "seeds", [5, 30])
+@slow_after(1, "seeds", [2, 30])
 def test_colored_noise_is_no_missing_dynamics(noise, seeds):
     right = [codes_of(record([1.0], [1 / RATE, 1.0], 0, seed, noise)) & CODES for seed in range(seeds)]
     assert sum(map(bool, right)) == 0, right

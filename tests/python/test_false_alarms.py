@@ -97,7 +97,7 @@ def test_a_step_within_noise_of_its_size_is_not_early():
     early = Counter()
     for kind in ("of motion", "coloured"):
         for plant in ("lag", "fractional", "swing"):
-            for name in ("pulses", "bursts", "multisine"):
+            for name in ("pulses", "multisine"):
                 r = ordinary.record(plant, name, kind, 2)
                 early[kind] += "moves_before_input" in codes(ftlm.identify(r.run, r.structure))
     assert sum(early.values()) <= 1, early

@@ -72,7 +72,7 @@ def weighed(found):
     return found.verdict.level, sorted((f.level, f.code) for f in found.findings)
 
 
-@slow_after(3, "fault", ["none", "order", "noise", "outliers"])
+@slow_after(2, "fault", ["none", "order", "noise", "outliers"])
 def test_verdicts_do_not_depend_on_names_scales_or_the_order_of_runs(fault):
     def runs_of(inside="u", outside="y", names=("first", "second"), scale=(1.0, 1.0)):
         runs = []

@@ -9,12 +9,12 @@ from targets import NEEDS, SLOW, TARGETS
 KEPT = sorted(path for path in REGRESSIONS.rglob("*") if path.is_file())
 
 
-@slow_after(1, "count", [100, 200])
+@slow_after(1, "count", [40, 200])
 @pytest.mark.parametrize("target", TARGETS)
 def test_mutations_end_well_or_in_an_error_of_ftlm(target, count):
     if target in NEEDS:
         pytest.importorskip(NEEDS[target])
-    count //= 50 if target in SLOW else 1
+    count //= 20 if target in SLOW else 1
     tried, faults = fuzz(target, seed=1, inputs=count)
     assert (tried, faults) == (count, {})
 

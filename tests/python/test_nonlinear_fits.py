@@ -281,7 +281,7 @@ def test_an_order_may_fall_below_an_integer_in_motion(start):
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
     structure = replace(ftlm.equation("D^alpha y = a y + c y^3 + b u"), initial="caputo")
     guess = {"alpha": start, "a": -1.2, "c": -0.8, "b": 2.0}
-    result = ftlm.identify(run, structure, method=ftlm.OutputError(start=guess))
+    result = ftlm.identify(run, structure, method=ftlm.OutputError(start=guess, intervals="quadratic"))
     truth = {"alpha": 0.9, "a": -1.2, "c": -0.8, "b": 2.0}
     for name, value in truth.items():
         estimate = result.parameters[name]

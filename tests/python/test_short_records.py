@@ -45,7 +45,7 @@ ASKED = {
 }
 
 
-@slow_after(1, "seeds", [12, 60])
+@slow_after(1, "seeds", [6, 60])
 @pytest.mark.parametrize("name", ASKED)
 def test_a_short_record_ends_in_a_result_or_in_words(name, seeds):
     for seed in range(seeds if name.startswith("identify") else seeds // 4):

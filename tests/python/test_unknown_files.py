@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import ftlm
 import unknown_files
 from ftlm.cli.main import app
+from slow_cases import slow_after
 
 
 def command(*words):
@@ -27,7 +28,7 @@ def files(tmp_path_factory):
     return folder, made
 
 
-@pytest.mark.parametrize("name", unknown_files.MAKERS)
+@slow_after(2, "name", unknown_files.MAKERS)
 @pytest.mark.usefixtures("reader_in_process")
 def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     folder, made = files
