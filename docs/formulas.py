@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from docutils.nodes import SkipNode
@@ -52,6 +53,7 @@ def draw(formula: str) -> str:
     return "".join(draw_part(part) for part in split_at_breaks(" ".join(formula.split())))
 
 
+@cache
 def draw_part(formula: str) -> str:
     """Return a part of a formula as one SVG drawing, aligned with the baseline of the text."""
     font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")

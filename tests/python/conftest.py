@@ -45,17 +45,55 @@ settings.register_profile("ftlm", derandomize=True, deadline=None)
 settings.load_profile("ftlm")
 
 
+#: Files that share what takes long to make, such as the reproduction or the drawn formulas, by the file's name.
+SHARED_SCOPES = {
+    "test_browser.py": "reproduction",
+    "test_reproduction.py": "reproduction",
+    "test_documents.py": "documents",
+    "test_pages_browser.py": "documents",
+}
+#: Files that take longest, which start first: one that starts last keeps the other workers waiting.
+LONGEST_FILES = (
+    "test_automatic.py",
+    "test_reproduction.py",
+    "test_browser.py",
+    "test_documents.py",
+    "test_pages_browser.py",
+    "test_rig_safety.py",
+    "test_first_rows.py",
+    "test_order_search.py",
+    "test_files.py",
+    "test_app_browser.py",
+    "test_app.py",
+    "test_store.py",
+    "test_extensions.py",
+    "test_monte_carlo.py",
+    "test_rig.py",
+    "test_friction.py",
+    "test_two_frictions.py",
+    "test_filtered_signals.py",
+)
+
+
 class ByFile(LoadScopeScheduling):
-    """One worker takes a file, so that what its tests share is made once; those of the dear reproduction go to one."""
+    """One worker takes a file, so that what its tests share is made once."""
 
     def _split_scope(self, nodeid):
         file = nodeid.split("::", 1)[0]
-        return "reproduction" if file.endswith(("test_browser.py", "test_reproduction.py")) else file
+        return SHARED_SCOPES.get(file.rpartition("/")[2], file)
 
 
 def pytest_xdist_make_scheduler(config, log):
     """Groups of pytest-xdist 3.8 are marked in names that pytest 9.2 no longer reads."""
+    # The files of most tests are not those that take longest.
+    config.option.loadscopereorder = False
     return ByFile(config, log)
+
+
+def pytest_collection_modifyitems(items):
+    """Sort the files that take longest to the front, in their sequence."""
+    ranks = {name: rank for rank, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: ranks.get(item.path.name, len(ranks)))
 
 
 @pytest.fixture(scope="module")

@@ -419,7 +419,8 @@ def test_record_identify_compare(tmp_path, capsys):
     square, sine, model = tmp_path / "square.csv", tmp_path / "sine.csv", tmp_path / "stage1.json"
     assert command("record", "--input", "square", "--amplitude", 0.3, "--period", 2, "--duration", 3, "-o", square) == 0
     assert command("record", "--input", "sine", "--amplitude", 0.5, "--duration", 3, "-o", sine) == 0
-    words = ["--structure", "flexible-link:1", "--laws", "orders", "--offset", "none", "--initial", "rest", "--intervals", "quadratic"]
+    words = ["--structure", "flexible-link:1", "--laws", "orders", "--offset", "none", "--initial", "rest"]
+    words += ["--intervals", "quadratic"]
     orders = [word for known in ("alpha1=2", "gamma1=1", "beta2=0") for word in ("--orders", known)]
     assert command("identify", square, *words, *orders, "-o", model) == 0
     assert command("compare", model, sine, "--min-fit", 60) == 0

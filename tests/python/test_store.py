@@ -323,7 +323,10 @@ def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
     assert section.processed_count == 5
 
 
-@pytest.mark.parametrize(("mask", "stride"), [pytest.param(0xFF, 1, marks=pytest.mark.slow), (0xFF, 25), pytest.param(0x01, 25, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("mask", "stride"),
+    [pytest.param(0xFF, 1, marks=pytest.mark.slow), (0xFF, 25), pytest.param(0x01, 25, marks=pytest.mark.slow)],
+)
 def test_a_store_flipped_at_any_byte_never_gives_a_wrong_row(run, whole, expected, tmp_path, mask, stride):
     path = tmp_path / "flipped.ftlm"
     path.write_bytes(whole)
