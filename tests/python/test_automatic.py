@@ -38,7 +38,8 @@ def record(
     [
         ([7.0], [1.0, 4.0], 6, "u(t - 0:0.667 s)"),
         ([12.0, 40.0], [1.0, 3.0, 40.0], 0, "D^1 u"),
-        ([60.0], [1.0, 6.0, 0.0], 0, "D^2 y = a1 D^1 y + b0 u"),
+        # That of the next test by default.
+        pytest.param([60.0], [1.0, 6.0, 0.0], 0, "D^2 y = a1 D^1 y + b0 u", marks=pytest.mark.slow),
         ([1.0, 0.4, 30.0], [1.0, 0.5, 25.0], 0, "D^2 y = a1 D^1 y + a0 y + b2 D^2 u + b1 D^1 u + b0 u"),
     ],
 )

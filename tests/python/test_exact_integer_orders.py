@@ -190,7 +190,7 @@ def test_the_sign_before_a_coefficient_does_not_change_the_optimum(seed: int, of
 
 
 @slow_after(1, "seed", range(1, 5))
-@pytest.mark.parametrize("level", [0.03, 0.3, 3.0])
+@slow_after(2, "level", [0.03, 3.0, 0.3])
 def test_an_output_level_is_found_by_default(seed: int, level: float) -> None:
     # The smallest level is below the noise of one sample.
     result = ftlm.identify(two_modes_run(seed, level), ftlm.equation(two_modes("----")))
@@ -201,7 +201,7 @@ def test_an_output_level_is_found_by_default(seed: int, level: float) -> None:
     assert abs(result.parameters["level_y"].value - level) < 4.5 * result.parameters["level_y"].standard_error
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@slow_after(2, "seed", range(1, 5))
 def test_no_level_is_found_where_there_is_none(seed: int) -> None:
     result = ftlm.identify(two_modes_run(seed, 0.0), ftlm.equation(two_modes("----")))
     assert not result.findings

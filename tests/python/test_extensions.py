@@ -263,7 +263,7 @@ def resting(plant, u, seed, color, read=0.0, raised=0.0):
     return run, ftlm.equation(words, initial="rest")
 
 
-@slow_after(3, "color", [0.0, 0.8])
+@slow_after(1, "color", [0.8, 0.0])
 @pytest.mark.parametrize("kind", ONE_SIDED)
 @pytest.mark.parametrize("plant", RESTING)
 def test_an_offset_of_an_input_is_no_dead_zone(plant, kind, color):
