@@ -429,7 +429,7 @@ def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
 
 
 @slow_after(
-    3,
+    2,
     "structure",
     [
         "D y = a0 y + k y^3 + b0 u",

@@ -347,7 +347,8 @@ def test_auto_finds_dry_friction_behind_a_dead_time() -> None:
     assert values == pytest.approx({"a0": -0.8, "b0": 1.0, "fc": 0.25, "delay_u": 0.6}, rel=0.05)
 
 
-@slow_after(1, "rows", [1200, 3000])
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [1200, 3000])
 def test_friction_is_found_beside_a_delay_that_further_poles_replace(rows):
     # Without friction, four poles and three zeros fit better than a delay of 7.4 samples. The encoder is coarse.
     t = np.arange(rows) * 0.005
