@@ -1,6 +1,6 @@
 //! Initial states and constant forces of a run, as powers of t in outputs and velocities.
 
-use super::system::is_derived_from_output;
+use super::channels::is_derived_from_output;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};

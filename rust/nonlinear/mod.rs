@@ -15,6 +15,7 @@ mod initial_state;
 mod input_continuation;
 mod jumps;
 mod model;
+mod operators;
 mod pulse;
 mod sensitivity;
 mod system;
@@ -93,7 +94,7 @@ impl NonlinearSystem {
         self.check()?;
         check_length("initial terms", self.equations.len(), initial.len())?;
         let (powers, impulses) = split_impulses(initial);
-        let operators = time_stepping::Operators::new(self, record)?;
+        let operators = operators::Operators::new(self, record)?;
         let mut forcing = operators.initial_forcing(self, &powers)?;
         operators.add_inputs(self, record, &mut forcing);
         let (run, end) = operators.run(self, &forcing, None);

@@ -3,9 +3,10 @@
 use super::channels::{ForcingTerms, InputDerivative, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
 use super::input_continuation::InputContinuation;
+use super::operators::Operators;
 use super::sensitivity::{OutputDerivatives, SensitivityCache};
 use super::system::NonlinearSystem;
-use super::time_stepping::{LinearizedRun, Operators};
+use super::time_stepping::LinearizedRun;
 use crate::equation::Equation;
 use crate::error::{Error, Result};
 use crate::estimation::output_error::{Experiment, FreeModel, Monomial};

@@ -2,8 +2,8 @@
 
 use super::channels::PulseFailure;
 use super::contact::PulseEquations;
+use super::operators::{ExpressionArgument, Operators};
 use super::system::NonlinearSystem;
-use super::time_stepping::{ExpressionArgument, Operators};
 use crate::expression::Values;
 use crate::linalg::small;
 

@@ -1,6 +1,6 @@
 //! Systems of equations with non-linear terms and dry friction, with given orders and coefficients.
 
-use super::channels::StateChannel;
+use super::channels::{is_derived_from_output, StateChannel, MIN_INTEGRATION_ORDER};
 use super::convolution::MAX_FEEDTHROUGH_ORDER;
 use super::initial_state::Link;
 use crate::equation::{check_regular, Equation, Term, ORDER_GRAIN};
@@ -9,22 +9,6 @@ use crate::expression::DerivedSignal;
 use crate::friction::contact::is_p_matrix;
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
-
-/// Minimum integration order of a linear term: order of the equation minus order of the term.
-pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
-
-/// Maximum order of a derivative that is computed from the pulse means of an output. A derivative amplifies errors of
-/// short duration, the more so the higher its order.
-const MAX_DIFFERENTIATION_ORDER: f64 = 0.5;
-
-/// Return true if a linear term with integration order η enters the derivative D^ρ of an output as I^{η−ρ} y, computed
-/// from the pulse means of y. Return false if it enters as I^η D^ρ y.
-///
-/// In the second form, y does not enter the equation of D^ρ y. If the linear part of the equation is unstable, errors of
-/// y then grow, because non-linear terms that depend on D^ρ y do not act against them.
-pub(super) fn is_derived_from_output(eta: f64, rho: f64) -> bool {
-    rho > ORDER_GRAIN && eta >= MIN_INTEGRATION_ORDER && eta - rho >= -MAX_DIFFERENTIATION_ORDER
-}
 
 /// Equations with non-linear terms and dry friction, with given orders and coefficients.
 ///

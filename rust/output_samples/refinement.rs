@@ -46,7 +46,7 @@ pub struct RefinedSamples {
     /// Number of pulses per sampling interval of the finest grid of block pulses; 1 if the samples are computed by
     /// transforms, without a grid.
     pub refinement: usize,
-    /// Estimated error of each output relative to its largest magnitude: the change that is expected if the step is
+    /// Error estimate of each output relative to its largest magnitude: the change that is expected if the step is
     /// halved again, or a bound of the error of transforms. It is infinite if fewer than three steps were simulated.
     pub change: Vec<f64>,
 }

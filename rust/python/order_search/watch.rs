@@ -48,7 +48,8 @@ pub fn run_checkpointed<T: Send>(
             while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 let callbacks = Python::attach(|py| {
                     py.check_signals()?;
-                    if let Some(progress) = progress {
+                    // Before the search has counted its candidates, there is no total to report.
+                    if let Some(progress) = progress.filter(|_| progress_counts(&control).1 > 0) {
                         progress.call1(py, progress_counts(&control))?;
                     }
                     if let Some(save) = save {
