@@ -229,13 +229,14 @@ impl NonlinearSystem {
             let channel = states[processed];
             for term in &self.equations[channel.equation()].structure.terms {
                 let eta = self.equations[channel.equation()].structure.order - term.order;
-                match self.output_index(channel.equation(), term.signal) {
-                    Some(l) if !(channel.is_at_ends() && self.couples_by_means(channel.equation(), l, eta)) => {
-                        if channel.is_at_ends() || !is_derived_from_output(eta, channel.order()) {
-                            add(&mut states, channel.with_equation(l));
-                        }
-                    }
-                    _ => {}
+                let Some(output) = self.output_index(channel.equation(), term.signal) else { continue };
+                let enters_by_means = if channel.is_at_ends() {
+                    self.couples_by_means(channel.equation(), output, eta)
+                } else {
+                    is_derived_from_output(eta, channel.order())
+                };
+                if !enters_by_means {
+                    add(&mut states, channel.with_equation(output));
                 }
             }
             processed += 1;

@@ -101,7 +101,7 @@ fn derivative_by_input_limit_matches_the_residuals() -> Result<(), Error> {
         // Held inputs act at once at their samples; friction is followed on pulse means alone.
         for held in [false, true] {
             experiment.point_values =
-                vec![PointValues::default(), PointValues { values: None, is_zero_order_hold: held }];
+                vec![PointValues::default(), PointValues { values: None, is_zero_order_hold: held }].into();
             let here = |value: f64| {
                 let start = ParameterPoint { orders: vec![1.7], coefficients: vec![0.8, 1.4], inputs: vec![value] };
                 output_error::fit(&linear(law), std::slice::from_ref(&experiment), &start, settings)
@@ -111,7 +111,7 @@ fn derivative_by_input_limit_matches_the_residuals() -> Result<(), Error> {
             assert!(norm(&slope) > 0.0);
             assert!(relative_distance(&at.jacobian[3], &slope) < 1e-9, "{law:?} {held}");
         }
-        experiment.point_values.clear();
+        experiment.point_values = std::sync::Arc::default();
         let here = |value: f64| {
             let start = InitialGuess {
                 orders: vec![1.7],

@@ -274,7 +274,7 @@ fn problems_without_initial_guess_are_rejected() {
         }
     }
     let mut short = experiments[0].clone();
-    short.samples[1].pop();
+    Arc::make_mut(&mut short.samples)[1].pop();
     assert!(matches!(
         fit(&model, &[short], &point(&ORDERS, &COEFFICIENTS), MinimizationSettings::default()),
         Err(Error::Length { .. })
@@ -449,7 +449,7 @@ fn feedthrough_derivative_matches_the_residuals() {
             .cloned()
             .map(|values| PointValues { values: Some(values), is_zero_order_hold: false });
         experiment.point_values =
-            instants.chain([PointValues { values: Some(held), is_zero_order_hold: true }]).collect();
+            instants.chain([PointValues { values: Some(held), is_zero_order_hold: true }]).collect::<Vec<_>>().into();
         let at = |c: &[f64], delay: f64| {
             let inputs = model.inputs.iter().map(|_| delay).collect();
             let start = ParameterPoint { orders: Vec::new(), coefficients: c.to_vec(), inputs };
