@@ -313,14 +313,16 @@ mod tests {
 
     #[test]
     fn initial_values_have_the_powers_of_caputo_derivatives() -> Result<()> {
-        // D² y = −c D^0.6 y from y = 3 + 2 t: y is 3 + 2 t plus −c I^1.4 (y − 3), whose 3 t^1.4 cancels.
-        let links = vec![vec![Link { output: 0, order: 0.6, integration: 1.4, coefficient: -0.7 }]];
-        let taken = 0.7 * 3.0 / libm::tgamma(2.4);
-        let powers = vec![vec![(0.0, 3.0), (1.0, 2.0), (1.4, taken)]];
+        // D² y = −0.7 D^1.7 y from y = 3 + 2 t: y is 3 + 2 t plus −0.7 I^0.3 (y − 3), whose 3 t^0.3 cancels in D y.
+        let links = vec![vec![Link { output: 0, order: 1.7, integration: 0.3, coefficient: -0.7 }]];
+        let taken = 0.7 * 3.0 / libm::tgamma(1.3);
+        let powers = vec![vec![(0.0, 3.0), (1.0, 2.0), (0.3, taken)]];
         assert_eq!(derivative_powers(0, 1.0, &links, &powers)?, [(0.0, 2.0)]);
+        // D^0.5 y is computed from y, of which the term differentiates the jump to 3 as well.
         let half = derivative_powers(0, 0.5, &links, &powers)?;
-        assert!(half.len() == 1 && (half[0].0 - 0.5).abs() < 1e-12);
+        assert!(half.len() == 2 && (half[0].0 - 0.5).abs() < 1e-12 && (half[1].0 + 0.2).abs() < 1e-12);
         assert!((half[0].1 - 2.0 / libm::tgamma(1.5)).abs() < 1e-12);
+        assert!((half[1].1 - taken * libm::tgamma(1.3) / libm::tgamma(0.8)).abs() < 1e-12);
         assert_eq!(derivative_powers(0, 0.0, &links, &powers)?.len(), 3);
         Ok(())
     }
