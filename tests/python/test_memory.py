@@ -265,6 +265,34 @@ def test_a_long_record_is_fitted_in_little_memory(tmp_path):
     assert peak * 1024 < 150e6
 
 
+HALF_MILLION = (
+    PEAK_MEMORY
+    + """
+import numpy as np, sys, ftlm
+from scipy.signal import cont2discrete, lfilter
+rng, samples = np.random.default_rng(1), 500_000
+u = np.repeat(rng.choice([-1.0, 1.0], samples // 20), 20)
+b, a, _ = cont2discrete(([8.0, 144.0], [1.0, 1.2, 144.0]), 0.01)[:3]
+y = lfilter(np.ravel(b), a, u) + 0.02 * rng.standard_normal(samples)
+run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
+before = peak_memory()
+found = ftlm.identify(run, ftlm.equation(sys.argv[1] + " y = a1 D y + a0 y + b1 D u + b0 u"), threads=1)
+print(found.values["a0"], peak_memory() - before)
+"""
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks are counted in kB on Linux")
+@pytest.mark.parametrize(("derivative", "limit"), [("D^2", 300e6), ("D^alpha", 400e6)])
+def test_half_a_million_samples_are_fitted_in_the_memory_of_a_few_signals_per_parameter(derivative, limit):
+    command = [sys.executable, "-c", HALF_MILLION, derivative]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
+    stiffness, peak = map(float, done.stdout.split())
+    assert stiffness == pytest.approx(-144, rel=0.01)
+    assert peak * 1024 < limit
+
+
 INTEGRATE = """
 import resource
 import numpy as np

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import ftlm
@@ -234,6 +235,24 @@ def test_an_offset_of_the_sensor_is_estimated_as_a_level(offset):
     level = found.offsets["level_y"]
     assert abs(level.value - 5.0) < 3 * level.standard_error < 0.05
     assert found.joint.noise["y"] == pytest.approx(0.01, rel=0.1)
+    assert found.model.compare(run).fit["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
+    # The range of y is that in y^3, without the level.
+    ranges = next(finding.numbers["ranges"] for finding in found.findings if finding.code == "nonlinear_range")
+    low, high = map(float, re.fullmatch(r"y from (\S+) to (\S+)", ranges).groups())
+    assert abs(low) < 0.1
+    assert 1.0 < high < 2.0
+
+
+@slow_after(2, "seed", range(30))
+def test_colored_noise_is_no_level_beside_a_nonlinear_term(seed):
+    rng = np.random.default_rng(100 + seed)
+    u = np.repeat(rng.uniform(0, 2, 16), 25)
+    rest = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.zeros(u.size)})
+    y = ftlm.Model(ftlm.equation("D y = -1 y - 0.3 y^3 + 1 u")).simulate(rest, tolerance=1e-6)["y"]
+    noise = lfilter([0.6], [1, -0.8], rng.standard_normal(u.size + 50))[50:]
+    run = rest.with_outputs({"y": y + 0.02 * noise})
+    found = ftlm.identify(run, ftlm.equation("D y = a y + c y^3 + b u"), threads=1)
+    assert not {"level_estimated", "constant_estimated"} & {finding.code for finding in found.findings}
 
 
 def test_from_the_command_line_to_a_page(runs, tmp_path):

@@ -16,7 +16,7 @@ from ftlm.kernels import integrate
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import apply_input_nonlinearity
 from ftlm.simulation.nonlinear_columns import differentiate
-from ftlm.simulation.output_samples import OutputSamples, simulate_samples
+from ftlm.simulation.output_samples import LEVEL_EXPONENT, OutputSamples, simulate_samples
 from ftlm.structure.equation import Equation, Term, derivative
 from ftlm.structure.expression import Channel, channel
 from ftlm.utils.validation import Floats
@@ -39,9 +39,13 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], simulations: Sequence[
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
-    """Return samples of all signals by name: simulated outputs, and inputs with saturation and dead zone applied."""
+    """Return samples of all signals as they enter the equations, by name.
+
+    These are simulated outputs without their levels, and inputs with saturation and dead zone applied.
+    """
     limited = apply_input_nonlinearity(run.with_interpolated_gaps(), model.structure)
-    simulated = dict(zip(model.outputs, samples.outputs, strict=True))
+    levels = [samples.initial[output].get(LEVEL_EXPONENT, 0.0) for output in model.outputs]
+    simulated = {o: y - level for o, y, level in zip(model.outputs, samples.outputs, levels, strict=True)}
     return {name: simulated[name] if name in simulated else limited[name] for name in model.structure.signals}
 
 
