@@ -102,10 +102,10 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     })
 }
 
-/// Return the upper-triangular factor R of the QR factorization of k columns with m rows, row-major k × k, without the
-/// columns in memory. O(k²m).
+/// Return the upper-triangular factor R of the QR factorization of k columns with m rows, row-major k × k. O(k²m).
 ///
-/// `append_rows(j, rows, out)` appends the elements `rows` of column j to `out`.
+/// The columns are computed by blocks of rows and never stored as a whole: `append_rows(j, rows, out)` appends the
+/// elements `rows` of column j to `out`. It may be called more than once for the same rows.
 #[must_use]
 pub fn triangular_factor_by_blocks(
     (k, m): (usize, usize),

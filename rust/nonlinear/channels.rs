@@ -8,16 +8,16 @@ use crate::signal::block_pulse::PulseJump;
 /// Minimum integration order of a linear term: order of the equation minus order of the term.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// Maximum order of a derivative that is computed from the pulse means of an output. A derivative amplifies errors of
-/// short duration, the more so the higher its order.
+/// Maximum order ρ − η of a derivative that is computed from the pulse means of an output. Derivatives amplify
+/// high-frequency errors, the more so the higher their order.
 const MAX_DIFFERENTIATION_ORDER: f64 = 0.5;
 
 /// Return true if a linear term with integration order η enters the derivative D^ρ of an output as I^{η−ρ} y, computed
-/// from the pulse means of y. Return false if it enters as I^η D^ρ y.
+/// from the pulse means of y. Return false if it enters as I^η D^ρ y. Both are equal up to initial terms.
 ///
-/// In the second form, y does not enter the equation of D^ρ y. If the linear part of the equation is unstable, errors of
-/// y then grow, because non-linear terms that depend on D^ρ y do not act against them.
-pub(super) fn is_derived_from_output(eta: f64, rho: f64) -> bool {
+/// The second form has no feedback from y to D^ρ y. If the linear part of the equation is unstable, errors of y then
+/// grow, because non-linear terms that depend on D^ρ y do not act on them.
+pub(super) fn uses_output_means(eta: f64, rho: f64) -> bool {
     rho > ORDER_GRAIN && eta >= MIN_INTEGRATION_ORDER && eta - rho >= -MAX_DIFFERENTIATION_ORDER
 }
 

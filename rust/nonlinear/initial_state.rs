@@ -1,6 +1,6 @@
 //! Initial states and constant forces of a run, as powers of t in outputs and velocities.
 
-use super::channels::is_derived_from_output;
+use super::channels::uses_output_means;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, power_means};
@@ -108,8 +108,8 @@ impl PowerSum {
 /// `powers` holds the powers of t in every output. Return an error if the derivative has no mean over the first pulse.
 ///
 /// D^ρ I^η y equals I^η D^ρ y plus powers of t with coefficients from y(0), y′(0), …. These powers are added for terms
-/// that enter as I^η D^ρ y (`is_derived_from_output`). The initial terms of Caputo derivatives contain the same powers
-/// with opposite signs.
+/// that enter as I^η D^ρ y (`uses_output_means`). They cancel against those in the initial terms of Caputo
+/// derivatives.
 pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
@@ -126,7 +126,7 @@ pub(super) fn derivative_powers(
         let constants: Vec<f64> = powers.iter().map(coefficient_at).collect();
         let initial_outputs = solve_feedthrough(&constants, links)?;
         let integrates_derivative =
-            |link: &&Link| link.integration.abs() >= ORDER_GRAIN && !is_derived_from_output(link.integration, order);
+            |link: &&Link| link.integration.abs() >= ORDER_GRAIN && !uses_output_means(link.integration, order);
         for link in links[equation].iter().filter(integrates_derivative) {
             let exponent = link.integration + integer_order;
             let value = initial_outputs[link.output] * libm::tgamma(integer_order + 1.0);

@@ -157,8 +157,6 @@ pub(super) struct ExperimentLinearization {
     record: Option<Record>,
     operators: Operators,
     run: LinearizedRun,
-    /// Continuation of the inputs after samples at which they jump.
-    continuation: Option<InputContinuation>,
     /// Derivative of each input with respect to its free parameter.
     input_slopes: Vec<InputDerivative>,
 }
@@ -404,7 +402,7 @@ impl NonlinearModel {
             // With friction, the body's own reversals limit the order of convergence.
             let continuation =
                 if self.frictions.is_empty() { InputContinuation::new(experiment, record) } else { None };
-            let (run, end) = operators.run(&system, &forcing, continuation.as_ref());
+            let (run, end) = operators.run(&system, &forcing, continuation);
             if let Some(end) = end {
                 return Err(end.error(record.step()));
             }
@@ -419,7 +417,7 @@ impl NonlinearModel {
             let levels = powers.iter().map(|terms| terms.iter().filter(|(e, _)| e.is_infinite()).map(|(_, v)| v).sum());
             let levels = weighted_levels(experiment, &levels.collect::<Vec<f64>>());
             residuals.iter_mut().zip(levels).for_each(|(e, v)| *e -= v);
-            if continuation.is_some() {
+            if run.continuation.is_some() {
                 let corrections = run.sample_corrections(outputs.len(), experiment.compared_count());
                 let corrections = experiment.weighted_corrections(&corrections);
                 residuals.iter_mut().zip(corrections).for_each(|(e, v)| *e -= v);
@@ -433,7 +431,6 @@ impl NonlinearModel {
                 record: transformed_record,
                 operators,
                 run,
-                continuation,
                 input_slopes,
             });
         }
@@ -487,21 +484,12 @@ impl NonlinearModel {
                     }
                     _ => {
                         let derivatives = self.derivatives(point, index, part, parameter)?;
-                        let continuation = part.continuation.as_ref();
-                        let operators = &part.operators;
-                        operators.sensitivity(
-                            &part.system,
-                            record,
-                            &part.run,
-                            &mut cache,
-                            &derivatives,
-                            continuation,
-                        )?
+                        part.operators.sensitivity(&part.system, record, &part.run, &mut cache, &derivatives)?
                     }
                 };
                 // Residuals are measurement minus response.
                 let mut samples = experiment.weighted_samples(&slopes.means);
-                if part.continuation.is_some() {
+                if part.run.continuation.is_some() {
                     let corrections = slopes.sample_corrections(experiment.compared_count());
                     let corrections = experiment.weighted_corrections(&corrections);
                     samples.iter_mut().zip(corrections).for_each(|(v, correction)| *v += correction);

@@ -1,6 +1,6 @@
 //! Discretization of equations with non-linear terms: channels, kernels and weights on the pulses of a record.
 
-use super::channels::{is_derived_from_output, MIN_INTEGRATION_ORDER};
+use super::channels::{uses_output_means, MIN_INTEGRATION_ORDER};
 use super::channels::{ForcingTerms, IntegralKernel, StateChannel};
 use super::contact::ContactOperators;
 use super::convolution::{average_neighbors, product, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
@@ -134,7 +134,7 @@ impl Operators {
                     if at_ends && system.couples_by_means(j, l, eta) {
                         let mean = StateChannel::Mean { equation: l, order: 0.0 };
                         (state_index(mean), kernel_index(&mut integrals, eta - 1.0, true))
-                    } else if !at_ends && is_derived_from_output(eta, rho) {
+                    } else if !at_ends && uses_output_means(eta, rho) {
                         let mean = StateChannel::Mean { equation: l, order: 0.0 };
                         (state_index(mean), kernel_index(&mut integrals, eta - rho, false))
                     } else {

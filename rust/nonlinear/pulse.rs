@@ -22,25 +22,32 @@ const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 pub(super) struct Pulse<'a> {
     operators: &'a Operators,
     system: &'a NonlinearSystem,
+    /// Forcing of each state channel: the part that does not depend on this pulse.
     pub(super) free: Vec<f64>,
     /// Value at which each state channel is fixed; None if the equations determine it.
     fixed: Vec<Option<f64>>,
     /// For each state channel, whether it was fixed when `inverse` was computed. Without non-linear terms, the inverse
     /// depends on these flags only.
     fixed_in_inverse: Vec<bool>,
+    /// Means of the input channels in this pulse.
     pub(super) input_means: Vec<f64>,
+    /// Iterate: means of the state channels in this pulse.
     pub(super) z: Vec<f64>,
     /// Values of the non-linear terms at `z`, followed by the friction forces.
     pub(super) values: Vec<f64>,
+    /// Derivatives of the non-linear terms with respect to the state channels, then the input channels, row-major.
     pub(super) slopes: Vec<f64>,
+    /// Inverse Jacobian of the equations, row-major.
     pub(super) inverse: Vec<f64>,
     pub(super) determinant: f64,
+    /// Residual of the equation of each state channel.
     residual: Vec<f64>,
     /// Sum of the magnitudes of the terms in the equation of each state channel.
     magnitudes: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
     previous: Vec<f64>,
+    /// First function without a value at the iterate, and its argument.
     fault: Option<(&'static str, f64)>,
     arguments: Vec<f64>,
     work: Values,

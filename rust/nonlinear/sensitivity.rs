@@ -80,7 +80,6 @@ impl Operators {
         run: &LinearizedRun,
         cache: &mut SensitivityCache<'_>,
         derivatives: &SystemDerivatives,
-        continuation: Option<&InputContinuation>,
     ) -> Result<OutputDerivatives> {
         let states = self.states.len();
         let mut forcing = derivatives.forcing.channels.clone();
@@ -144,15 +143,16 @@ impl Operators {
             }
             None => None,
         };
-        let continued = continuation.map(|continuation| ContinuedDerivatives {
+        let continued = run.continuation.as_ref().map(|continuation| ContinuationDerivatives {
             continuation,
             derivatives,
             gains: self.gain_derivatives(derivatives, cache),
             inputs: self.input_gain_derivatives(system, derivatives, cache),
         });
         cache.linearize_contacts()?;
-        let parts = (derivatives, cache.contacts.as_ref(), continued.as_ref());
-        self.linear_run(run, &forcing, &input_derivatives, bodies, parts)
+        let forcing =
+            ForcingDerivatives { system: derivatives, channels: forcing, inputs: input_derivatives, continued };
+        self.linear_run(run, &forcing, bodies, cache.contacts.as_ref())
     }
 
     /// Return the derivatives of the gains of the inputs within a pulse.
@@ -191,19 +191,16 @@ impl Operators {
 
     /// Simulate the linearized equations. Return the derivatives of the outputs with respect to a parameter.
     ///
-    /// `forcing` holds the derivatives of the forcing of each state channel. `input_derivatives` holds indices of input
-    /// channels and the derivatives of their pulse means. `bodies` holds the derivatives of the initial states, gains
-    /// and friction laws of the bodies. `parts` holds the derivatives of the system, the responses to friction forces,
-    /// and the derivatives for the pulses with continued inputs.
+    /// `bodies` holds the derivatives of the initial states, gains and friction laws of the bodies, and `responses` the
+    /// responses to friction forces. Both are None without friction.
     fn linear_run(
         &self,
         run: &LinearizedRun,
-        forcing: &[Vec<f64>],
-        input_derivatives: &[(usize, Vec<f64>)],
+        forcing: &ForcingDerivatives<'_>,
         bodies: Option<(&ContactOperators, BodyDerivatives)>,
-        parts: (&SystemDerivatives, Option<&ContactResponses>, Option<&ContinuedDerivatives<'_>>),
+        responses: Option<&ContactResponses>,
     ) -> Result<OutputDerivatives> {
-        let (derivatives, responses, continued) = parts;
+        let ForcingDerivatives { system, channels, inputs: input_derivatives, continued } = forcing;
         let (states, values, count) = (self.states.len(), self.values(), self.sources());
         let width = states + self.input_means.len();
         let mut means = vec![Vec::with_capacity(self.m); self.outputs];
@@ -215,7 +212,7 @@ impl Operators {
         let mut inputs = vec![0.0; input_derivatives.len()];
         let mut bodies = bodies.map(|(contact, bodies)| (contact, MotionDerivatives::start(&bodies), bodies));
         for k in 0..self.m {
-            free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
+            free.iter_mut().zip(channels).for_each(|(free, row)| *free = row[k]);
             for (group, convolution) in self.kernel_contributions.iter().zip(&convolutions) {
                 free[group.state] += convolution.past_contribution();
             }
@@ -240,7 +237,7 @@ impl Operators {
             }
             self.solve_states(inverse, &free, &mut x);
             if let (Some((contact, motion, bodies)), Some(responses)) = (&mut bodies, responses) {
-                let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, derivatives));
+                let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, system));
                 let pulse_context = (&run.contacts, responses, k);
                 contact.add_friction_derivatives(pulse_context, intervals, bodies, motion, &mut x);
             }
@@ -315,6 +312,17 @@ impl OutputDerivatives {
     }
 }
 
+/// Derivatives of the forcing of the state channels with respect to a parameter.
+struct ForcingDerivatives<'a> {
+    system: &'a SystemDerivatives,
+    /// Derivatives of the forcing of each state channel, one value per pulse.
+    channels: Vec<Vec<f64>>,
+    /// Indices of input channels, and the derivatives of their pulse means.
+    inputs: Vec<(usize, Vec<f64>)>,
+    /// Derivatives for the pulses with continued inputs; None if no input is continued.
+    continued: Option<ContinuationDerivatives<'a>>,
+}
+
 /// Gain of an input in a state channel within the same pulse, and its derivative with respect to a parameter.
 struct InputGain {
     signal: usize,
@@ -323,8 +331,8 @@ struct InputGain {
     derivative: f64,
 }
 
-/// Derivatives for the pulses with continued inputs with respect to a parameter.
-struct ContinuedDerivatives<'a> {
+/// Derivatives with respect to a parameter that the pulses with continued inputs need.
+struct ContinuationDerivatives<'a> {
     continuation: &'a InputContinuation,
     derivatives: &'a SystemDerivatives,
     /// Derivatives of the contributions within a pulse, in the layout of [`Operators::gains`].
@@ -332,8 +340,8 @@ struct ContinuedDerivatives<'a> {
     inputs: Vec<InputGain>,
 }
 
-impl ContinuedDerivatives<'_> {
-    /// Change the derivative of the forcing of a pulse to that with continued inputs.
+impl ContinuationDerivatives<'_> {
+    /// Add the derivative of the change of the forcing by continued inputs to `free`.
     fn add_forcing(&self, run: &LinearizedRun, pulse: &ContinuedPulse, free: &mut [f64]) {
         let count = self.gains.len() / free.len();
         for (free, gains) in free.iter_mut().zip(self.gains.chunks(count)) {
@@ -341,7 +349,7 @@ impl ContinuedDerivatives<'_> {
             *free += gains.iter().zip(changes).map(|(gain, change)| gain * change).sum::<f64>();
         }
         for input in &self.inputs {
-            let change = self.continuation.change(input.signal, pulse.sample);
+            let change = self.continuation.continued_minus_actual(input.signal, pulse.sample);
             free[input.state] += input.derivative * change + input.gain * self.signal_change(input.signal, pulse);
         }
     }
@@ -349,7 +357,7 @@ impl ContinuedDerivatives<'_> {
     /// Return the derivative of the change of a signal in a pulse with continued inputs.
     fn signal_change(&self, signal: usize, pulse: &ContinuedPulse) -> f64 {
         let input = self.derivatives.inputs.iter().find(|input| input.signal == signal);
-        input.map_or(0.0, |input| self.continuation.change_derivative(input, pulse.sample))
+        input.map_or(0.0, |input| self.continuation.continued_minus_actual_derivative(input, pulse.sample))
     }
 
     /// Return the derivative of the change of an input channel, given by signal and order of the derivative.

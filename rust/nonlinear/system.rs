@@ -1,6 +1,6 @@
 //! Systems of equations with non-linear terms and dry friction, with given orders and coefficients.
 
-use super::channels::{is_derived_from_output, StateChannel, MIN_INTEGRATION_ORDER};
+use super::channels::{uses_output_means, StateChannel, MIN_INTEGRATION_ORDER};
 use super::convolution::MAX_FEEDTHROUGH_ORDER;
 use super::initial_state::Link;
 use crate::equation::{check_regular, Equation, Term, ORDER_GRAIN};
@@ -233,7 +233,7 @@ impl NonlinearSystem {
                 let enters_by_means = if channel.is_at_ends() {
                     self.couples_by_means(channel.equation(), output, eta)
                 } else {
-                    is_derived_from_output(eta, channel.order())
+                    uses_output_means(eta, channel.order())
                 };
                 if !enters_by_means {
                     add(&mut states, channel.with_equation(output));

@@ -27,7 +27,9 @@ pub(super) struct LinearizedRun {
     /// Inverse Jacobian of the equations in each pulse, row-major.
     pub(super) inverses: Vec<f64>,
     pub(super) contacts: ContactStates,
-    /// Pulses after samples at which an input jumps, solved with continued inputs.
+    /// Continuation of the inputs after samples at which they jump; None if no input jumps, or with friction.
+    pub(super) continuation: Option<InputContinuation>,
+    /// Pulses after these samples, solved with continued inputs.
     pub(super) continued_pulses: Vec<ContinuedPulse>,
 }
 
@@ -65,7 +67,7 @@ impl Operators {
         &self,
         system: &NonlinearSystem,
         forcing: &ForcingTerms,
-        continuation: Option<&InputContinuation>,
+        continuation: Option<InputContinuation>,
     ) -> (LinearizedRun, Option<EarlyEnd>) {
         let (states, count) = (self.states.len(), self.sources());
         let width = states + self.input_means.len();
@@ -74,6 +76,7 @@ impl Operators {
             slopes: Vec::with_capacity(self.m * self.values() * width),
             inverses: Vec::with_capacity(self.m * states * states),
             contacts: ContactStates::empty(),
+            continuation: None,
             continued_pulses: Vec::new(),
         };
         let mut convolutions: Vec<OnlineConvolution<'_>> =
@@ -88,7 +91,7 @@ impl Operators {
             }
             pulse.predict(&run.sources);
             pulse.input_means.iter_mut().zip(&self.input_means).for_each(|(value, (_, means))| *value = means[k]);
-            let start = continuation.and_then(|inputs| Some((inputs, inputs.sample_before(k)?)));
+            let start = continuation.as_ref().and_then(|inputs| Some((inputs, inputs.sample_at_start(k)?)));
             let continued = start.map(|(inputs, sample)| self.solve_continued(system, &mut pulse, inputs, (k, sample)));
             match continued.transpose() {
                 Ok(continued) => run.continued_pulses.extend(continued),
@@ -120,6 +123,7 @@ impl Operators {
                 convolution.push(group.contributions.iter().map(weighted_value).sum());
             }
         }
+        run.continuation = continuation;
         (run, None)
     }
 
@@ -136,13 +140,13 @@ impl Operators {
         for input in &self.inputs {
             let weight = system.equations[input.term.0].coefficients[input.term.1];
             let first = self.kernels[input.kernel].values().first().copied().unwrap_or(0.0);
-            pulse.free[input.state] += weight * first * continuation.change(input.signal, sample);
+            pulse.free[input.state] += weight * first * continuation.continued_minus_actual(input.signal, sample);
         }
         // A derivative of an input is infinite at a jump, so only the inputs themselves are continued.
         let channels = pulse.input_means.iter_mut().zip(&self.input_means);
         channels
             .filter(|(_, ((_, order), _))| *order < ORDER_GRAIN)
-            .for_each(|(value, ((signal, _), _))| *value += continuation.change(*signal, sample));
+            .for_each(|(value, ((signal, _), _))| *value += continuation.continued_minus_actual(*signal, sample));
         pulse.solve()?;
         let continued = ContinuedPulse {
             pulse: index,

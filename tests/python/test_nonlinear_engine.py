@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
-from scipy.special import ellipj, ellipk
+from scipy.special import ellipj, ellipk, erfcx
 
 import ftlm
 from ftlm.estimation.free_parameters import FreeProblem
@@ -321,6 +321,25 @@ def test_residuals_after_jumps_of_the_input_are_of_second_order_in_the_step(name
         largest.append(np.max(np.abs(iterate.outcome["residuals"])))
     # Linear interpolation has kinks of the input, whose pulse means are of second order themselves.
     assert largest[0] < (0.01 if intersample == "zoh" else 0.05) * np.max(exact)
+    np.testing.assert_array_less(np.divide(largest[1:], largest[:-1]), 0.35)
+
+
+def test_residuals_of_half_order_after_jumps_are_of_second_order_in_the_step():
+    rows, step = 120, 0.1
+    times = step * np.arange(rows)
+    u = np.repeat([2.0, 0.5, 0.5, 2.0, 1.0, 2.0], 20)
+    jumps = np.diff(u**2, prepend=0.0)
+    # The step response of D^0.5 y = -y + u.
+    responses = [
+        jump * np.where(times >= at, 1.0 - erfcx(np.sqrt(np.maximum(times - at, 0.0))), 0.0)
+        for at, jump in zip(times, jumps, strict=True)
+    ]
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": np.sum(responses, axis=0)})
+    problem = FreeProblem.of(ftlm.equation("D^0.5 y = a y + b u^2", initial="rest"))
+    largest = []
+    for pulses in (1, 2, 4, 8):
+        iterate = Objective(problem, [run], [1.0], pulses).evaluate(start_from_values(problem, {"a": -1.0, "b": 1.0}))
+        largest.append(np.max(np.abs(iterate.outcome["residuals"])))
     np.testing.assert_array_less(np.divide(largest[1:], largest[:-1]), 0.35)
 
 

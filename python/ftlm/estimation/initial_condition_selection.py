@@ -51,10 +51,10 @@ def fit_with_offset_decision(
 ) -> Fit:
     """Return the fit of a structure, and decide on its initial conditions and its offset.
 
-    With ``offset="auto"``, the function `estimate` fits the structure, and a constant is added to each equation if it
-    is significant. The structure with the constant is fitted first, because a fit that lacks a necessary constant may
-    end at any wrong optimum. For a non-linear model, fits without offset, with a constant and with an output level are
-    compared. With every other offset, the functions in `fits` fit the structure as given.
+    With ``offset="auto"``, the function `estimate` fits the structure with a constant in each equation, and without it
+    if it is not significant. A fit that lacks a necessary constant may end at a wrong optimum. For a non-linear model,
+    fits without offset, with a constant and with an output level are compared. With every other offset, the functions
+    in `fits` fit the structure as given.
     """
     if structure.offset == "auto" and not structure.is_linear:
         fit = _fit_with_start_decision(replace(structure, offset="none"), replace(fits, may_add_offset=True))
@@ -174,10 +174,10 @@ def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -
 def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
     """Return the fit with a significant constant in the equations or output level; None if there is none.
 
-    A level is tried for non-linear models only. For a linear plant that does not integrate, the result is None, because
-    a level suffices and is tried later.
-    No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
-    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
+    For a linear plant that integrates, a constant is tried, and for a non-linear model a constant and a level. For
+    other linear plants, the result is None, because a level suffices and is tried later. A level cannot describe the
+    response of an integrating or non-linear plant to the offset of an input sensor. The new fit starts from its own
+    initial guesses, because the fit without a constant may be at a wrong local optimum.
     """
     automatic = structure.initial == "auto" and structure.offset == "none" and fits.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":

@@ -393,7 +393,7 @@ pub trait LeastSquaresProblem {
 
     /// Release the intermediate results of an evaluation that only its derivatives need.
     ///
-    /// The minimization calls this after [`Self::jacobian`].
+    /// The residuals remain available. The minimization calls this after [`Self::jacobian`].
     fn release(&self, _evaluation: &mut Self::Evaluation) {}
 
     /// Move a point by steps in the coordinates, within bounds.
