@@ -549,9 +549,9 @@ impl ContactSolver<'_> {
             if error <= FRICTION_ROUNDING_RATIO * velocity_scale {
                 break;
             }
-            if pulse.is_linear() {
+            if pulse.is_linear() && !self.is_resting.contains(&true) {
                 // With linear equations, this iteration found the exact friction forces. The state channels follow from
-                // them.
+                // them. A fixed output changes the gains slightly, so that the iteration continues.
                 pulse.solve_with(&self.forces)?;
                 error = 0.0;
                 break;

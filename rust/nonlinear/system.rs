@@ -195,12 +195,16 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(links_of_equation).collect()
     }
 
-    /// Return true if a coupling term of `equation` uses the pulse means of the output `output`, like those of an
-    /// input, for the velocity at the end of a pulse. This applies to outputs of equations of order 1 or less, such as
-    /// actuators, because they have no velocity at the end of a pulse.
+    /// Return true if a term of `equation` uses the pulse means of the output `output`, like those of an input, for the
+    /// velocity at the end of a pulse.
+    ///
+    /// This applies to integration orders of 2 or more: the velocity then has feedback from the output, as in
+    /// [`uses_output_means`]. For lower orders, velocities at the ends of pulses are more accurate. It also applies to
+    /// outputs of equations of order 1 or less, such as actuators, because they have no velocity at the end of a pulse.
     pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
-        output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
+        let has_no_velocity = output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER;
+        integration >= 2.0 - ORDER_GRAIN || (has_no_velocity && integration > 1.0 + MAX_FEEDTHROUGH_ORDER)
     }
 
     /// Return the state channels: all outputs, then the derivatives that expressions, friction and coupling terms need.

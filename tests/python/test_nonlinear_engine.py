@@ -367,28 +367,39 @@ def staircase(rows, hold, size, seed):
     return np.repeat(np.random.default_rng(seed).uniform(-size, size, -(-rows // hold)), hold)[:rows]
 
 
-def euler_with_friction(u, step, fine):
-    """Positions of D^2 y = -0.3 D y - 2 y - 4 y^3 + 3 u - 0.5 sign(D y) by small steps that stop at rest."""
-    y = v = 0.0
+def euler_with_friction(u, step, fine, forces, start=0.0):
+    """Positions of D^2 y = -d D y + k y - 4 y^3 + b u - f sign(D y) by small steps that stop at rest."""
+    damping, stiffness, gain, friction = forces
+    y, v = start, 0.0
     out = []
     for level in u:
         out.append(y)
         for _ in range(fine):
-            force = -0.3 * v - 2 * y - 4 * y**3 + 3 * level
-            if v == 0 and abs(force) <= 0.5:
+            force = -damping * v + stiffness * y - 4 * y**3 + gain * level
+            if v == 0 and abs(force) <= friction:
                 continue
-            ahead = v + step / fine * (force - 0.5 * np.sign(v or force))
+            ahead = v + step / fine * (force - friction * np.sign(v or force))
             ahead = 0.0 if ahead * v < 0 else ahead
             y, v = y + 0.5 * step / fine * (v + ahead), ahead
     return np.array(out)
 
 
-def test_friction_beside_a_cubic_spring_is_that_of_small_steps():
-    u = staircase(1000, 50, 2.0, 1)
-    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u})
-    model = ftlm.Model(ftlm.equation("D^2 y = -0.3 D y - 2 y - 4 y^3 + 3 u - 0.5*sign(D y)"))
-    y = model.simulate(run, tolerance=1e-5)["y"]
-    errors = [np.max(np.abs(y - euler_with_friction(u, 0.01, fine))) for fine in (20, 40)]
+@pytest.mark.parametrize(
+    ("forces", "start", "step", "size"),
+    [
+        pytest.param((0.3, -2.0, 3.0, 0.5), 0.0, 0.01, 2.0, id="spring"),
+        # Errors that the velocity did not feel would grow with exp(2 t), over 30 s.
+        pytest.param((0.6, 4.0, 1.0, 0.2), 1.0, 0.03, 1.2, id="unstable stiffness"),
+    ],
+)
+def test_friction_beside_a_cubic_spring_is_that_of_small_steps(forces, start, step, size):
+    u = staircase(1000, 50, size, 1)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": 0 * u})
+    damping, stiffness, gain, friction = forces
+    text = f"D^2 y = -{damping} D y + {stiffness} y - 4 y^3 + {gain} u - {friction}*sign(D y)"
+    initial = {"y": {0.0: start, 1.0: damping * start}}
+    y = ftlm.Model(ftlm.equation(text)).simulate(run, initial=initial, tolerance=1e-5)["y"]
+    errors = [np.max(np.abs(y - euler_with_friction(u, step, fine, forces, start))) for fine in (20, 40)]
     assert errors[0] < 5e-3 * np.max(np.abs(y))
     assert errors[1] < 0.6 * errors[0]
 
