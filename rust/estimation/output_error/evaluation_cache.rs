@@ -8,6 +8,7 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::experiment::Experiment;
+use super::kink_correction::Kink;
 use super::parameterization::FreeModel;
 use super::system_inverse::{
     filtered_spectrum, InitialTerm, Operator, PulseMeans, SeriesFilter, SystemInverse, MAX_CACHED_PULSES,
@@ -75,6 +76,8 @@ pub(crate) struct EvaluationCache {
     input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
     /// The weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
     impulses: HashMap<(usize, u64), Vec<f64>>,
+    /// Most recently used kink of each input term and of each pass through an autoregressive term.
+    kinks: Vec<Rc<Kink>>,
 }
 
 impl EvaluationCache {
@@ -117,7 +120,14 @@ impl EvaluationCache {
         indexed_caches.sort_by_key(|(k, _)| *k);
         let cache = |(_, grid_cache): (usize, Rc<RefCell<GridCache>>)| {
             let total = SPECTRUM_FACTORS * grid_cache.borrow().zero_record.m();
-            Self { stop: stop.clone(), grid_cache, total, input_spectra: HashMap::new(), impulses: HashMap::new() }
+            Self {
+                stop: stop.clone(),
+                grid_cache,
+                total,
+                input_spectra: HashMap::new(),
+                impulses: HashMap::new(),
+                kinks: Vec::new(),
+            }
         };
         Ok(indexed_caches.into_iter().map(cache).collect())
     }
@@ -273,5 +283,24 @@ impl EvaluationCache {
             experiment.weighted_samples(&means)
         };
         self.impulses.entry((output, exponent.to_bits())).or_insert_with(samples).clone()
+    }
+
+    /// Return the kink of an input term, or of its pass through an autoregressive term, at an integration order.
+    ///
+    /// `compute` computes it if the order differs from that of the last evaluation.
+    pub(crate) fn kink(
+        &mut self,
+        equation: usize,
+        terms: Vec<usize>,
+        integration_order: f64,
+        compute: impl FnOnce(Vec<usize>) -> Kink,
+    ) -> Rc<Kink> {
+        if let Some(kink) = self.kinks.iter().find(|kink| kink.matches(equation, &terms, integration_order)) {
+            return kink.clone();
+        }
+        self.kinks.retain(|kink| !kink.is_of(equation, &terms));
+        let kink = Rc::new(compute(terms));
+        self.kinks.push(kink.clone());
+        kink
     }
 }

@@ -5,7 +5,11 @@
 //! the equation, and ν that of the term. Further kinks arise when these terms pass once through the autoregressive
 //! terms. After several passes the response is smoother, and the error of its pulse means decreases with the step.
 
-use super::experiment::{Experiment, NonuniformSamples};
+use std::cell::OnceCell;
+use std::rc::Rc;
+
+use super::evaluation_cache::EvaluationCache;
+use super::experiment::Experiment;
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
 use super::parameterization::{FreeModel, ParameterPoint};
 use crate::equation::Structure;
@@ -17,27 +21,67 @@ const ORDER_DIFFERENCE_STEP: f64 = 1e-5;
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 
 /// Kink of one input term, either alone or after one pass through an autoregressive term.
-struct Kink {
+pub(crate) struct Kink {
     /// Index of the equation.
     equation: usize,
     /// Indices of the input term and, if there is one, of the autoregressive term.
     terms: Vec<usize>,
+    /// Index of the input signal.
+    signal: usize,
+    /// Integration order of the input.
+    integration_order: f64,
     /// Correction of the compared samples for coefficients of 1.
     values: Vec<f64>,
-    /// Derivative of the correction `values` with respect to the integration order.
-    slopes: Vec<f64>,
+    /// Derivative of the correction `values` with respect to the integration order; computed when first needed.
+    slopes: OnceCell<Vec<f64>>,
+}
+
+impl Kink {
+    /// Return true if this is the kink of the given terms at the given integration order.
+    pub(crate) fn matches(&self, equation: usize, terms: &[usize], integration_order: f64) -> bool {
+        self.is_of(equation, terms) && self.integration_order.to_bits() == integration_order.to_bits()
+    }
+
+    /// Return true if this is the kink of the given terms of an equation.
+    pub(crate) fn is_of(&self, equation: usize, terms: &[usize]) -> bool {
+        self.equation == equation && self.terms == terms
+    }
+
+    /// Return the corrections of the samples for the integration order `order` of the input `signal`.
+    fn corrections(experiment: &Experiment, signal: usize, order: f64) -> Vec<f64> {
+        let samples = experiment.nonuniform.as_ref();
+        let of_samples = samples.and_then(|n| Some((n, n.jumps.get(signal)?.as_ref()?)));
+        of_samples.map_or_else(Vec::new, |(n, jumps)| {
+            n.interpolation.kink_corrections(jumps, order, experiment.record.step())
+        })
+    }
+
+    /// Return the derivative of the correction with respect to the integration order.
+    fn slopes(&self, experiment: &Experiment) -> &[f64] {
+        self.slopes.get_or_init(|| {
+            let shift = ORDER_DIFFERENCE_STEP.min(0.5 * self.integration_order);
+            let shifted = |shift| Self::corrections(experiment, self.signal, self.integration_order + shift);
+            shifted(shift).iter().zip(shifted(-shift)).map(|(upper, lower)| (upper - lower) / (2.0 * shift)).collect()
+        })
+    }
 }
 
 /// Kink correction of one experiment.
 pub(crate) struct KinkCorrection {
-    kinks: Vec<Kink>,
+    kinks: Vec<Rc<Kink>>,
 }
 
 impl KinkCorrection {
     /// Return the kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
-    pub(crate) fn new(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
-        let NonuniformSamples { interpolation, jumps } = experiment.nonuniform.as_ref()?;
-        let step = experiment.record.step();
+    ///
+    /// Kinks whose integration orders have not changed since the last evaluation are taken from the cache.
+    pub(crate) fn new(
+        model: &FreeModel,
+        experiment: &Experiment,
+        structures: &[Structure],
+        cache: &mut EvaluationCache,
+    ) -> Option<Self> {
+        let jumps = &experiment.nonuniform.as_ref()?.jumps;
         let mut kinks = Vec::new();
         for (equation, structure) in structures.iter().enumerate() {
             let integration_order = |term: usize| structure.order - structure.terms[term].order;
@@ -45,8 +89,9 @@ impl KinkCorrection {
                 .filter(|&k| model.output_index(equation, structure.terms[k].signal) == Some(equation))
                 .collect();
             for (term, input_term) in structure.terms.iter().enumerate() {
-                let Some(Some(input_jumps)) = jumps.get(input_term.signal) else { continue };
-                if model.output_index(equation, input_term.signal).is_some() {
+                let signal = input_term.signal;
+                let has_jumps = matches!(jumps.get(signal), Some(Some(_)));
+                if !has_jumps || model.output_index(equation, signal).is_some() {
                     continue;
                 }
                 for terms in std::iter::once(vec![term]).chain(autoregressive_terms.iter().map(|&k| vec![term, k])) {
@@ -55,18 +100,14 @@ impl KinkCorrection {
                     if eta < FEEDTHROUGH_ORDER_TOLERANCE || (terms.len() > 1 && eta >= SMOOTH_INTEGRATION_ORDER) {
                         continue;
                     }
-                    let shift = ORDER_DIFFERENCE_STEP.min(0.5 * eta);
-                    let (upper, lower) = (
-                        interpolation.kink_corrections(input_jumps, eta + shift, step),
-                        interpolation.kink_corrections(input_jumps, eta - shift, step),
-                    );
-                    let slopes = upper.iter().zip(&lower).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
-                    kinks.push(Kink {
+                    kinks.push(cache.kink(equation, terms, eta, |terms| Kink {
                         equation,
                         terms,
-                        values: interpolation.kink_corrections(input_jumps, eta, step),
-                        slopes,
-                    });
+                        signal,
+                        integration_order: eta,
+                        values: Kink::corrections(experiment, signal, eta),
+                        slopes: OnceCell::new(),
+                    }));
                 }
             }
         }
@@ -96,8 +137,11 @@ impl KinkCorrection {
         let mut corrections = vec![vec![0.0; experiment.compared_count()]; model.equations.len()];
         for kink in &self.kinks {
             let (value, slope) = weights(kink);
-            let rows = kink.values.iter().zip(&kink.slopes);
-            corrections[kink.equation].iter_mut().zip(rows).for_each(|(v, (c, s))| *v += value * c + slope * s);
+            let correction = &mut corrections[kink.equation];
+            correction.iter_mut().zip(&kink.values).for_each(|(v, c)| *v += value * c);
+            if slope != 0.0 {
+                correction.iter_mut().zip(kink.slopes(experiment)).for_each(|(v, s)| *v += slope * s);
+            }
         }
         experiment.weighted_corrections(&match direct {
             Some(direct) => direct.apply_coupling(corrections),
