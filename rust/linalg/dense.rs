@@ -180,24 +180,44 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
 /// ```
 #[must_use]
 pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], relative_tolerance: f64) -> Option<Vec<f64>> {
-    let k = columns.len();
-    let mut solution = vec![0.0; k];
-    if k == 0 {
-        return Some(solution);
-    }
-    let augmented: Vec<Vec<f64>> = columns.iter().cloned().chain([target.to_vec()]).collect();
-    let factor = triangular_factor(&augmented);
+    let column = |j: usize| columns.get(j).map_or(target, Vec::as_slice);
+    let append_rows = |j: usize, rows: Range<usize>, out: &mut Vec<f64>| out.extend_from_slice(&column(j)[rows]);
+    Some(minimum_norm_solution_by_blocks((columns.len(), target.len()), append_rows, relative_tolerance)?.values)
+}
+
+/// Least-squares solution of smallest norm.
+#[non_exhaustive]
+pub struct MinimumNormSolution {
+    /// One value per column.
+    pub values: Vec<f64>,
+    /// Sum of the squared residuals.
+    pub residual_squares: f64,
+}
+
+/// Return the least-squares solution of smallest norm as in [`minimum_norm_solution`], for columns that are computed by
+/// blocks of rows as in [`triangular_factor_by_blocks`]. Column k is the target.
+#[must_use]
+pub fn minimum_norm_solution_by_blocks(
+    (k, m): (usize, usize),
+    append_rows: impl Fn(usize, Range<usize>, &mut Vec<f64>),
+    relative_tolerance: f64,
+) -> Option<MinimumNormSolution> {
+    let factor = triangular_factor_by_blocks((k + 1, m), append_rows);
     let column = |j: usize| -> Vec<f64> { (0..=k).map(|i| factor[i * (k + 1) + j]).collect() };
+    let (mut values, mut remainder) = (vec![0.0; k], column(k));
+    if k == 0 {
+        return Some(MinimumNormSolution { values, residual_squares: remainder[0] * remainder[0] });
+    }
     let factors = singular_values(&(0..k).map(column).collect::<Vec<_>>())?;
-    let (transformed_target, threshold) =
-        (column(k), relative_tolerance * factors.values.first().copied().unwrap_or(0.0));
+    let threshold = relative_tolerance * factors.values.first().copied().unwrap_or(0.0);
     for ((left, value), right) in factors.left.iter().zip(&factors.values).zip(&factors.right) {
         if *value > threshold {
-            let component = left.iter().zip(&transformed_target).map(|(u, v)| u * v).sum::<f64>() / value;
-            solution.iter_mut().zip(right).for_each(|(x, v)| *x += component * v);
+            let component: f64 = left.iter().zip(&remainder).map(|(u, v)| u * v).sum();
+            remainder.iter_mut().zip(left).for_each(|(v, u)| *v -= component * u);
+            values.iter_mut().zip(right).for_each(|(x, v)| *x += component / value * v);
         }
     }
-    Some(solution)
+    Some(MinimumNormSolution { values, residual_squares: remainder.iter().map(|v| v * v).sum() })
 }
 
 /// Return the inner products of every left with every right column, row-major with one row per left column. All columns

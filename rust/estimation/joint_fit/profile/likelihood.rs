@@ -1,13 +1,15 @@
 //! Cost of a joint fit around its optimum: rise, refits with one parameter fixed, and the cost over two parameters.
 
+use std::ops::Range;
+
 use crate::error::{check_length, Error, Result};
 use crate::estimation::joint_fit::covariance::{covariance, covariance_of_residuals};
 use crate::estimation::joint_fit::objective::{Objective, Weights, RELATIVE_COST_TOLERANCE};
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::{Iterate, OptimizationResult};
 use crate::estimation::output_error::MinimizationSettings;
-use crate::linalg::dense::{self, SingularValues};
-use crate::linalg::orthogonal::norm;
+use crate::linalg::dense::{minimum_norm_solution_by_blocks, MinimumNormSolution};
+use crate::linalg::orthogonal::{orthonormal_basis, project_out};
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::inner;
@@ -250,9 +252,8 @@ impl<'a> ProfileLikelihood<'a> {
             let Some(refit_result) = none_if_failed(self.minimize_others(i, &point, 1, REFIT_TOLERANCE))? else {
                 return Ok(f64::INFINITY);
             };
-            let (sensitivities, _) = other_sensitivities(&refit_result, &[i])?;
-            let remaining = projected_residuals(&refit_result, &sensitivities);
-            worst = worst.max((self.rise(i, inner(&remaining, &remaining)) / width - 1.0).abs());
+            let squares = fit_other_sensitivities(&refit_result, i, &refit_result.residuals)?.residual_squares;
+            worst = worst.max((self.rise(i, squares) / width - 1.0).abs());
         }
         Ok(worst)
     }
@@ -353,8 +354,8 @@ pub struct CostSurface<'a> {
     objective: Objective<'a>,
     optimum: OptimizationResult,
     pair: [usize; 2],
-    /// Orthonormal basis of the sensitivities of the other parameters; None if these are fixed.
-    sensitivities: Option<Sensitivities>,
+    /// Orthonormal basis of the sensitivities of the other parameters; empty if these are fixed.
+    basis: Vec<Vec<f64>>,
 }
 
 impl<'a> CostSurface<'a> {
@@ -374,8 +375,9 @@ impl<'a> CostSurface<'a> {
     ) -> Result<Self> {
         let objective = fit.objective((parameter_set, source, stop), fit.pulses_per_sample)?;
         let optimum = minimize(parameter_set, &objective, &fit.estimate, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let sensitivities = if refit { Some(other_sensitivities(&optimum, &pair)?.0) } else { None };
-        Ok(Self { parameter_set, objective, optimum, pair, sensitivities })
+        let others = optimum.jacobian.iter().enumerate().filter(|(j, _)| refit && !pair.contains(j));
+        let basis = orthonormal_basis(others.map(|(_, row)| row.clone()).collect(), SINGULAR_VALUE_TOLERANCE, stop)?;
+        Ok(Self { parameter_set, objective, optimum, pair, basis })
     }
 
     /// Return `point_count` evenly spaced values of one of the two parameters, `axis` = 0 or 1.
@@ -398,10 +400,8 @@ impl<'a> CostSurface<'a> {
     }
 
     fn squares(&self, result: &OptimizationResult) -> f64 {
-        let remaining = match &self.sensitivities {
-            Some(sensitivities) => projected_residuals(result, sensitivities),
-            None => result.residuals.clone(),
-        };
+        let mut remaining = result.residuals.clone();
+        project_out(&self.basis, &mut remaining);
         inner(&remaining, &remaining)
     }
 
@@ -454,56 +454,34 @@ fn none_if_failed<T>(outcome: Result<T>) -> Result<Option<T>> {
     }
 }
 
-/// Significant singular values and vectors of sensitivities whose rows have unit norm.
-type Sensitivities = SingularValues;
-
-/// Return the significant singular values and vectors of the sensitivities, and the norms of the rows.
+/// Approximate a vector by the sensitivities of all parameters but parameter `i`, by least squares.
 ///
-/// The parameters with the indices `omitted` are left out. Rows are first scaled to norm 1.
-fn other_sensitivities(result: &OptimizationResult, omitted: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
-    let other_rows = result.jacobian.iter().enumerate().filter(|(j, _)| !omitted.contains(j)).map(|(_, row)| row);
-    let (mut scaled, mut norms) = (Vec::new(), Vec::new());
-    for row in other_rows {
+/// Combinations of parameters that have almost no effect are left unchanged.
+fn fit_other_sensitivities(result: &OptimizationResult, i: usize, target: &[f64]) -> Result<MinimumNormSolution> {
+    let rows: Vec<&[f64]> =
+        result.jacobian.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, row)| row.as_slice()).collect();
+    let scale = |row: &&[f64]| {
         // Far from the optimum, sensitivities may be so large that their squares overflow.
         let peak = row.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        let unit: Vec<f64> = row.iter().map(|v| v / if peak > 0.0 { peak } else { 1.0 }).collect();
-        let row_norm = norm(&unit).max(1.0);
-        scaled.push(unit.iter().map(|v| v / row_norm).collect());
-        norms.push(if peak > 0.0 { peak * row_norm } else { 1.0 });
-    }
-    let singular_value_error = || Error::Internal { what: "sensitivities without singular values".into() };
-    let mut factors = if scaled.is_empty() {
-        SingularValues { left: Vec::new(), values: Vec::new(), right: Vec::new() }
-    } else {
-        dense::singular_values(&scaled).ok_or_else(singular_value_error)?
+        let unit = if peak > 0.0 { peak } else { 1.0 };
+        unit * row.iter().map(|v| (v / unit).powi(2)).sum::<f64>().sqrt().max(1.0)
     };
-    let largest_value = factors.values.iter().copied().fold(0.0, f64::max);
-    let rank = factors.values.iter().filter(|size| **size > SINGULAR_VALUE_TOLERANCE * largest_value).count();
-    factors.left.truncate(rank);
-    factors.values.truncate(rank);
-    factors.right.truncate(rank);
-    Ok((factors, norms))
-}
-
-/// Return the residuals after one least-squares step of the linearized parameters.
-///
-/// This is the projection of the residuals orthogonal to `sensitivities`.
-fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
-    let mut remaining = result.residuals.clone();
-    for direction in &sensitivities.left {
-        let component = inner(direction, &result.residuals);
-        remaining.iter_mut().zip(direction).for_each(|(v, d)| *v -= component * d);
-    }
-    remaining
+    let scales: Vec<f64> = rows.iter().map(scale).collect();
+    let append_rows = |j: usize, range: Range<usize>, out: &mut Vec<f64>| match rows.get(j) {
+        Some(row) => out.extend(row[range].iter().map(|v| v / scales[j])),
+        None => out.extend_from_slice(&target[range]),
+    };
+    let mut solution =
+        minimum_norm_solution_by_blocks((rows.len(), target.len()), append_rows, SINGULAR_VALUE_TOLERANCE)
+            .ok_or_else(|| Error::Internal { what: "sensitivities without singular values".into() })?;
+    solution.values.iter_mut().zip(&scales).for_each(|(v, scale)| *v /= scale);
+    Ok(solution)
 }
 
 /// Derivative of all parameters with respect to parameter `i` along the profile. The derivative of parameter `i` is 1.
 fn tangent(result: &OptimizationResult, i: usize) -> Result<Vec<f64>> {
-    let (SingularValues { left, values, right }, norms) = other_sensitivities(result, &[i])?;
-    let weights: Vec<f64> =
-        left.iter().zip(&values).map(|(direction, size)| inner(direction, &result.jacobian[i]) / size).collect();
-    let parameter_slope = |j: usize| right.iter().zip(&weights).map(|(v, w)| v[j] * w).sum::<f64>();
-    let mut tangent: Vec<f64> = norms.iter().enumerate().map(|(j, row_norm)| -parameter_slope(j) / row_norm).collect();
+    let mut tangent = fit_other_sensitivities(result, i, &result.jacobian[i])?.values;
+    tangent.iter_mut().for_each(|slope| *slope = -*slope);
     tangent.insert(i, 1.0);
     Ok(tangent)
 }
