@@ -8,6 +8,7 @@ import control as python_control
 import numpy as np
 import pytest
 from scipy import signal
+from scipy.special import gammaln
 
 import ftlm
 from ftlm import control
@@ -294,7 +295,7 @@ def test_models_that_cannot_be_designed_on_are_refused():
         (HUB, {"output": np.array(["theta", "theta"])}, "output = array"),
         (HUB, {"input": 10**5000}, "input = an integer of 16610 bits is not one"),
         (HUB, {"seed": -(10**5000)}, "seed = an integer of 16610 bits"),
-        ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains from 0"),
+        ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains of one sign"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             tuned(text, **options)
@@ -475,3 +476,34 @@ def test_a_crossover_below_a_resonance_that_crosses_again_says_where():
     plant = ftlm.Model(ftlm.equation("D^1.7 y = -0.8 D^0.7 y - 6 y + 5 u"))
     with pytest.raises(ftlm.ModelError, match=r"crossover of 2 rad/s crosses a gain of 1 again .* last at 40\.3"):
         control.fractional_pid(plant, crossover=2.0)
+
+
+def closed_loop_peak(pid, gain, order, pole, rate=500.0, seconds=4.0):
+    """Largest output of a loop with one sample of delay; the plant gain/(s^order + pole) by its exact step response."""
+    controller, rows = control.DiscretePid(pid, rate), int(seconds * rate)
+    t = np.arange(rows + 2) / rate
+    k = np.arange(80)
+    powers = (-pole) ** k * t[:, None] ** (order * (k + 1)) / np.exp(gammaln(order * (k + 1) + 1))
+    pulse = np.diff(gain * powers.sum(axis=1))
+    y, u, command = np.zeros(rows + 1), np.zeros(rows + 1), 0.0
+    for row in range(rows):
+        u[row] = command
+        command = controller(1.0 - y[row])
+        y[row + 1] = pulse[: row + 1][::-1] @ u[: row + 1]
+        if abs(y[row + 1]) > 1e6:
+            break
+    return np.max(np.abs(y))
+
+
+@pytest.mark.parametrize(
+    ("order", "pole", "gain", "crossover"),
+    [(1.0, 0.5, 2.0, 0.5), (1.0, 0.5, -2.0, 1.0), (0.7, 0.3, 1.0, 1.0), (0.8, 0.1, 0.5, 0.2)],
+)
+def test_a_loop_is_stable_where_its_design_says_so(order, pole, gain, crossover):
+    """A derivative that brings the loop gain near 1 close to the Nyquist frequency is not chosen."""
+    plant = ftlm.Model(ftlm.equation(f"D^{order:g} y = -{pole} y + {gain} u"))
+    design = control.fractional_pid(plant, crossover=crossover)
+    assert design.nominal.gain > 1.4
+    assert all(50 < margin < 70 for margin in design.phase_margin_at_gains)
+    for factor in (0.7, 1.0, 1.4):
+        assert closed_loop_peak(design.pid, factor * gain, order, pole) < 1.5

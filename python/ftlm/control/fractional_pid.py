@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -442,8 +443,8 @@ def fractional_pid(
     ModelError
         If the model is unstable (an integrator is permitted), has friction, or is too uncertain. It is too uncertain if
         for more than 5 % of the parameter samples the loop is unstable or has less than half the requested phase
-        margin. Also if no nonnegative gains meet the requirements, or if all loops that meet them are unstable or have
-        a second crossover above the requested one.
+        margin. Also if no gains with the sign of the plant's gain meet the requirements, or if all loops that meet them
+        are unstable, also at 0.7 or 1.4 times the plant gain, or have a second crossover above the requested one.
 
     Notes
     -----
@@ -472,12 +473,14 @@ def fractional_pid(
     slope = float(
         np.diff(np.unwrap(np.angle(plant.response(crossover_pair))))[0] / (crossover_pair[1] - crossover_pair[0])
     )
-    w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARISON_FREQUENCIES)
+    # A derivative can bring the loop gain close to 1 far above the crossover.
+    w = np.geomspace(wc / 100, 0.999 * math.pi * plant.rate, COMPARISON_FREQUENCIES)
     plant_responses = np.array([plant_sample.response(w) for plant_sample in [plant, *samples_drawn[:50]]])
-    controller = _best_controller(target, slope, wc, w, plant_responses)
+    find_controller = partial(_best_controller, target, slope, wc, w, plant_responses, plant.gain_sign())
+    controller = find_controller()
     if controller is None:
         raise ModelError(
-            f"no fractional PID with gains from 0 and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
+            f"no fractional PID with gains of one sign and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
             "margin of "
             f"{margin:g} degrees at {wc:g} rad/s on this model, whose phase there is "
             f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
@@ -491,9 +494,9 @@ def fractional_pid(
         """Whether the loop gain is below 1 at all frequencies above the requested crossover."""
         return bool(np.all(np.abs(pid.response(fine_frequencies[is_above_crossover]) * high) < 1.0))
 
-    choice = controller if is_last(controller) else _best_controller(target, slope, wc, w, plant_responses, is_last)
+    choice = controller if is_last(controller) else find_controller(is_last)
     acting = (choice or controller).response(fine_frequencies)
-    lam = (choice or controller).lam if (choice or controller).ki > 0 else 0.0
+    lam = (choice or controller).lam if (choice or controller).ki else 0.0
 
     def loop_margins(plant_sample: Plant, factor: float = 1.0) -> Margins:
         order = plant_sample.integral_order() + lam
@@ -505,16 +508,16 @@ def fractional_pid(
         )
 
     nominal = loop_margins(plant)
-    if not nominal.stable:
-        raise ModelError(
-            f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
-            "is 1 elsewhere too, at a resonance; move the crossover away from it"
-        )
     if choice is None:
         raise ModelError(
             f"the loop with a crossover of {wc:g} rad/s crosses a gain of 1 again on this model, last at "
-            f"{nominal.crossover:.4g} rad/s, whatever the orders; move the crossover above the resonance, or further "
-            "below it"
+            f"{nominal.crossover:.4g} rad/s, whatever the orders; if the plant has a resonance there, move the "
+            "crossover above it or further below it, otherwise raise the crossover"
+        )
+    if not nominal.stable:
+        raise ModelError(
+            f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s is not stable on this model; move the "
+            "crossover, or ask for another phase margin"
         )
     margins = tuple(map(loop_margins, samples_drawn))
     failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_FRACTION * margin)]
@@ -526,7 +529,14 @@ def fractional_pid(
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
-    flat = tuple(loop_margins(plant, factor).phase for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1]))
+    varied = [loop_margins(plant, factor) for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1])]
+    if not all(m.stable for m in varied):
+        raise ModelError(
+            f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s has a gain margin of only "
+            f"{nominal.gain:.3g}, whatever the orders: it is unstable at {GAIN_VARIATIONS[0]:g} or "
+            f"{GAIN_VARIATIONS[1]:g} times the gain of the plant; move the crossover, or ask for another phase margin"
+        )
+    flat = tuple(m.phase for m in varied)
     other_plants = [replace(plant, output=o) for o in model.outputs if o != plant.output]
     plants = (plant, *(p for p in other_plants if p.has_response()))
     return PidDesign(choice, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), plants)
@@ -569,13 +579,15 @@ def _best_controller(
     wc: float,
     w: Floats,
     plant_responses: Complex,
+    gain_sign: float,
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
     """Return the controller with the largest low-frequency gain that meets all conditions and `is_allowed`, or None.
 
     At the frequency `wc` [rad/s], the controller has the response `target`, and its phase slope is minus the phase
     slope `slope` of the plant. `plant_responses` are the responses of the plant at the frequencies `w`, one row per
-    parameter sample. They determine the maximum sensitivity of the loop.
+    parameter sample. They determine the maximum sensitivity of the loop. The gains of the controller have the sign
+    `gain_sign` of the gain of the plant.
     """
     candidates: list[tuple[float, float, FractionalPid]] = []
     center, half_range = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
@@ -585,7 +597,7 @@ def _best_controller(
         ]
         for lam in np.unique(order_values[0]).tolist():
             for mu in np.unique(order_values[1]).tolist():
-                pid = _solve_gains(target, slope, wc, lam, mu)
+                pid = _solve_gains(target, slope, wc, lam, mu, gain_sign)
                 if pid is None or not is_allowed(pid):
                     continue
                 max_sensitivity = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * plant_responses)))
@@ -602,10 +614,12 @@ def _best_controller(
     return controller
 
 
-def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
+def _solve_gains(
+    target: complex, slope: float, wc: float, lam: float, mu: float, gain_sign: float
+) -> FractionalPid | None:
     """Return the controller C with orders lam and mu, C(j wc) = target and d arg C/dw = -slope at wc [rad/s].
 
-    Return None if a gain is negative or not finite, or if the equations are singular.
+    Return None if a gain does not have the sign `gain_sign` or is not finite, or if the equations are singular.
     """
     powers = np.array([0.0, -lam, mu])
     powers_of_s = (1j * wc) ** powers
@@ -616,7 +630,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
         )
     except np.linalg.LinAlgError:
         return None
-    if not (np.isfinite(gains).all() and (gains >= 0).all()):
+    if not (np.isfinite(gains).all() and (gain_sign * gains >= 0).all()):
         return None
     kp, ki, kd = gains.tolist()
     return FractionalPid(kp, ki, kd, lam, mu)

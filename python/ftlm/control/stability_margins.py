@@ -173,11 +173,24 @@ class Plant:
 
         Raise ModelError if the output does not depend on the input.
         """
+        (_, numerator_order), (_, denominator_order) = self._lowest_terms()
+        return denominator_order - numerator_order
+
+    def gain_sign(self) -> float:
+        """Return the sign of the plant's gain at low frequencies, 1 or -1.
+
+        Raise ModelError if the output does not depend on the input.
+        """
+        (numerator, _), (denominator, _) = self._lowest_terms()
+        return math.copysign(1.0, numerator * denominator)
+
+    def _lowest_terms(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return (coefficient, order) of the lowest terms of the numerator and of the denominator."""
         transfer = transfer_functions(self.model, coupling=self.coupling)
         numerator = transfer.numerators[self.output, self.input]
         if not numerator:
             raise ModelError(f"{self.input} does not affect {self.output} in this model; choose another pair")
-        return transfer.denominator[self.output][-1][1] - numerator[-1][1]
+        return numerator[-1], transfer.denominator[self.output][-1]
 
     def count_unstable_poles(self) -> float:
         """Return the number of poles of the model with a positive real part; NaN if a pole is on the imaginary axis."""
