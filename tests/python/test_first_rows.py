@@ -230,18 +230,59 @@ def test_a_level_that_is_asked_for_does_not_imply_rest():
     assert found.model.compare(run).fit["y"] > 97
 
 
-def test_initial_values_of_the_textbook_are_refused_with_caputos_powers():
+def blank_run(u, step=0.05, kind="foh"):
+    return ftlm.Run.from_arrays(step=step, inputs={"f": u}, outputs={"y": 0 * u}, intersample={"f": kind})
+
+
+def test_initial_values_of_the_textbook_are_those_of_caputo():
     """Bagley and Torvik: D^2 y + D^1.5 y + y = 1 + t with y(0) = y'(0) = 1 has the solution 1 + t."""
     t = 0.05 * np.arange(201)
-    run = ftlm.Run.from_arrays(
-        step=0.05, inputs={"f": 1 + t}, outputs={"y": np.zeros(t.size)}, intersample={"f": "foh"}
-    )
+    run = blank_run(1 + t)
     model = ftlm.Model(ftlm.equation("D^2 y = -1 D^1.5 y - 1 y + 1 f"))
-    with pytest.raises(ftlm.ModelError, match=r"fractional order; give \{0: 1, 0\.5: 1\.12838, 1: 1, 1\.5: 0\.752"):
+    assert model.simulate(run, initial={"y": [1.0, 1.0]})["y"] == pytest.approx(1 + t, abs=1e-5)
+    with pytest.raises(
+        ftlm.ModelError, match=r"powers \{0: 1, 0\.5: 1\.12838, 1: 1, 1\.5: 0\.752.*'y': \[1\.0, 1\.0\]"
+    ):
         model.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1.0}})
     powers = {0.0: 1.0, 0.5: 1.1283791671, 1.0: 1.0, 1.5: 0.7522527781}
     assert model.simulate(run, initial={"y": powers})["y"] == pytest.approx(1 + t, abs=1e-5)
     model.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1.0, 0.5: 0.0, 1.5: 0.0}})
+
+
+def test_initial_values_of_whole_orders_are_those_of_a_differential_equation():
+    t = 0.01 * np.arange(401)
+    run = blank_run(0 * t, 0.01)
+    swing = ftlm.Model(ftlm.equation("D^2 y = -1 D y - 9 y + 1 f"))
+    free = solve_ivp(lambda _, x: [x[1], -x[1] - 9 * x[0]], (0, 4), [1, 0.5], t_eval=t, rtol=1e-10, atol=1e-12).y[0]
+    assert swing.simulate(run, initial={"y": [1.0, 0.5]})["y"] == pytest.approx(free, abs=1e-6)
+    # The coefficients of 1 and t: the term D y adds its own.
+    assert swing.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1.5}})["y"] == pytest.approx(free, abs=1e-6)
+    for powers in ({0.0: 1.0}, {0.0: 1.0, 1.0: 0.0}):
+        with pytest.raises(ftlm.ModelError, match=r"imply the powers \{0: 1, 1: 1\}; give initial=\{'y': \[1\.0"):
+            swing.simulate(run, initial={"y": powers})
+    with pytest.raises(ftlm.ModelError, match="3 initial values of y, but its equation of order 2 has 2"):
+        swing.simulate(run, initial={"y": [1.0, 0.0, 0.0]})
+    circle = ftlm.Model(ftlm.equation("D^2 y = 1 D y - 1 y^2*D y - 1 y + 1 f"))
+    limit = solve_ivp(
+        lambda _, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]], (0, 4), [2, 0], t_eval=t, rtol=1e-10, atol=1e-12
+    ).y[0]
+    assert circle.simulate(run, initial={"y": [2.0]})["y"] == pytest.approx(limit, abs=1e-4)
+
+
+def test_initial_values_of_coupled_equations_act_on_each_other():
+    t = 0.01 * np.arange(301)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"f": 0 * t}, outputs={"y": 0 * t, "z": 0 * t})
+    text = "D^2 y = -1 D y - 5 y + 2 D z + 1 f; D z = -1 z + 1 y"
+    model = ftlm.Model(replace(ftlm.equation(text), coupling="simulated"))
+
+    def slope(_, x):
+        rate = -x[2] + x[0]
+        return [x[1], -x[1] - 5 * x[0] + 2 * rate, rate]
+
+    exact = solve_ivp(slope, (0, 3), [1, -0.5, 2], t_eval=t, rtol=1e-10, atol=1e-12).y
+    found = model.simulate(run, initial={"y": [1.0, -0.5], "z": [2.0]})
+    assert found["y"] == pytest.approx(exact[0], abs=1e-6)
+    assert found["z"] == pytest.approx(exact[2], abs=1e-6)
 
 
 def test_initial_terms_of_a_comparison_simulate_its_run():

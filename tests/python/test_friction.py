@@ -447,7 +447,7 @@ def test_the_initial_values_of_a_long_ring_down_are_found() -> None:
     # Far from its rest the squared error over the whole run has a second minimum, another half swing before it sticks.
     truth = ftlm.Model(ftlm.equation("D^2 x = -0.1 D x - 100 x - 0.5*sign(D x)"))
     rest = ftlm.Run.from_arrays(step=0.01, inputs={}, outputs={"x": np.zeros(1000)})
-    x = truth.simulate(rest, initial={"x": {0.0: 0.1}})["x"] + 2e-5 * np.random.default_rng(1).standard_normal(1000)
+    x = truth.simulate(rest, initial={"x": [0.1]})["x"] + 2e-5 * np.random.default_rng(1).standard_normal(1000)
     found = truth.compare(rest.with_outputs({"x": x}))
     assert found.initial[0]["x"][0.0] == pytest.approx(0.1, rel=1e-3)
     assert found.output_error["x"].rmse == pytest.approx(2e-5, rel=0.1)

@@ -196,7 +196,7 @@ class Model:
         run: Run,
         *,
         tolerance: float = 1e-6,
-        initial: Mapping[str, Mapping[float, float]] | None = None,
+        initial: Mapping[str, Mapping[float, float] | Sequence[float]] | None = None,
         max_m: int = 1 << 22,
     ) -> Run:
         """Simulate the outputs from the inputs of a run; see :func:`ftlm.simulate`."""

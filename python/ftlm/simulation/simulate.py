@@ -24,10 +24,14 @@ from ftlm.simulation.initial_conditions import deviations
 from ftlm.simulation.output_samples import LEVEL_EXPONENT
 from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.equation import Equation
+from ftlm.structure.order import ORDER_RESOLUTION
 from ftlm.structure.structure import check_initial
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, real_number
+
+#: Difference up to which two exponents of initial terms are equal.
+EXPONENT_TOLERANCE = 1e-6
 
 
 def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record]:
@@ -68,7 +72,7 @@ def simulate(
     run: Run,
     *,
     tolerance: float = 1e-6,
-    initial: Mapping[str, Mapping[float, float]] | None = None,
+    initial: Mapping[str, Mapping[float, float] | Sequence[float]] | None = None,
     max_m: int = 1 << 22,
 ) -> Run:
     """Simulate a model with the inputs of a run, and return the outputs at the run's sample times.
@@ -92,13 +96,14 @@ def simulate(
     tolerance
         Change of the outputs, relative to their largest value, at which the refinement of the step terminates.
     initial
-        Coefficients of the initial terms (powers of t), by output and exponent; by default the run starts at rest. Such
-        coefficients apply to one run only. With a sensor filter, the exponents -1 and -2 are an impulse and its
-        derivative, which represent the initial state of the filter. An offset c of the equation is the exponent alpha
-        with the coefficient c / Gamma(alpha + 1). The exponent infinity is the level of an output; the values of the
-        inputs before they change are then subtracted from the inputs. Initial values y(0), y'(0) by Caputo's definition
-        imply further powers of t if a term of the output has a fractional order. If these powers are missing, an error
-        lists them.
+        Initial values or initial terms of the outputs, by name; by default the run starts at rest. A sequence gives the
+        initial values y(0), y'(0), ... by Caputo's definition. A mapping gives the coefficients of the initial terms
+        (powers of t) by exponent, as in ``Comparison.initial``. The coefficient of t is not y'(0) if the equation has a
+        term D y. If initial values imply further powers and these are missing, an error lists them.
+        With a sensor filter, the exponents -1 and -2 are an impulse and its derivative, which represent the initial
+        state of the filter. An offset c of the equation is the exponent alpha with the coefficient
+        c / Gamma(alpha + 1). The exponent infinity is the level of an output; the values of the inputs before they
+        change are then subtracted from the inputs.
     max_m
         Maximum number of block pulses. If the simulation has not converged with it, ConvergenceError is raised.
 
@@ -123,11 +128,13 @@ def simulate(
         raise DataError(f"run is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
     sensor = model.structure.sensor_filter
     impulses = {-1.0 - k for k in range(sensor.relative_degree if sensor is not None else 0)}
-    for name, terms in (initial or {}).items():
-        if name not in model.outputs:
-            raise ModelError(
-                f"initial terms of {name!r}, which is no output of the model; give those of {', '.join(model.outputs)}"
-            )
+    unknown = next((name for name in initial or {} if name not in model.outputs), None)
+    if unknown is not None:
+        raise ModelError(
+            f"initial terms of {unknown!r}, which is no output of the model; give those of {', '.join(model.outputs)}"
+        )
+    initial_terms = _initial_terms(model, initial or {})
+    for name, terms in initial_terms.items():
         check_initial(
             [
                 e
@@ -138,20 +145,18 @@ def simulate(
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
     # The equations are simulated for deviations from given levels, which are added to the result.
-    levels = {name: terms.get(LEVEL_EXPONENT, 0.0) for name, terms in (initial or {}).items()}
-    initial = {n: {e: v for e, v in terms.items() if e != LEVEL_EXPONENT} for n, terms in (initial or {}).items()}
+    levels = {name: terms.get(LEVEL_EXPONENT, 0.0) for name, terms in initial_terms.items()}
+    powers = {n: {e: v for e, v in terms.items() if e != LEVEL_EXPONENT} for n, terms in initial_terms.items()}
     if any(levels.values()):
         run = deviations(run, model.structure)[0]
     if model.structure.offset == "level":
         model = replace(model, structure=replace(model.structure, offset="none"))
-    for equation in model.equations:
-        _check_initial_values(equation, initial.get(equation.output, {}))
     default_pulses = run.length - 1
     max_m = min(max_m, MAX_M)
     if default_pulses > max_m:
         raise ModelError(f"run {run.name!r} has {default_pulses} intervals, more than {max_m}; slice it")
     free = simulate_refined(
-        model, _with_missing_outputs(run, model), initial, tolerance=tolerance, max_m=max_m, on_grid=True
+        model, _with_missing_outputs(run, model), powers, tolerance=tolerance, max_m=max_m, on_grid=True
     )
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):
@@ -177,32 +182,87 @@ def simulate(
     )
 
 
-def _check_initial_values(equation: Equation, terms: Mapping[float, float]) -> None:
-    """Raise ModelError if the initial terms lack fractional powers of t that initial values imply.
+def _initial_terms(
+    model: Model, initial: Mapping[str, Mapping[float, float] | Sequence[float]]
+) -> dict[str, dict[float, float]]:
+    """Return the coefficients of the powers of t by output and exponent, from these or from initial values.
+
+    Raise ModelError if an output has more initial values than its order allows, or if given powers do not contain those
+    that initial values imply.
+    """
+    values: dict[str, list[float]] = {}
+    for equation in model.equations:
+        given = initial.get(equation.output)
+        if given is None or isinstance(given, Mapping):
+            continue
+        count = math.ceil(equation.order.constant - ORDER_RESOLUTION)
+        values[equation.output] = [real_number(f"an initial value of {equation.output}", v) for v in given]
+        if len(values[equation.output]) > count:
+            raise ModelError(
+                f"{len(values[equation.output])} initial values of {equation.output}, but its equation of order "
+                f"{equation.order.constant:g} has {count}; give y(0) and the derivatives of lower order than the "
+                "equation"
+            )
+    terms = _powers_of_initial_values(model, values) if values else {}
+    for equation in model.equations:
+        given = initial.get(equation.output)
+        if isinstance(given, Mapping):
+            terms[equation.output] = dict(given)
+            _check_powers(model, equation, given)
+    return terms
+
+
+def _powers_of_initial_values(model: Model, values: Mapping[str, Sequence[float]]) -> dict[str, dict[float, float]]:
+    """Return the coefficients of the powers of t that initial values imply, by output and exponent.
 
     In an equation of order alpha, integrated alpha times, a term with Caputo's derivative D^nu y becomes
     I^(alpha - nu) (y - sum of y_i t^i / i!), where y_i are the initial values. This contains powers alpha - nu + i.
     """
-    alpha = equation.order.constant
-    values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
-    required_values: dict[float, float] = {}
-    for i, value in values.items():
-        required_values[float(i)] = required_values.get(float(i), 0.0) + value
+    powers: dict[str, dict[float, float]] = {}
+    for equation in model.equations:
+        alpha, own = equation.order.constant, values.get(equation.output, ())
+        coefficients = {float(i): v / math.factorial(i) for i, v in enumerate(own)}
         for term in equation.terms:
-            order, power = term.order.constant, round(alpha - term.order.constant + i, 9)
-            if term.column == equation.output and i < math.ceil(order - 1e-9):
-                contribution = float(term.fixed_value or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
-                required_values[power] = required_values.get(power, 0.0) - contribution * value
-    missing_exponents = [
-        e for e in required_values if e != round(e) and not any(abs(e - exponent) < 1e-6 for exponent in terms)
-    ]
-    if missing_exponents:
-        text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(required_values.items()))
+            if term.column != equation.output and model.structure.coupling != "simulated":
+                continue
+            order = term.order.constant
+            for i, value in enumerate(values.get(term.column, ())):
+                if value and i < math.ceil(order - ORDER_RESOLUTION):
+                    power = round(alpha - order + i, 9)
+                    change = float(term.fixed_value or 0.0) * value / math.gamma(power + 1.0)
+                    coefficients[power] = coefficients.get(power, 0.0) - change
+        if coefficients:
+            powers[equation.output] = coefficients
+    return powers
+
+
+def _check_powers(model: Model, equation: Equation, terms: Mapping[float, float]) -> None:
+    """Raise ModelError if given whole powers of t are initial values that imply other powers.
+
+    A whole power is taken for an initial value if a power that it implies is missing, or if it is 0 although a
+    coefficient other than 0 is implied.
+    """
+    count = math.ceil(equation.order.constant - ORDER_RESOLUTION)
+    given = {int(e): v for e, v in terms.items() if 0.0 <= e < count and e == int(e)}
+    if not any(given.values()):
+        return
+    values = [math.factorial(i) * given.get(i, 0.0) for i in range(max(given) + 1)]
+    implied = _powers_of_initial_values(model, {equation.output: values})[equation.output]
+
+    def is_missing(exponent: float) -> bool:
+        value = next((v for e, v in terms.items() if abs(e - exponent) < EXPONENT_TOLERANCE), None)
+        return value is None or (value == 0.0 and exponent == round(exponent))
+
+    missing = [e for e, v in implied.items() if v and is_missing(e)]
+    if missing:
+        shown = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(implied.items()))
+        fractional = next((e for e in missing if e != round(e)), None)
+        only = "" if fractional is None else f", or t^{fractional:g} as 0 if only the given powers are meant"
         raise ModelError(
-            f"initial terms of {equation.output}: powers of t {', '.join(map(str, sorted(values)))}, but initial "
-            "values by "
-            f"Caputo's definition imply further powers in an equation of fractional order; give {{{text}}} for such "
-            f"initial values, or t^{missing_exponents[0]:g} as 0 if only the given powers are meant"
+            f"initial terms of {equation.output}: powers of t {', '.join(f'{e:g}' for e in sorted(given))}, but "
+            f"initial values by Caputo's definition imply the powers {{{shown}}}; give "
+            f"{parameter('initial')}{{{equation.output!r}: {[float(f'{v:.6g}') for v in values]}}} for these initial "
+            f"values{only}"
         )
 
 
