@@ -172,11 +172,32 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 /// signal at the edge is then the average of its means over the two neighboring pulses.
 pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
-/// Return the convolution of `series` with a signal whose spectrum is `cached`, truncated to the length of `series`.
-pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
-    let mut out = vec![0.0; series.len()];
-    cached.apply(series, &mut out, &mut Buffers::default());
-    out
+/// Spectrum of a signal, for its convolutions with several kernels.
+///
+/// The values before the first nonzero value of the signal are left out. A convolution is therefore exactly 0 there, so
+/// that a system stays at rest until its inputs start. Rounding errors of transforms would be outside the domain of
+/// functions such as the square root.
+pub(crate) struct SignalSpectrum {
+    /// Index of the first nonzero value.
+    start: usize,
+    /// Spectrum of the signal from `start` on.
+    spectrum: Kernel,
+}
+
+impl SignalSpectrum {
+    /// Return the spectrum of a signal.
+    pub(crate) fn new(signal: &[f64]) -> Self {
+        let start = signal.iter().position(|v| *v != 0.0).unwrap_or(signal.len());
+        Self { start, spectrum: Kernel::new(&signal[start..]) }
+    }
+
+    /// Return the convolution of the signal with a kernel of equal length, truncated to this length.
+    pub(crate) fn convolve(&self, kernel: &[f64]) -> Vec<f64> {
+        let mut out = vec![0.0; kernel.len()];
+        let start = self.start.min(kernel.len());
+        self.spectrum.apply(&kernel[..kernel.len() - start], &mut out[start..], &mut Buffers::default());
+        out
+    }
 }
 
 /// Return values at the ends of pulses from pulse means: the averages of neighboring means. The last value is

@@ -3,7 +3,7 @@
 use super::channels::{uses_output_means, MIN_INTEGRATION_ORDER};
 use super::channels::{ForcingTerms, IntegralKernel, StateChannel};
 use super::contact::ContactOperators;
-use super::convolution::{average_neighbors, product, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
+use super::convolution::{average_neighbors, ConvolutionKernel, SignalSpectrum, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
 use super::jumps::ForceJumps;
 use super::system::NonlinearSystem;
@@ -12,7 +12,6 @@ use crate::error::{Error, Result};
 use crate::fractional::kernels::{kernel, MAX_ORDER_EXCESS};
 use crate::friction::FrictionLaw;
 use crate::regressors::Record;
-use crate::series::Kernel;
 
 /// Argument of an expression, by its index: a state channel, or an input channel (an input or a derivative of one).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -258,7 +257,7 @@ impl Operators {
     /// Add the contributions of the inputs to the forcing of the state channels.
     pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut ForcingTerms) {
         for (signal, inputs) in self.inputs_by_signal() {
-            let spectrum = Kernel::new(record.signal(signal));
+            let spectrum = SignalSpectrum::new(record.signal(signal));
             for input in inputs {
                 let weight = system.equations[input.term.0].coefficients[input.term.1];
                 let part = self.integrate(&spectrum, input.kernel, self.kernels[input.kernel].values());
@@ -269,8 +268,8 @@ impl Operators {
 
     /// Return the fractional integral of a signal that is given by its spectrum. `series` holds the values of the
     /// kernel with index `kernel`, or their derivatives with respect to its order.
-    pub(super) fn integrate(&self, signal: &Kernel, kernel: usize, series: &[f64]) -> Vec<f64> {
-        let out = product(signal, series);
+    pub(super) fn integrate(&self, signal: &SignalSpectrum, kernel: usize, series: &[f64]) -> Vec<f64> {
+        let out = signal.convolve(series);
         if self.integrals[kernel].is_averaged() {
             average_neighbors(&out)
         } else {
@@ -318,5 +317,5 @@ pub(super) fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64
             remedy: "measure the derivative as a signal".into(),
         });
     }
-    Ok(product(&Kernel::new(means), &kernel(-order, means.len(), step)))
+    Ok(SignalSpectrum::new(means).convolve(&kernel(-order, means.len(), step)))
 }

@@ -9,13 +9,14 @@ use crate::linalg::small;
 
 /// Maximum number of Newton iterations in a pulse. Two or three are usual.
 const MAX_NEWTON_ITERATIONS: usize = 50;
-/// Maximum number of times that a Newton step is halved if it does not reduce the residual.
-const MAX_STEP_HALVINGS: usize = 12;
+/// Maximum number of times that a Newton step is halved if it does not reduce the residual. From the infinite slope of a
+/// square root at 0, which counts as 0, a solution may be smaller than the first step by many orders of magnitude.
+const MAX_STEP_HALVINGS: usize = 50;
 /// Newton step at which the iteration has converged, relative to the sum of the magnitudes of the channel's terms.
 /// Convergence is quadratic, so the next step would be below rounding error. The Jacobian is computed before this step
 /// and therefore has a relative error of this size.
 const NEWTON_TOLERANCE: f64 = 1e-8;
-/// Rounding error of the residual of a channel, relative to the sum of the magnitudes of the channel's terms.
+/// Rounding error of the residual of a channel, relative to the rounding scale of the channel.
 const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
 /// Equations of one pulse, with the current iterate of the Newton iterations and work arrays.
@@ -44,6 +45,10 @@ pub(super) struct Pulse<'a> {
     residual: Vec<f64>,
     /// Sum of the magnitudes of the terms in the equation of each state channel.
     magnitudes: Vec<f64>,
+    /// Scale of the rounding error of each residual: `magnitudes`, with the rounding scales of the non-linear terms.
+    rounding_scales: Vec<f64>,
+    /// Rounding scale of each non-linear term, then the magnitudes of the friction forces.
+    term_scales: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
     previous: Vec<f64>,
@@ -70,6 +75,8 @@ impl<'a> Pulse<'a> {
             determinant: 1.0,
             residual: vec![0.0; states],
             magnitudes: vec![0.0; states],
+            rounding_scales: vec![0.0; states],
+            term_scales: vec![0.0; values],
             matrix: vec![0.0; states * states],
             step: vec![0.0; states],
             previous: vec![0.0; states],
@@ -97,6 +104,7 @@ impl<'a> Pulse<'a> {
             };
             self.arguments.extend(term.arguments.iter().map(value));
             self.values[q] = self.system.derived[term.signal].expression.evaluate(&self.arguments, &mut self.work);
+            self.term_scales[q] = self.work.rounding_scale();
             self.fault = self.fault.or(self.work.fault());
             for (argument, slope) in term.arguments.iter().zip(self.work.slopes()) {
                 let column = match *argument {
@@ -106,6 +114,8 @@ impl<'a> Pulse<'a> {
                 self.slopes[q * width + column] += slope;
             }
         }
+        let terms = self.operators.terms.len();
+        self.term_scales[terms..].iter_mut().zip(&self.values[terms..]).for_each(|(scale, v)| *scale = v.abs());
         let count = self.operators.sources();
         let mut norm = 0.0;
         for a in 0..states {
@@ -113,6 +123,9 @@ impl<'a> Pulse<'a> {
             let same_pulse_sum: f64 = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| g * x).sum();
             let magnitudes = gains.iter().zip(self.z.iter().chain(&self.values)).map(|(g, x)| (g * x).abs());
             self.magnitudes[a] = magnitudes.sum::<f64>() + self.z[a].abs() + self.free[a].abs();
+            let scales = gains[states..].iter().zip(self.values.iter().zip(&self.term_scales));
+            let excess: f64 = scales.map(|(g, (value, scale))| g.abs() * (scale - value.abs())).sum();
+            self.rounding_scales[a] = self.magnitudes[a] + excess;
             self.residual[a] = match self.fixed[a] {
                 Some(value) => self.z[a] - value,
                 None => self.z[a] - self.free[a] - same_pulse_sum,
@@ -210,7 +223,7 @@ impl<'a> Pulse<'a> {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
                 // The inverse Jacobian propagates rounding errors of large state channels to small ones.
-                let rounding: f64 = row.iter().zip(&self.magnitudes).map(|(v, magnitude)| (v * magnitude).abs()).sum();
+                let rounding: f64 = row.iter().zip(&self.rounding_scales).map(|(v, scale)| (v * scale).abs()).sum();
                 let tolerance = NEWTON_TOLERANCE * self.magnitudes[a] + ROUNDING_RATIO * rounding;
                 is_small &= self.step[a].abs() <= tolerance;
             }

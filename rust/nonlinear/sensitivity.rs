@@ -2,7 +2,7 @@
 
 use super::channels::SystemDerivatives;
 use super::contact::{BodyDerivatives, ContactOperators, ContactResponses, MotionDerivatives};
-use super::convolution::OnlineConvolution;
+use super::convolution::{OnlineConvolution, SignalSpectrum};
 use super::input_continuation::{ContinuedPulse, InputContinuation};
 use super::operators::{derivative, InputContribution, Operators};
 use super::system::NonlinearSystem;
@@ -10,14 +10,13 @@ use super::time_stepping::LinearizedRun;
 use crate::equation::ORDER_GRAIN;
 use crate::error::Result;
 use crate::regressors::Record;
-use crate::series::{Buffers, Kernel};
 
 /// Cache for the sensitivities of one simulated run. It contains convolutions of simulated pulse means with kernels and
 /// with derivatives of kernels, and responses to friction forces. Each is computed when it is first needed.
 pub(super) struct SensitivityCache<'a> {
     operators: &'a Operators,
     run: &'a LinearizedRun,
-    spectra: Vec<Option<Kernel>>,
+    spectra: Vec<Option<SignalSpectrum>>,
     slopes: Vec<Option<Vec<f64>>>,
     convolutions: std::collections::BTreeMap<(usize, usize, bool), Vec<f64>>,
     contacts: Option<ContactResponses>,
@@ -50,9 +49,6 @@ impl<'a> SensitivityCache<'a> {
     fn convolution(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
         let key = (kernel, source, is_slope);
         if !self.convolutions.contains_key(&key) {
-            if self.spectra[source].is_none() {
-                self.spectra[source] = Some(Kernel::new(&self.run.sources[source]));
-            }
             if is_slope {
                 self.kernel_slope(kernel);
             }
@@ -60,11 +56,9 @@ impl<'a> SensitivityCache<'a> {
                 Some(slope) if is_slope => slope.as_slice(),
                 _ => self.operators.kernels[kernel].values(),
             };
-            let mut out = vec![0.0; self.operators.m];
-            if let Some(spectrum) = &self.spectra[source] {
-                spectrum.apply(series, &mut out, &mut Buffers::default());
-            }
-            self.convolutions.insert(key, out);
+            let signal = &self.run.sources[source];
+            let spectrum = self.spectra[source].get_or_insert_with(|| SignalSpectrum::new(signal));
+            self.convolutions.insert(key, spectrum.convolve(series));
         }
         &self.convolutions[&key]
     }
@@ -107,14 +101,17 @@ impl Operators {
             }
         }
         for (signal, inputs) in self.inputs_by_signal() {
-            let input_change =
-                derivatives.inputs.iter().find(|input| input.signal == signal).map(|input| Kernel::new(&input.means));
+            let input_change = derivatives
+                .inputs
+                .iter()
+                .find(|input| input.signal == signal)
+                .map(|input| SignalSpectrum::new(&input.means));
             let mut spectrum = None;
             for input in inputs {
                 let (coefficient, order) = derivatives.terms[input.term.0][input.term.1];
                 let weight = system.equations[input.term.0].coefficients[input.term.1];
                 if coefficient != 0.0 || order != 0.0 {
-                    let spectrum = spectrum.get_or_insert_with(|| Kernel::new(record.signal(signal)));
+                    let spectrum = spectrum.get_or_insert_with(|| SignalSpectrum::new(record.signal(signal)));
                     if coefficient != 0.0 {
                         let part = self.integrate(spectrum, input.kernel, self.kernels[input.kernel].values());
                         add(&mut forcing[input.state], coefficient, &part);

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -202,6 +203,58 @@ def test_a_run_that_forgets_its_parameters_is_said():
     assert "simulation_chaotic" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
     # A linear unstable model grows with its output.
     assert "simulation_chaotic" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
+
+
+@pytest.mark.parametrize("at", [300, 450, 600])
+def test_a_late_step_is_not_chaos(at):
+    """A tank in equilibrium at 0.4 m, and one step of its pump."""
+    rows, rng = 800, np.random.default_rng(0)
+    u = np.where(np.arange(rows) < at, 2.0 * np.sqrt(0.4), 1.8)
+    y = np.full(rows, 0.4)
+    rate = lambda _, level: -0.02 * np.sqrt(level) + 0.018  # noqa: E731
+    y[at:] = solve_ivp(rate, (0, rows), [0.4], t_eval=np.arange(rows - at), rtol=1e-10, atol=1e-12).y[0]
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": y + 0.003 * rng.standard_normal(rows)})
+    found = ftlm.identify(run, ftlm.equation("D y = -k sqrt(y) + b u"), threads=1)
+    assert {f.code for f in found.findings if f.level == "do not use"} == set()
+    for name, truth in (("k", 0.02), ("b", 0.01)):
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < 0.02 * truth
+
+
+@pytest.mark.parametrize("rows_at_rest", [0, 1, 40])
+@pytest.mark.parametrize("root", ["sqrt(y)", "sqrt(abs(y))"])
+def test_a_tank_that_is_empty_until_its_pump_starts_is_simulated_and_found(rows_at_rest, root):
+    """The slope of the square root is infinite at rest."""
+    rows = 300
+    u = np.where(np.arange(rows) < rows_at_rest, 0.0, 1.2)
+    y = np.zeros(rows)
+    rate = lambda _, level: -0.02 * np.sqrt(np.maximum(level, 0.0)) + 0.012  # noqa: E731
+    times = np.arange(rows - rows_at_rest)
+    y[rows_at_rest:] = solve_ivp(rate, (0, rows), [0.0], t_eval=times, rtol=1e-9, atol=1e-11).y[0]
+    noise = 0.003 * np.random.default_rng(0).standard_normal(rows)
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": y + noise})
+    simulated = ftlm.Model(ftlm.equation(f"D y = -0.02 {root} + 0.01 u")).simulate(run)["y"]
+    np.testing.assert_allclose(simulated, y, atol=2e-6)
+    assert not simulated[: rows_at_rest + 1].any()
+    found = ftlm.identify(run, ftlm.equation(f"D y = -k {root} + b u"), threads=1)
+    assert found.coefficients == pytest.approx({"k": 0.02, "b": 0.01}, rel=0.03)
+
+
+@pytest.mark.parametrize("at", [100, 320])
+def test_radiation_at_ambient_temperature_is_simulated_and_found(at):
+    """Near y = 0 the fourth powers cancel to rounding errors, which no Newton step reduces."""
+    step, rows = 5.0, 600
+    heat = np.where(np.arange(rows) < at, 0.0, 60.0)
+    rate = lambda _, y: -2e-3 * y - 8e-12 * ((y + 293) ** 4 - 293.0**4) + 1.2  # noqa: E731
+    y = np.zeros(rows)
+    times = step * np.arange(rows - at)
+    y[at:] = solve_ivp(rate, (0, step * rows), [0.0], t_eval=times, rtol=1e-10, atol=1e-9).y[0]
+    noise = 0.05 * np.random.default_rng(1).standard_normal(rows)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": heat}, outputs={"y": y + noise})
+    model = ftlm.Model(ftlm.equation("D y = -0.002 y - 8e-12 ((y + 293)^4 - 293^4) + 0.02 u"))
+    np.testing.assert_allclose(model.simulate(run)["y"], y, atol=1e-5)
+    found = ftlm.identify(run, ftlm.equation("D y = -a y - e ((y + 293)^4 - 293^4) + b u"), threads=1)
+    assert found.coefficients == pytest.approx({"a": 2e-3, "e": 8e-12, "b": 0.02}, rel=0.02)
+    assert "step_moves_estimate" not in {f.code for f in found.findings}
 
 
 def test_a_fit_to_chaotic_motion_has_no_intervals():
