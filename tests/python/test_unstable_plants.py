@@ -58,6 +58,29 @@ def test_default_splits_the_run_and_finds_the_plant(seed, noise, tmp_path):
     assert by_hand.coefficients == found.coefficients
 
 
+def levitation_run(seed, rows=4000, step=1e-3):
+    """Magnetic levitation D^2 x = 900 x - 20 i under PID control, steps of the reference, noise of 0.05 %."""
+    rng, x, total, last = np.random.default_rng(seed), np.zeros(2), 0.0, 0.0
+    move = expm(np.array([[0.0, 1.0, 0.0], [900.0, 0.0, -20.0], [0.0, 0.0, 0.0]]) * step)
+    positions, currents = np.empty(rows), np.empty(rows)
+    for k, target in enumerate(np.repeat(rng.uniform(-0.002, 0.002, rows // 200), 200)):
+        positions[k] = x[0] + 1e-6 * rng.standard_normal()
+        error = target - positions[k]
+        slope = (error - last) / step if k else 0.0
+        total, last = total + error * step, error
+        currents[k] = -100.0 * error - 300.0 * total - 4.0 * slope
+        x = move[:2, :2] @ x + move[:2, 2] * currents[k]
+    return ftlm.Run.from_arrays(step=step, inputs={"i": currents}, outputs={"x": positions})
+
+
+def test_an_unstable_plant_whose_output_a_stable_model_half_explains_is_found():
+    run = levitation_run(8)
+    found = ftlm.identify(run, ftlm.equation("D^2 x = a1 D x + a0 x + b i"), threads=1)
+    assert found.coefficients["a0"] == pytest.approx(900.0, rel=0.01)
+    assert found.coefficients["b"] == pytest.approx(-20.0, rel=0.01)
+    assert "runs_split" in codes(found)
+
+
 @pytest.mark.parametrize("initial", ["rest", "caputo"])
 def test_a_start_that_is_given_is_kept_and_the_way_is_named(initial):
     run = controlled_run(4.0, 2.0, 5.0, seed=1, noise=1e-2)

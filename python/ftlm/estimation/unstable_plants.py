@@ -113,17 +113,20 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
     """
     if not model.structure.is_linear:
         return []
-    is_explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
+    residual = max((f.nr for f in comparison.output_error.values()), default=0.0)
+    is_explained = residual <= MAX_NORMALIZED_RESIDUAL
     is_unstable = any(f.code == "simulation_unbounded" for f in stability_findings(model))
     if is_unstable:
         test = piece_test(model, runs)
         if test is not None and test.passed:
             code = "plant_unstable" if is_explained and fit.joint is not None else "plant_unstable_in_pieces"
             return [make_finding(code, fit=test.fit, seconds=test.seconds)]
-    if (is_explained and not is_unstable) or fit.joint is None:
+    if fit.joint is None or (not is_unstable and residual <= MAX_PIECE_RESIDUAL):
         return []
     test = least_squares_piece_test(runs, fit.task.structure.with_orders(model.orders), model.units)
-    return [] if test is None else [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]
+    if test is None or (is_explained and test.residual >= residual):
+        return []
+    return [make_finding("plant_needs_pieces", fit=test.fit, seconds=test.seconds)]
 
 
 def least_squares_piece_test(runs: Sequence[Run], structure: Structure, units: Mapping[str, str]) -> PieceTest | None:
