@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import signal
+from scipy.integrate import solve_ivp
 
 import ftlm
 from ftlm.estimation import extensions
@@ -36,6 +37,7 @@ CODES = {
     "motion_missing",
     "friction_fits",
     "load_step_fits",
+    "nonlinear_term_fits",
     *(code for _, code, _ in ACTING.values()),
     *(code for *_, code in MISSING.values()),
 }
@@ -378,3 +380,43 @@ def test_color_under_a_constant_input_is_not_blamed_on_the_model(rows, seeds):
     wrong = {"residuals_not_white", "output_not_white", "noise_coloured", "dynamics_missing"}
     assert all(wrong.isdisjoint(codes) for codes in found), found
     assert 6 * sum("color_undecided" in codes for codes in found) >= 4 * seeds, found
+
+
+def heated(_, x, u):
+    return [-2e-3 * x[0] - 8e-12 * ((x[0] + 293) ** 4 - 293.0**4) + 0.02 * u]
+
+
+def swinging(_, x, u):
+    return [x[1], -0.5 * x[1] - 9.81 * np.sin(x[0]) + u]
+
+
+def multiplied(_, x, u):
+    return [-0.8 * x[0] + 2 * u + 0.5 * x[0] * u]
+
+
+#: Slope of the state, number of states, step, rows between changes of the input, its range, noise, a structure that
+#: lacks a non-linear term, and the terms that may be named.
+CURVED = {
+    "pendulum": (swinging, 2, 0.02, 40, (-6, 6), 0.005, "D^2 y = -c D y - k y + b u", ("y^3",)),
+    "heating": (heated, 1, 10.0, 40, (0, 50), 0.1, "D y = -a y + b u", ("y^2", "y^3")),
+    "radiation": (heated, 1, 10.0, 40, (0, 50), 0.1, "D y = -e ((y + 293)^4 - 293^4) + b u", ("y", "y^2", "y^3")),
+    "product": (multiplied, 1, 0.1, 20, (-1, 1), 0.01, "D y = -a y - e y^2 + b u", ("y*u",)),
+}
+
+
+@pytest.mark.parametrize("name", CURVED)
+def test_a_missing_nonlinear_term_is_not_called_noise(name):
+    slope, states, step, hold, interval, noise, text, terms = CURVED[name]
+    rng, rows = np.random.default_rng(1), 700
+    u = np.repeat(rng.uniform(*interval, rows // hold + 1), hold)[:rows]
+    y, x = np.empty(rows), np.zeros(states)
+    for k in range(rows):
+        y[k] = x[0]
+        x = solve_ivp(slope, (0, step), x, args=(u[k],), rtol=1e-8, atol=1e-10).y[:, -1]
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + noise * rng.standard_normal(rows)})
+    found = ftlm.identify(run, ftlm.equation(text), threads=1)
+    (finding,) = (f for f in found.findings if f.code in CODES)
+    assert finding.code == "nonlinear_term_fits"
+    assert any(f": k {term} explains" in finding.sentence for term in terms)
+    assert 20 < finding.numbers["share"] <= 100
+    assert "noise_coloured" not in {f.code for f in found.findings}

@@ -2,7 +2,7 @@
 
 The extensions are an output level, nonzero initial conditions, a constant, a linear drift of an output, another
 intersample behavior of an input (``"zoh"`` or ``"foh"``), a lag, a delay or lead, a zero, a pole with a zero, dry
-friction, a saturation, a dead zone, a squared input, and a load step.
+friction, a saturation, a dead zone, a squared input, a non-linear term of the output, and a load step.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import enumerate_names
+from ftlm.estimation.nonlinear_checks import nonlinear_term_inputs
 from ftlm.estimation.nuisance_parameters import evaluate_at_point, output_sensitivities, refit_after_screening
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
@@ -96,6 +97,7 @@ CAUSE_NAMES = {
     "saturation_fits": "a saturation",
     "dead_zone_fits": "a dead zone",
     "square_fits": "the square of an input",
+    "nonlinear_term_fits": "a non-linear term of the output",
     "friction_fits": "dry friction",
     "load_step_fits": "a load step",
 }
@@ -190,8 +192,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
 
     Colored residuals are colored noise, or contain a response that the structure lacks. An autoregression of the
     residuals distinguishes the two: only a missing response raises its innovation variance. An extension is reported
-    only if its own residuals depend neither on an input nor on the direction of motion.
-
+    only if its own residuals depend neither on an input nor on the direction of motion, or if it is a non-linear term.
     Residuals at the level of rounding and discretization errors are not tested.
 
     If a controller computes an input from the output of the same row, the input contains the noise of this row. An
@@ -200,7 +201,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
 
     Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
     with a coefficient law are tested only for a constant, a drift and intersample behavior. Structures with other
-    non-linear terms are tested only for intersample behavior.
+    non-linear terms are tested only for intersample behavior and for further non-linear terms.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     inexact = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
@@ -210,7 +211,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
     fed_back = _inputs_fed_back_within_row(fit.model, tests)
-    names = [n for n in _inputs_of_single_equation(structure, runs) if n not in fed_back]
+    inputs = [n for n in _inputs_of_single_equation(structure, runs) if n not in fed_back]
+    names = inputs if structure.is_linear else []
     location = {"run": ", ".join(r.name for r in runs), "output": ", ".join(structure.outputs)}
     try:
         joint, runs = _first_samples(joint, structure, runs)
@@ -226,6 +228,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint.values_by_name, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
+        fits += fit_each(_nonlinear_extensions(structure, joint, runs, inputs)) if inputs else []
         best = _best_physical(fits, fitted_criterion)
         if best is not None and best.extension.code != "offset_missing":
             # The optimum with an offset or friction may be far from that without. Under an input of one sign or of two
@@ -260,12 +263,15 @@ def _extension_findings(
     """
     missing = [make_finding("dynamics_missing", input=enumerate_names(names), **location)] if names else []
     extension, refit = best.extension, best.fit
+    share = 100.0 * (1.0 - min(_largest_change(joint, refit)["ratio"], 1.0))
+    if extension.code == "nonlinear_term_fits":
+        # The effect of the term is of first order only, so that its residuals may still depend on the inputs.
+        return [make_finding(extension.code, term=extension.term_text, share=share, **location)]
     if not best.is_physical or not _passes_residual_tests(best, runs):
         return missing
     if extension.code == "offset_missing":
         change = _largest_change(joint, refit)
         test = f"with it {change['parameter']} is {change['other_value']:.4g}, not {change['value']:.4g}"
-        share = 100.0 * (1.0 - min(change["ratio"], 1.0))
         return [make_finding("offset_missing", output=location["output"], share=share, test=test)]
     if extension.code in OFFSET_CODES:
         return [make_finding(extension.code, **location, **_largest_change(joint, refit))]
@@ -295,8 +301,8 @@ def _extension_findings(
 
 
 def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, ...]:
-    """Return the inputs of a linear structure of one equation without a coefficient law; () for other structures."""
-    if len(structure.equations) > 1 or structure.coefficient_law or not structure.is_linear:
+    """Return the inputs of a structure of one equation without a coefficient law; () for other structures."""
+    if len(structure.equations) > 1 or structure.coefficient_law:
         return ()
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
@@ -304,7 +310,7 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 def _inputs_fed_back_within_row(model: Model, tests: Residuals) -> set[str]:
     """Return the inputs that, by the feedback tests, depend on an output of the same row.
 
-    The result is empty for a non-linear model, which has no static gain.
+    There are none for a non-linear model, which has no static gain.
     """
     loops = {(output, name): t for output, r in tests.outputs.items() for name, t in r.feedback_tests.items()}
     states = steady_states(model) if model.structure.is_linear else ()
@@ -692,6 +698,16 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
         return []
     time = run.start + row * run.step
     return [Extension("load_step_fits", extended, 2, [name], [values], runs=as_runs(with_load(row)), load_time=time)]
+
+
+def _nonlinear_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
+    """Return extensions by the terms of :func:`nonlinear_term_inputs`."""
+    (equation,), samples = structure.equations, simulate_runs(fitted_model(joint, structure), runs)
+    (signal,), (coefficient,) = (unused_names(base, 1, structure, runs[0].signals) for base in ("term", "k"))
+    extended = replace(structure, equations=(_with_terms(equation, [Term(signal, Order(0.0), coefficient)]),))
+    base = Extension("nonlinear_term_fits", extended, 1, names, starts=[{**joint.values_by_name, coefficient: 0.0}])
+    inputs = nonlinear_term_inputs(equation, runs, [s.outputs[0] for s in samples], names, signal)
+    return [replace(base, runs=as_runs(new), term_text=f"{coefficient} {text}") for text, new in inputs.items()]
 
 
 def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -> tuple[Floats, Floats]:

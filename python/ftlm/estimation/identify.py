@@ -78,7 +78,7 @@ SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Codes of reported effects that have a nonzero mean. The test for an offset would report this mean as well.
 HAVE_MEAN_CODES = (
     *OFFSET_CODES,
-    *("saturation_fits", "dead_zone_fits", "square_fits", "friction_fits", "load_step_fits"),
+    *("saturation_fits", "dead_zone_fits", "square_fits", "nonlinear_term_fits", "friction_fits", "load_step_fits"),
 )
 #: Fraction of the progress of an identification that is reached when its initial conditions are selected.
 INITIAL_CONDITIONS_PROGRESS = 0.7

@@ -1,4 +1,4 @@
-"""Findings on non-linear terms: their range in the data, their share of the motion, and chaotic sensitivity."""
+"""Findings on non-linear terms: their range, their share of the motion, chaos, and candidates for missing terms."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError
+from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.findings import Finding, make_finding
 from ftlm.kernels import integrate
 from ftlm.model.model import Model
@@ -18,6 +19,7 @@ from ftlm.simulation.nonlinear_columns import differentiate
 from ftlm.simulation.output_samples import LEVEL_EXPONENT, OutputSamples, simulate_samples
 from ftlm.structure.equation import Equation, Term, derivative
 from ftlm.structure.expression import Channel, channel
+from ftlm.structure.order import Order
 from ftlm.utils.validation import Floats
 
 #: Growth factor of a small change from the first to the second half of a run, above which the growth is exponential,
@@ -143,3 +145,30 @@ def _sensitivity_growth_findings(
     if worst is None:
         return []
     return [make_finding("simulation_chaotic", run=worst[2], growth=worst[0], seconds=worst[1])]
+
+
+def nonlinear_term_inputs(
+    equation: Equation, runs: Sequence[Run], simulated: Sequence[Floats], names: Sequence[str], signal: str
+) -> dict[str, list[Run]]:
+    """Return runs with non-linear terms of the output as an additional input `signal`, by the text of the term.
+
+    The terms are the square and the cube of the output, and its product with each of the inputs `names`. In an equation
+    with non-linear terms but without the output itself, the output is one of them. They are computed from the outputs
+    `simulated` of a fit, one array per run, and divided by a power of the largest value. A coefficient of such an input
+    has the effect of a small non-linear term, to first order.
+    """
+    scale = max(float(np.abs(y).max()) for y in simulated) or 1.0
+    outputs = [y / scale for y in simulated]
+    name = equation.output
+    factors: dict[str, Sequence[Floats]] = {f"{name}^2": outputs, f"{name}^3": [y**2 for y in outputs]}
+    factors |= {f"{name}*{n}": [run[n] for run in runs] for n in names}
+    if equation.nonlinear_terms and not any(t.signal == name and t.order == Order(0.0) for t in equation.terms):
+        factors[name] = [np.ones_like(y) for y in outputs]
+
+    def with_term(run: Run, values: Floats) -> Run:
+        return run_with_inputs(run, {signal: values}).with_intersample({signal: "foh"})
+
+    return {
+        text: [with_term(run, y * v) for run, y, v in zip(runs, outputs, values, strict=True)]
+        for text, values in factors.items()
+    }

@@ -179,13 +179,24 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
             threshold = START_SETTINGS.sigmas * noise / math.sqrt(rows.size) + REST_FRACTION * float(
                 np.nanstd(run[name])
             )
-            shows_level |= abs(levels[name]) > threshold
+            shows_level |= abs(levels[name]) > threshold or _is_tared(run[name])
         return RestEvidence(rest_length, levels, {n: float(run[n][0]) for n in inputs}, shows_level)
     constant = all(_change_indices(run[n][1:]).size == 0 for n in inputs)
     if not constant or not any(np.any(run[n][1:]) for n in inputs):
         return None
     first_values = {n: float(drop_missing(run[n])[0]) for n in outputs}
-    return RestEvidence(0, first_values, dict.fromkeys(inputs, 0.0), not all(is_rest(run[n]) for n in outputs))
+    shows_level = any(not is_rest(run[n]) or _is_tared(run[n]) for n in outputs)
+    return RestEvidence(0, first_values, dict.fromkeys(inputs, 0.0), shows_level)
+
+
+def _is_tared(samples: Floats) -> bool:
+    """Whether the first value of a noisy signal was subtracted from all values, so that its noise remains as a level.
+
+    The first value is then exactly 0. In a quantized signal, other values are 0 as well.
+    """
+    noise = white_noise(samples)
+    is_noisy = noise > START_SETTINGS.least_noise * float(np.nanstd(samples))
+    return bool(samples[0] == 0.0 and np.count_nonzero(samples == 0.0) == 1 and is_noisy)
 
 
 def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
