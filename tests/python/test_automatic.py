@@ -418,3 +418,16 @@ def test_the_report_of_an_automatic_structure_has_the_choice(tmp_path):
         assert candidate["failure"] or f'<data value="{candidate["parameter_count"]}.0">' in row
     assert "Fit by number of parameters" in part
     assert all(typeset(text) in page for text in found["warnings"])
+
+
+def test_an_integrator_that_is_set_to_zero_in_motion_is_found() -> None:
+    g, step, rows = np.random.default_rng(1), 0.008, 700
+    b, a, _ = cont2discrete(([3.0], [6.0, 1.0, 0.0]), 1.0)[:3]
+    u = np.repeat(g.uniform(-6.0, 6.0, 70), 12)[: rows + 100]
+    y = lfilter(np.ravel(b), a, u)[100:]
+    y += 0.01 * np.std(y) * g.standard_normal(rows)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u[100:]}, outputs={"y": y - y[0]})
+    found = ftlm.select(run, "auto", threads=1)
+    assert "a0" not in found.best.parameters
+    assert found.best.parameters["b0"].value == pytest.approx(0.5 / step**2, rel=0.02)
+    assert found.best.parameters["a1"].value == pytest.approx(-1 / (6 * step), rel=0.02)

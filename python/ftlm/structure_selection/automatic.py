@@ -251,8 +251,7 @@ class AutomaticSelection:
         if not self.problem.drivers:
             # Free responses have neither zeros nor delays.
             return self._fit([IntegerOrderForm(n, 0, offset=o) for n in range(1, MAX_ORDER + 1) for o in FREE_OFFSETS])
-        probe = IntegerOrderForm(2, 1)
-        probes = self._fit([probe, replace(probe, offset="level")])
+        probes = self._fit_probes(IntegerOrderForm(2, 1))
         offset = "level" if _bic_decrease(probes, lambda f: f.offset == "level") > MIN_BIC_DECREASE else "none"
         forms = [IntegerOrderForm(n, n - 1, offset=offset) for n in range(1, MAX_ORDER + 1)]
         fits = self._fit_delayed(self._fit_zeros(forms, probes), offset)
@@ -269,6 +268,26 @@ class AutomaticSelection:
                 break
             fits = _rank([*fits, *integer_fits])
         return fits
+
+    def _fit_probes(self, form: IntegerOrderForm) -> list[FittedForm]:
+        """Return the fits of a form without and with an output level, and decide whether all forms start in motion.
+
+        An output that begins at zero may have been set to zero in motion. All forms then have initial values.
+        """
+        forms = [form, replace(form, offset="level")]
+        probes = self._fit(forms)
+        if self.problem.initial == "auto" and any(f.joint.initial == "rest" for f in probes):
+            problem = replace(self.problem, initial="caputo")
+            in_motion = self._fit_structures([(f.structure(problem), f, []) for f in forms])
+            all_fits = _rank([*probes, *in_motion])
+            at_rest = min(f.bic for f in all_fits if f.joint.initial == "rest")
+            if (
+                min((f.bic for f in all_fits if f.joint.initial != "rest"), default=math.inf)
+                < at_rest - MIN_BIC_DECREASE
+            ):
+                self.problem = problem
+                return in_motion
+        return probes
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
         """Return the inputs that depend on the output through feedback, as tested on residuals of the best form.
