@@ -14,8 +14,9 @@ pytest.importorskip("myst_parser")
 pytest.importorskip("pydata_sphinx_theme")
 
 DOCS = Path(__file__).parents[2] / "docs"
-#: Pages with tables of three and more columns, or with formulas.
-NAMES = ("arm", "bad_data", "comparison", "findings", "frequency_data", "mathematics", "numbers", "rig", "threats")
+#: Pages with tables of three and more columns, or with formulas; those that are built by the slow tests only.
+NAMES = ("comparison", "findings", "frequency_data", "mathematics")
+SLOW_NAMES = ("arm", "bad_data", "numbers", "rig", "threats")
 #: Of long words: an address, types and arguments.
 REFERENCE = ("autofunction:: ftlm.fractional_integral", "autofunction:: ftlm.search_orders", "autoclass:: ftlm.Run")
 #: Settings of docs/conf.py that the appearance of a page depends on.
@@ -40,14 +41,16 @@ TOO_WIDE = """() => {
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """The pages with tables and formulas, without the reference and the pictures, whose making takes minutes."""
+def pages(tmp_path_factory, request):
+    """The pages of the tests that run, without the reference and the pictures, whose making takes minutes."""
     source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("built")
-    for name in NAMES:
+    tests = [item for item in request.session.items if item.path == request.path and hasattr(item, "callspec")]
+    names = sorted({*NAMES, *(item.callspec.params.get("name", NAMES[0]) for item in tests)} - {"reference"})
+    for name in names:
         shutil.copy(DOCS / f"{name}.md", source)
     listed = "".join(f".. {line}\n\n" for line in REFERENCE)
     (source / "reference.md").write_text(f"# Reference\n\n```{{eval-rst}}\n{listed}```\n", encoding="utf-8")
-    listed = "\n".join((*NAMES, "reference"))
+    listed = "\n".join((*names, "reference"))
     (source / "index.md").write_text(f"# Pages\n\n```{{toctree}}\n{listed}\n```\n", encoding="utf-8")
     # Extensions warn of what later versions of Sphinx remove.
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
@@ -62,7 +65,7 @@ def pages(tmp_path_factory):
     return built
 
 
-@pytest.mark.parametrize("name", [*NAMES, "reference"])
+@pytest.mark.parametrize("name", [*NAMES, "reference", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW_NAMES)])
 def test_tables_and_formulas_keep_to_the_width_of_a_telephone(browser, pages, name):  # noqa: F811
     with Opened(browser, pages / f"{name}.html", viewport={"width": WIDTH, "height": 900}) as opened:
         assert opened.page.evaluate(TOO_WIDE) == []
