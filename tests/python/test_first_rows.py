@@ -230,6 +230,22 @@ def test_a_level_that_is_asked_for_does_not_imply_rest():
     assert found.model.compare(run).fit["y"] > 97
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_run_that_settles_within_a_few_rows_is_compared_as_it_was_fitted(seed):
+    # The response to initial values is over after a few of 100 samples, and its residuals from rest pass for white.
+    pole, records = np.exp(-0.5), []
+    for k in (seed, seed + 50):
+        g = np.random.default_rng(k)
+        u = np.repeat(g.choice([-1.0, 1.0], 11), 10)[:100]
+        y = 20 + lfilter([0, 1 - pole], [1, -pole], u) + 5 * pole ** np.arange(100) + 0.02 * g.standard_normal(100)
+        records.append(run_of(u, y, 1.0, name=f"r{k}"))
+    found = ftlm.identify(records[0], ftlm.equation(WORDS))
+    assert found.fit["y"] == pytest.approx(100 * (1 - 0.02 / np.std(records[0]["y"])), abs=0.5)
+    assert found.comparison.initial[0]["y"] == pytest.approx({0.0: 5.0, np.inf: 20.0}, abs=0.1)
+    validation = found.validate(records[1])
+    assert validation.fit["y"] == pytest.approx(100 * (1 - 0.02 / np.std(records[1]["y"])), abs=0.5)
+
+
 def blank_run(u, step=0.05, kind="foh"):
     return ftlm.Run.from_arrays(step=step, inputs={"f": u}, outputs={"y": 0 * u}, intersample={"f": kind})
 

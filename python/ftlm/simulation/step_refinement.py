@@ -8,7 +8,6 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.data.run import Run
-from ftlm.data.sampling import drop_missing
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
 from ftlm.simulation.initial_conditions import (
@@ -34,7 +33,6 @@ from ftlm.simulation.output_samples import (
 )
 from ftlm.structure.structure import History
 from ftlm.utils.resources import memory_limit, stop_flag
-from ftlm.utils.statistics import is_white
 from ftlm.utils.validation import Floats
 
 #: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
@@ -74,9 +72,9 @@ def simulate_refined(
         rest_model = replace(model, structure=replace(model.structure, initial="rest"))
         result = _simulate_refined(rest_model, shifted, None, tolerance, max_m, on_grid)
         model = replace(model, structure=replace(model.structure, initial=conditions_in_motion(model.structure)))
-    if result is None or not _has_white_residuals(model, shifted, result):
-        free = _simulate_refined(model, shifted, None, tolerance, max_m, on_grid)
-        result = free if result is None or not _explains_as_well(model, shifted, result, free) else result
+    # White residuals are no evidence of rest: the response to initial values may end within a few samples.
+    free = _simulate_refined(model, shifted, None, tolerance, max_m, on_grid)
+    result = free if result is None or not _explains_as_well(model, shifted, result, free) else result
     outputs, terms = add_levels(model, levels, result.outputs, result.initial)
     return replace(result, outputs=outputs, initial=terms)
 
@@ -84,12 +82,6 @@ def simulate_refined(
 def _residuals(model: Model, run: Run, simulated: OutputSamples) -> list[Floats]:
     """Return measured minus simulated samples of each output."""
     return [*(measured_samples(model, run, simulated.refinement) - simulated.outputs)]
-
-
-def _has_white_residuals(model: Model, run: Run, simulated: OutputSamples) -> bool:
-    """Whether the residuals of all outputs are finite and white, so that further initial terms are not significant."""
-    residuals = [drop_missing(e) for e in _residuals(model, run, simulated)]
-    return all(bool(np.all(np.isfinite(e))) and is_white(e) for e in residuals)
 
 
 def _explains_as_well(model: Model, run: Run, short_samples: OutputSamples, long_samples: OutputSamples) -> bool:
