@@ -246,6 +246,19 @@ def test_a_run_that_settles_within_a_few_rows_is_compared_as_it_was_fitted(seed)
     assert validation.fit["y"] == pytest.approx(100 * (1 - 0.02 / np.std(records[1]["y"])), abs=0.5)
 
 
+@pytest.mark.parametrize("tau", [20.0, 40.0])
+def test_an_output_counted_from_its_first_sample_in_motion_has_the_pole_of_the_plant(tau):
+    # A chirp about 5, and colored noise. The residuals of a start from rest oscillate without a slow component.
+    pole, t, g = np.exp(-1 / tau), np.arange(600), np.random.default_rng(0)
+    u = np.sin(2 * np.pi * (t / 150 + t * t / 1200 * (1 / 12 - 1 / 150)))
+    y = lfilter([0, 1 - pole], [1, -pole], u)[300:]
+    y += 0.01 * np.std(y) * lfilter([0.19**0.5], [1, -0.9], g.standard_normal(399))[99:]
+    found = ftlm.identify(run_of(5 + u[300:], y - y[0], 1.0), ftlm.equation(WORDS))
+    assert found.settings["initial"] == "caputo"
+    assert found.coefficients["a"] == pytest.approx(-1 / tau, rel=0.03)
+    assert found.fit["y"] > 98.5
+
+
 def blank_run(u, step=0.05, kind="foh"):
     return ftlm.Run.from_arrays(step=step, inputs={"f": u}, outputs={"y": 0 * u}, intersample={"f": kind})
 

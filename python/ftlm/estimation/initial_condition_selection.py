@@ -221,12 +221,13 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     """Return a fit with nonzero initial conditions or a level if residuals contradict a start from rest, else None.
 
     A level is a constant that is added to the output. Rest is kept if the residuals are white. If they are colored
-    without a slow component, the new fit is accepted only if its own residuals are white.
+    without a slow component, the new fit is accepted only if its own residuals are white or no dynamics are missing: in
+    a run that has no constant samples before its first input change, the residuals are independent of the inputs.
 
-    Both fits are compared by an information criterion with one noise color. It is that of the new fit if its residuals
-    are independent of the inputs, because no dynamics are missing then. Otherwise it is that of the fit from rest:
-    residuals due to missing dynamics then count as noise, which initial conditions are not meant to explain. It is also
-    that of the fit from rest if a run has constant samples before its first input change, in which a level is visible.
+    Both fits are compared by an information criterion with one noise color. It is that of the new fit if no dynamics
+    are missing. Otherwise it is that of the fit from rest: residuals due to missing dynamics then count as noise, which
+    initial conditions are not meant to explain. It is also that of the fit from rest if a run has constant samples
+    before its first input change, in which a level is visible.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.is_linear
@@ -245,12 +246,15 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
         starts.insert(0, ("caputo", "level"))
         if not is_quiet:
             starts.append(("rest", "level"))
+
+    def is_complete(candidate: JointFit) -> bool:
+        return not is_quiet and has_independent_residuals(candidate, runs, structure)
+
     for k, (initial, offset) in enumerate(starts):
         request = replace(structure, initial=initial, offset=offset)
 
         def is_better(candidate: JointFit, *, lowest_score: float = lowest_score) -> bool:
-            is_complete = not is_quiet and has_independent_residuals(candidate, runs, structure)
-            gain = fit_score_gain(candidate, joint, candidate if is_complete else joint)
+            gain = fit_score_gain(candidate, joint, candidate if is_complete(candidate) else joint)
             return gain > START_SETTINGS.history_margin and fit_score(candidate, joint) < lowest_score
 
         # The optimum from rest may be far from that of the most general start. With integer orders, automatic guesses
@@ -265,7 +269,7 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
             continue
         if not is_better(alternative.joint):
             continue
-        if is_colored or has_white_residuals(alternative.joint):
+        if is_colored or has_white_residuals(alternative.joint) or is_complete(alternative.joint):
             lowest_score, candidate = fit_score(alternative.joint, joint), (request, alternative)
     if candidate is None:
         return None
