@@ -722,6 +722,18 @@ def test_a_level_far_from_the_fit_without_it_has_initial_guesses_of_its_own(num,
     assert found.coefficients["b"] / found.coefficients["q"] == pytest.approx(num[0] / den[-1], rel=0.01)
 
 
+@pytest.mark.parametrize("seed", [96, 100])
+def test_a_swinging_plant_at_a_level_is_not_sought_from_a_start_at_rest(seed):
+    # From rest at a level, the best fit explains 1 % and is stationary for a start in motion, too.
+    g = np.random.default_rng(seed)
+    u = np.repeat(g.choice([-1.0, 1.0], 41), 20)[:800]
+    y = 5 + plant([100.0], [1.0, 0.4, 100.0], u, 0.02) + 0.01 * g.standard_normal(800)
+    found = ftlm.identify(run_of(u[300:], y[300:], 0.02), ftlm.equation("D^2 y = -p D y - q y + b u"))
+    assert found.coefficients["p"] == pytest.approx(0.4, abs=0.01)
+    assert found.coefficients["b"] == pytest.approx(100.0, rel=0.01)
+    assert found.fit["y"] > 99.0
+
+
 def test_residuals_of_a_warm_start_are_in_units_of_its_noise():
     g = np.random.default_rng(3)
     u = np.repeat(g.choice([-1.0, 1.0], 40), 25)

@@ -300,7 +300,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
         request = replace(structure, initial=initial, offset="level")
         try:
             # With integer orders, automatic guesses cost little and lead to the best optimum.
-            is_new_fit = candidate is None and (is_suggested or not has_memory(structure))
+            is_near = candidate is not None and has_white_residuals(best)
+            is_new_fit = not is_near and (is_suggested or not has_memory(structure))
             previous_fit = fit if candidate is None else candidate[1]
             level = fits.fit(request) if is_new_fit else fits.refit(request, previous_fit, is_preferred)
             if level is not None and level.joint is not None and not (is_new_fit or level.joint.converged):
