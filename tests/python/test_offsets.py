@@ -9,7 +9,7 @@ from math import gamma
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.signal import lfilter, lsim
+from scipy.signal import cont2discrete, lfilter, lsim
 from typer.testing import CliRunner
 
 import ftlm
@@ -647,3 +647,23 @@ def test_a_constant_without_a_covariance_has_no_standard_error():
     assert np.isnan(parameter.standard_error)
     line = next(line for line in result.summary().splitlines() if "constant_y" in line)
     assert "±" not in line
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_a_constant_that_stands_for_motion_of_an_integrating_plant_is_left_out(bias):
+    # An encoder that counts from its first sample while the motor turns: 600 / (s (s + 20)), an input sensor with bias.
+    g, step = np.random.default_rng(3), 0.008
+    u = np.repeat(g.uniform(-6, 6, 75), 12)
+    num, den, _ = cont2discrete(([600.0], [1.0, 20.0, 0.0]), step)[:3]
+    y = lfilter(np.ravel(num), den, u)[100:]
+    y += 0.01 * np.std(y) * g.standard_normal(800)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u[100:] + bias}, outputs={"y": y - y[0]})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = a D y + b u"))
+    for name, true in (("a", -20.0), ("b", 600.0)):
+        assert abs(found.parameters[name].value - true) < 4 * found.parameters[name].standard_error
+    said = {finding.code for finding in found.findings}
+    assert "rest_rejected" in said
+    assert ("constant_estimated" in said) is (bias > 0)
+    if bias:
+        constant = found.parameters["constant_y"]
+        assert abs(constant.value + 600.0 * bias) < 4 * constant.standard_error

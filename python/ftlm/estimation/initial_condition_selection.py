@@ -213,6 +213,8 @@ def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits)
     if not is_constant_better:
         return None
     complete_fit = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
+    if complete_fit.task.structure.offset == "none":
+        return complete_fit
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
     return replace(complete_fit, findings=[*complete_fit.findings, make_finding("constant_estimated", **context)])
 
@@ -273,7 +275,26 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
             lowest_score, candidate = fit_score(alternative.joint, joint), (request, alternative)
     if candidate is None:
         return None
+    if structure.offset == "constant" and fits.may_add_offset:
+        candidate = _without_needless_constant(*candidate, fits)
     return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=True)
+
+
+def _without_needless_constant(structure: Structure, fit: Fit, fits: InitialConditionFits) -> tuple[Structure, Fit]:
+    """Return the structure and its fit, without the constant if the information criterion is not higher without it.
+
+    A constant that improves a fit from rest may only stand for initial conditions.
+    """
+    joint, request = fit.joint, replace(structure, offset="none")
+
+    def is_sufficient(candidate: JointFit) -> bool:
+        return joint is not None and not fits_better(joint, candidate)
+
+    try:
+        simpler = fits.refit(request, fit, is_sufficient)
+    except FtlmError:
+        return structure, fit
+    return (structure, fit) if simpler is None else (request, simpler)
 
 
 def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, is_suggested: bool) -> Fit | None:
@@ -281,7 +302,9 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 
     Both information criteria that are compared use the noise spectrum of the fit with the larger residuals. If
     `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used. They are also used for
-    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level.
+    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level. A fit in
+    motion starts from a fit from rest with a level only if the residuals of that fit are white: otherwise its optimum
+    may be as far away.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
