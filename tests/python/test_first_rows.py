@@ -684,6 +684,19 @@ def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monke
     assert gain_of(found) == pytest.approx(1.2, rel=0.01)
 
 
+def test_a_plant_that_rests_under_a_constant_input_is_not_said_to_have_moved():
+    # The input changes often, so that 40 constant samples are not accepted as evidence of rest.
+    g = np.random.default_rng(0)
+    change = np.r_[np.zeros(40), np.repeat(g.uniform(-20, -10, 12), 40)][:500]
+    y = 48 + plant([1.5], [20.0, 1.0], change, 1.0) + 0.1 * g.standard_normal(500)
+    found = ftlm.identify(run_of(20 + change, y, 1.0), ftlm.equation(WORDS))
+    assert found.settings["initial"] == "caputo"
+    # The level belongs to an input of 0, far from the output at which the plant rests.
+    assert found.parameters["level_y"].value == pytest.approx(48 - 1.5 * 20, abs=0.5)
+    (said,) = [f for f in found.findings if f.code == "level_estimated"]
+    assert "the simulation starts from estimated initial terms relative to this level" in said.text
+
+
 def test_a_given_offset_of_none_prevents_a_level_and_a_constant():
     g = np.random.default_rng(5)
     u = np.repeat(g.choice([-1.0, 1.0], 40), 25)

@@ -352,8 +352,9 @@ def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bo
     if is_rest_rejected and initial != "rest":
         findings.append(make_finding("rest_rejected", run=names))
     if fit.task.structure.offset == "level" and structure.offset != "level":
-        state = "rested" if initial == "rest" else "moved"
-        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), was=state))
+        # Initial terms are no evidence of motion: a plant may rest at the equilibrium of a constant input.
+        start = "at rest" if initial == "rest" else "from estimated initial terms"
+        findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), start=start))
     if is_rest_rejected and initial != "rest":
         return replace(fit, findings=findings)
     model = replace(fit.model, structure=replace(fit.model.structure, initial=structure.initial))
