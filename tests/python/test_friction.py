@@ -481,3 +481,37 @@ def test_friction_never_fits_worse_than_the_equation_without_it(seed, load, dist
         fit_output_error([run], ftlm.equation(words, initial="rest")) for words in (linear, f"{linear} - fc*sign(D y)")
     )
     assert dry.noise["y"] < 1.001 * frictionless.noise["y"]
+
+
+SPRING_CART = "D^2 y = - v D y - k y + g u - fc*sign(D y)"
+
+
+def noisy_spring_cart(force: np.ndarray, step: float, fc: float, seed: int, level: float = 0.0) -> ftlm.Run:
+    run = run_of(force, step)
+    y = model_of(SPRING_CART, v=1.0, k=6.0, g=4.0, fc=fc).simulate(run)["y"]
+    return run.with_outputs({"y": level + y + 0.002 * np.random.default_rng(seed).standard_normal(force.size)})
+
+
+def assert_spring_cart_is_found(found, fc: float) -> None:
+    for name, truth in {"v": 1.0, "k": 6.0, "g": 4.0, "fc": fc}.items():
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < 0.5, name
+
+
+@slow_after(1, "level", [3.0, -2.0])
+def test_a_step_in_the_first_row_of_a_cart_at_a_level(level):
+    # With initial values instead of a level, a gain of 22 or -8 explains the run as well.
+    found = ftlm.identify(noisy_spring_cart(np.ones(200), 0.04, 0.3, 1, level), ftlm.equation(SPRING_CART), threads=1)
+    assert_spring_cart_is_found(found, 0.3)
+    assert found.offsets["level_y"].value == pytest.approx(level, abs=0.01)
+    assert found.verdict.level == "with care"
+    assert "rest_assumed" in {finding.code for finding in found.findings}
+
+
+@slow_after(0, "seed", [1, 0])
+def test_an_offset_that_friction_compensates_is_not_estimated(seed):
+    """A long stick after a step: the guesses without offset miss the optimum that a fit with offset comes near."""
+    force = np.where(np.arange(400) < 20, 0.0, 1.0)
+    found = ftlm.identify(noisy_spring_cart(force, 0.05, 0.8, seed), ftlm.equation(SPRING_CART), threads=1)
+    assert_spring_cart_is_found(found, 0.8)
+    assert not found.offsets
+    assert not {"constant_estimated", "level_estimated"} & {finding.code for finding in found.findings}

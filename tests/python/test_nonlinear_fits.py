@@ -308,6 +308,44 @@ def test_colored_noise_is_no_level_beside_a_nonlinear_term(seed):
     assert not {"level_estimated", "constant_estimated"} & {finding.code for finding in found.findings}
 
 
+@slow_after(1, "seed", range(3))
+def test_a_step_in_the_first_row_of_a_drag_at_a_level(seed):
+    """Initial values explain the run alike, with a negative damping; rest at a level is assumed, and said to be."""
+    rate = lambda _, y: 2.0 - 0.5 * np.abs(y) * y - 0.5 * y  # noqa: E731
+    y = 3.0 + solve_ivp(rate, (0, 8), [0.0], t_eval=0.02 * np.arange(400), rtol=1e-9, atol=1e-11).y[0]
+    noise = 0.002 * np.random.default_rng(seed).standard_normal(400)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.ones(400)}, outputs={"y": y + noise})
+    found = ftlm.identify(run, ftlm.equation("D y = -w abs(y)*y - a y + b u"), threads=1)
+    for name, truth in {"w": 0.5, "a": 0.5, "b": 2.0}.items():
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < 0.1, name
+    assert found.offsets["level_y"].value == pytest.approx(3.0, abs=0.01)
+    assert "rest_assumed" in {finding.code for finding in found.findings}
+
+
+def test_a_tank_that_fills_from_a_level_does_not_rest_there():
+    """The root tells the level from an initial value, although the input is constant."""
+    rate = lambda _, y: 0.04 - 0.02 * np.sqrt(y)  # noqa: E731
+    y = solve_ivp(rate, (0, 300), [1.0], t_eval=np.arange(300.0), rtol=1e-9, atol=1e-11).y[0]
+    y += 0.003 * np.random.default_rng(0).standard_normal(300)
+    run = ftlm.Run.from_arrays(step=1.0, inputs={"u": np.ones(300)}, outputs={"y": y})
+    found = ftlm.identify(run, ftlm.equation("D y = -k sqrt(y) + b u"), threads=1)
+    for name, truth in {"k": 0.02, "b": 0.04}.items():
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < truth, name
+    assert not found.offsets
+
+
+@slow_after(1, "seed", range(4))
+@pytest.mark.parametrize("first", [0.2, 0.5])
+def test_growth_from_a_start_below_the_noise(first, seed):
+    y = 20.0 / (1.0 + (20.0 / first - 1.0) * np.exp(-0.05 * np.arange(300)))
+    y += 0.1 * np.random.default_rng(seed).standard_normal(300)
+    run = ftlm.Run.from_arrays(step=0.1, inputs={}, outputs={"y": y})
+    found = ftlm.identify(run, ftlm.equation("D y = r y - k y^2"), threads=1)
+    for name, truth in {"r": 0.5, "k": 0.025}.items():
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < 0.02 * truth
+    assert "constant_estimated" not in {finding.code for finding in found.findings}
+
+
 def test_from_the_command_line_to_a_page(runs, tmp_path):
     first, second = tmp_path / "first.csv", tmp_path / "second.csv"
     plant = PLANTS["rotor"]

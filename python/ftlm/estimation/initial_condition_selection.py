@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ from ftlm.estimation.nuisance_parameters import (
 )
 from ftlm.estimation.output_error import JointFit
 from ftlm.findings import Finding, make_finding
-from ftlm.simulation.initial_conditions import START_SETTINGS, has_memory, rest_evidence
+from ftlm.simulation.initial_conditions import START_SETTINGS, conditions_in_motion, has_memory, rest_evidence
 from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
 
@@ -41,6 +42,11 @@ INITIAL_CONDITIONS_WITH_LEVEL: tuple[Literal["rest"], Literal["caputo"]] = ("res
 MIN_LEVEL_MEAN_RATIO = 3.0
 #: Minimum ratio of the RMS residual to the standard deviation of an output that suggests a level.
 MIN_LEVEL_RESIDUAL_RATIO = 0.5
+#: Maximum difference of the information criteria of two fits that explain the runs alike (Kass and Raftery 1995).
+MAX_EQUAL_SCORE_DIFFERENCE = 2.0
+#: Maximum ratio of a standard error to its value for an offset to be preferred. A larger ratio is due to collinear
+#: sensitivities, whose covariance consists of rounding errors.
+MAX_ERROR_RATIO = 1e6
 #: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -147,14 +153,15 @@ class InitialConditionFits:
 def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -> Fit:
     """Return the fit of a structure, with a constant, nonzero initial conditions or levels if they are significant."""
     fit = fits.fit(structure)
+    if not structure.is_linear:
+        return _fit_nonlinear(fit, structure, fits)
     constant = _fit_with_offset(fit, structure, fits)
     if constant is not None:
         return constant
     restart = _fit_if_rest_rejected(fit, structure, fits)
     if restart is not None:
         return restart
-    # The test of an offset assumes a linear model. In a non-linear model a constant also moves the equilibrium.
-    if fit.task.structure.offset != "none" or not structure.is_linear:
+    if fit.task.structure.offset != "none":
         return fits.with_intervals(structure, fit)
     suggests_level = _suggests_level(fit)
     is_level_tried = suggests_level or _may_hide_level(fit)
@@ -171,30 +178,117 @@ def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -
     return replace(fit, findings=[*fit.findings, *offset_findings])
 
 
-def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return the fit with a significant constant in the equations or output level; None if there is none.
+def _fit_nonlinear(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit:
+    """Return the fit of a non-linear structure, with initial values, a constant or a level if they are significant.
 
-    For a linear plant that integrates, a constant is tried, and for a non-linear model a constant and a level. For
-    other linear plants, the result is None, because a level suffices and is tried later. A level cannot describe the
-    response of an integrating or non-linear plant to the offset of an input sensor. The new fit starts from its own
-    initial guesses, because the fit without a constant may be at a wrong local optimum.
+    All of them are compared by their fits, because the test of an offset assumes a linear model, and a constant also
+    moves the equilibrium of a non-linear one. Nothing is compared if the residuals are white, with one exception: where
+    an input is constant from the first row on, initial values and a level may explain the runs alike. The plant is then
+    assumed to have been at rest at a level, as for a linear structure, and a finding states this assumption.
+    """
+    is_automatic = structure.initial == "auto" and structure.offset == "none"
+    if fit.joint is None or not is_automatic or fit.task.structure.offset != "none":
+        return fits.with_intervals(structure, fit)
+    if _is_rest_assumed(fit) and fit.joint.initial != "rest":
+        level = _fit_with_level(fit, structure, fits, is_suggested=True)
+        if level is not None:
+            return level
+    if has_white_residuals(fit.joint):
+        return fits.with_intervals(structure, fit)
+    best_structure, best_fit = structure, fit
+    if fit.joint.initial == "rest" and not _has_quiet_samples(fit):
+        request = replace(structure, initial=conditions_in_motion(structure))
+        moving = _preferred_fit(request, fit.joint, fits)
+        if moving is not None:
+            best_structure, best_fit = request, moving
+    if fits.may_add_offset and not (best_fit.joint is not None and has_white_residuals(best_fit.joint)):
+        with_offset, best_fit = _fit_nonlinear_with_offset(best_fit, structure, fits)
+        if with_offset is not None:
+            return with_offset
+    complete_fit = fits.with_intervals(best_structure, best_fit)
+    if best_structure is structure:
+        return complete_fit
+    return _with_start_findings(complete_fit, structure, is_rest_rejected=True)
+
+
+def _preferred_fit(request: Structure, joint: JointFit, fits: InitialConditionFits) -> Fit | None:
+    """Return the fit of a non-linear structure from automatic initial guesses if it is preferred to `joint`, else None.
+
+    A non-linear structure has several optima, so that a slightly lower criterion is no evidence of further terms.
+    """
+    try:
+        candidate = fits.fit(request)
+    except FtlmError:
+        return None
+    if candidate.joint is None or candidate.joint.unstable_optimum is not None:
+        return None
+    return candidate if fits_better(candidate.joint, joint, -START_SETTINGS.history_margin) else None
+
+
+def _fit_nonlinear_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> tuple[Fit | None, Fit]:
+    """Return the fit of a non-linear structure with a significant constant or level, or None, and the fit without.
+
+    The fit without offset is that of `fit`, or a better one from the optimum with an offset.
+    """
+    constant, request = None, replace(structure, offset="constant")
+    if fit.joint is not None and constant_input(fit.task.runs, structure) is None:
+        constant = _preferred_fit(request, fit.joint, fits)
+    if constant is not None:
+        fit, is_significant = _compare_with_offset(fit, constant, structure, fits)
+        constant = constant if is_significant else None
+    level = _fit_with_level(fit if constant is None else constant, structure, fits, is_suggested=True)
+    if level is not None:
+        fit, is_significant = _compare_with_offset(fit, level, structure, fits)
+        return level if is_significant else None, fit
+    if constant is None:
+        return None, fit
+    return _with_constant_finding(fits.with_intervals(request, constant)), fit
+
+
+def _compare_with_offset(
+    fit: Fit, with_offset: Fit, structure: Structure, fits: InitialConditionFits
+) -> tuple[Fit, bool]:
+    """Return the best fit without offset, and whether the offset of `with_offset` is identifiable and significant.
+
+    An offset and friction may compensate each other, so that a fit with an offset may end near an optimum without it
+    that all initial guesses of `fit` missed.
+    """
+    if fit.joint is None or with_offset.joint is None:
+        return fit, False
+    without_offset = replace(structure, initial=fit.joint.initial)
+    nearby = fits.refit(without_offset, with_offset, partial(fits_better, other=fit.joint))
+    best = fit.joint if nearby is None or nearby.joint is None else nearby.joint
+    is_better = fits_better(with_offset.joint, best, -START_SETTINGS.history_margin)
+    return replace(fit, joint=best), is_better and _is_identifiable(with_offset.joint)
+
+
+def _is_identifiable(joint: JointFit) -> bool:
+    """Whether the runs determine every parameter: no sensitivity is collinear with the others within rounding."""
+    errors, values = joint.standard_errors, joint.values_by_name
+    return all(errors[n] <= MAX_ERROR_RATIO * abs(values[n]) for n in joint.names)
+
+
+def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
+    """Return the fit of a linear plant that integrates with a significant constant in the equations; None if not.
+
+    For other linear plants, the result is None, because a level suffices and is tried later. A level cannot describe
+    the response of an integrating plant to the offset of an input sensor. The new fit starts from its own initial
+    guesses, because the fit without a constant may be at a wrong local optimum.
     """
     automatic = structure.initial == "auto" and structure.offset == "none" and fits.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":
         return None
-    level_suffices = structure.is_linear and not structure.integrates
+    level_suffices = not structure.integrates
     if level_suffices or has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
         return None
-    # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a constant.
-    margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
 
     def is_better(candidate: JointFit, *, joint: JointFit = fit.joint) -> bool:
-        return fits_better(candidate, joint, margin)
+        return fits_better(candidate, joint)
 
     request = replace(structure, offset="constant")
     try:
         has_history = isinstance(fit.joint.initial, History)
-        if structure.is_linear and fits.complete_fit is not None and not has_history:
+        if fits.complete_fit is not None and not has_history:
             # A missing constant improves the fit near any optimum, so that automatic initial guesses can wait for this.
             # With a history, the constant may replace its powers of t instead.
             nearby = replace(request, initial=fit.joint.initial)
@@ -204,19 +298,17 @@ def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits)
     except FtlmError:
         return None
     joint = candidate.joint
-    is_constant_better = joint is not None and joint.unstable_optimum is None and is_better(joint)
-    if structure.has_nonlinear_terms:
-        # In a linear model, an output level is equivalent to a constant. In a non-linear model it is not.
-        level = _fit_with_level(candidate if is_constant_better else fit, structure, fits, is_suggested=True)
-        if level is not None:
-            return level
-    if not is_constant_better:
+    if joint is None or joint.unstable_optimum is not None or not is_better(joint):
         return None
     complete_fit = _fit_if_rest_rejected(candidate, request, fits) or fits.with_intervals(request, candidate)
-    if complete_fit.task.structure.offset == "none":
-        return complete_fit
+    has_constant = complete_fit.task.structure.offset != "none"
+    return _with_constant_finding(complete_fit) if has_constant else complete_fit
+
+
+def _with_constant_finding(fit: Fit) -> Fit:
+    """Return a fit with a constant in its equations, and the finding that reports it."""
     context = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
-    return replace(complete_fit, findings=[*complete_fit.findings, make_finding("constant_estimated", **context)])
+    return replace(fit, findings=[*fit.findings, make_finding("constant_estimated", **context)])
 
 
 def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
@@ -310,16 +402,17 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
         return None
     best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
+    is_rest_assumed = not structure.is_linear and _is_rest_assumed(fit)
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
     if not structure.is_linear and fit.task.structure.offset == "none":
         # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a level.
-        margin = -START_SETTINGS.history_margin
+        margin = MAX_EQUAL_SCORE_DIFFERENCE if is_rest_assumed else -START_SETTINGS.history_margin
 
     def is_preferred(joint: JointFit) -> bool:
         return fits_better(joint, best, margin)
 
     # From rest, motion has been judged before.
-    for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" else None]:
+    for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" or is_rest_assumed else None]:
         request = replace(structure, initial=initial, offset="level")
         try:
             # With integer orders, automatic guesses cost little and lead to the best optimum.
@@ -334,6 +427,9 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
             continue
         if level is not None and level.joint is not None and is_preferred(level.joint):
             best, candidate, margin = level.joint, (request, level), 0.0
+            if not structure.is_linear and has_white_residuals(best):
+                # Nothing is left that motion could explain, and a fit of a non-linear structure takes long.
+                break
     if candidate is None:
         return None
     return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=False)
@@ -393,6 +489,12 @@ def _has_quiet_samples(fit: Fit) -> bool:
     """Whether a run has samples before its inputs change, in which a level of the outputs would be visible."""
     evidence = (rest_evidence(run, fit.task.structure) for run in fit.task.runs)
     return any(item is not None and item.rows > 1 for item in evidence)
+
+
+def _is_rest_assumed(fit: Fit) -> bool:
+    """Whether inputs are constant from the second row on in every run, so that rest before it can only be assumed."""
+    evidence = (rest_evidence(run, fit.task.structure) for run in fit.task.runs)
+    return all(item is not None and item.rows == 0 for item in evidence)
 
 
 def _has_estimated_initial_conditions(fit: Fit) -> bool:
