@@ -396,3 +396,20 @@ def test_an_order_may_fall_below_an_integer_in_motion(start):
     for name, value in truth.items():
         estimate = result.parameters[name]
         assert abs(estimate.value - value) < 4 * estimate.standard_error
+
+
+def test_a_nonlinear_term_is_fitted_to_irregular_rows_on_their_grid():
+    rng, rows = np.random.default_rng(15), 300
+    t = np.cumsum(rng.uniform(0.5, 1.5, rows))
+    u = np.repeat(rng.uniform(0.5, 1.8, 6), 50)
+    level = np.full(rows, 0.4)
+    for k, duration in enumerate(np.diff(t)):
+        rate = lambda _, x, flow=u[k]: -0.02 * np.sqrt(x) + 0.01 * flow  # noqa: E731
+        level[k + 1] = solve_ivp(rate, (0, duration), [level[k]], rtol=1e-8, atol=1e-10).y[0, -1]
+    y = level + 0.003 * rng.standard_normal(rows)
+    run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, time=t - t[0], resample=1.0)
+    found = ftlm.identify(run, ftlm.equation("D y = -k sqrt(y) + b u"), threads=1)
+    for name, truth in (("k", 0.02), ("b", 0.01)):
+        assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error < 0.03 * truth
+    assert "sample_times_interpolated" in {f.code for f in found.findings}
+    assert found.model.compare(run).fit["y"] > 95

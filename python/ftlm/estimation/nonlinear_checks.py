@@ -32,7 +32,7 @@ RELATIVE_CHANGE = 1e-7
 def nonlinear_findings(model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]) -> list[Finding]:
     """Return findings on the non-linear terms of a model on its runs; [] for a linear model."""
     finite = all(np.isfinite(samples.outputs).all() for samples in simulations)
-    if not model.structure.has_nonlinear_terms or not finite or any(run.nonuniform_samples is not None for run in runs):
+    if not model.structure.has_nonlinear_terms or not finite:
         return []
     values = [_signal_values(model, run, samples) for run, samples in zip(runs, simulations, strict=True)]
     findings = [f for equation in model.equations for f in _term_findings(equation, runs, values)]

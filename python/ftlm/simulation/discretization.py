@@ -14,7 +14,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.data.run import Run
 from ftlm.data.runs import Runs
-from ftlm.data.sampling import make_read_only
+from ftlm.data.sampling import NonuniformSamples, make_read_only
 from ftlm.errors import DataError, ModelError
 from ftlm.simulation.initial_conditions import (
     common_initial_conditions,
@@ -188,12 +188,14 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
     _check_missing(run, structure)
     check_derivative_orders(run, structure)
     sensor, signals = structure.sensor_filter, structure.signals
+    # Friction and non-linear terms are simulated on the uniform grid.
+    samples = run.nonuniform_samples if structure.is_linear else None
     return _core.Recording(
         {
             "name": run.name,
             "step": run.step,
-            "times": None if run.nonuniform_samples is None else run.nonuniform_samples.times,
-            "signals": [_channel(run, structure, name) for name in signals],
+            "times": None if samples is None else samples.times,
+            "signals": [_channel(run, structure, name, samples) for name in signals],
             "outputs": [signals.index(name) for name in structure.outputs],
             "filter": None if sensor is None else (sensor.numerator, sensor.denominator),
             "filter_states": structure.filter_states(initial),
@@ -232,8 +234,8 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
     )
 
 
-def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
-    """Return a signal of a run in the form that the Rust core takes.
+def _channel(run: Run, structure: Structure, name: str, samples: NonuniformSamples | None) -> _core._Channel:
+    """Return a signal of a run, with its nonuniform `samples` if there are any, in the form that the Rust core takes.
 
     For a name with the prefix ``coulomb_``, the signal is the sign of the derivative of the signal after the prefix.
 
@@ -269,7 +271,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     return {
         **channel,
         "samples": run[name],
-        "nonuniform": None if run.nonuniform_samples is None else run.nonuniform_samples.data[name],
+        "nonuniform": None if samples is None else samples.data[name],
         "role": run.intersample.get(name, "output"),
         "delay": delay,
         "limits": [(limit.kind, None if isinstance(limit.value, tuple) else limit.value) for limit in limits],
@@ -616,9 +618,11 @@ def named_coefficients(equation: Equation, values: Sequence[float]) -> dict[str,
 def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
     """Whether simulation and measurement are compared at nonuniform sample times.
 
-    The uniform grid is used instead if a delay, saturation or dead zone is free, or if all signals are filtered.
+    The uniform grid is used instead if a delay, saturation or dead zone is free, if all signals are filtered, or with
+    friction or non-linear terms.
     """
-    return run.nonuniform_samples is not None and not structure.free_input_parameters and not structure.all_filtered
+    needs_grid = structure.free_input_parameters or structure.all_filtered or not structure.is_linear
+    return run.nonuniform_samples is not None and not needs_grid
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:

@@ -131,7 +131,6 @@ def output_simulation(
     if initial is not None:
         return core, (False, [list(initial.get(o, {}).items()) for o in model.outputs], False)
     if not structure.is_linear:
-        check_uniform_samples(run, model)
         states = initial_tuple(start, structure.offset, run_without_level.filter_states(start))
         return core, (False, core.fit_initial_states(states, state_refinement, stop_flag()), False)
     names = initial_names(model, start)
@@ -172,18 +171,6 @@ def add_levels(
 def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) -> dict[str, dict[float, float]]:
     """Return initial terms, given as (exponent, coefficient) pairs for each output, by output and exponent."""
     return {o: dict(coefficients_by_exponent) for o, coefficients_by_exponent in zip(model.outputs, terms, strict=True)}
-
-
-def check_uniform_samples(run: Run, model: Model) -> None:
-    """Raise ModelError if the sample times of a run are nonuniform, which non-linear models do not support."""
-    if has_nonuniform_samples(run, model.structure):
-        structure = model.structure
-        description = "friction" if structure.has_friction else "a non-linear term"
-        output = next(e.output for e in structure.equations if e.friction is not None or e.nonlinear_terms)
-        raise ModelError(
-            f"run {run.name!r} has nonuniform sample times, and the equation of {output} has {description}, "
-            "which is simulated on a regular grid; resample the run"
-        )
 
 
 def with_initial_conditions(model: Model, run: Run) -> Model:
