@@ -222,7 +222,7 @@ impl Expression {
 pub struct Values {
     stack: Vec<f64>,
     slopes: Vec<f64>,
-    /// Bound of the rounding error of each value on the stack, as a multiple of the machine epsilon.
+    /// Scale of the rounding error of each value on the stack.
     rounding_scales: Vec<f64>,
     fault: Option<(&'static str, f64)>,
 }
@@ -234,8 +234,8 @@ impl Values {
         &self.slopes
     }
 
-    /// Bound of the rounding error of the last evaluation, as a multiple of the machine epsilon. It exceeds the
-    /// magnitude of the result where terms cancel, as in (x + 300)⁴ − 300⁴ near x = 0.
+    /// Scale of the rounding error of the last evaluation: the error is a small multiple of the machine epsilon times
+    /// this value. It exceeds the magnitude of the result where terms cancel, as in (x + 300)⁴ − 300⁴ near x = 0.
     #[must_use]
     pub fn rounding_scale(&self) -> f64 {
         self.rounding_scales.last().copied().unwrap_or(0.0)
@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_scales_bound_the_errors_of_cancelling_terms() -> Result<()> {
+    fn rounding_scales_bound_the_errors_of_canceling_terms() -> Result<()> {
         // (x + 293)⁴ − 293⁴ = x (x + 586) ((x + 293)² + 293²), which does not cancel.
         let program = vec![Channel(0), Constant(293.0), Add, Power(4.0), Constant(293.0), Power(4.0), Negate, Add];
         let radiation = Expression::new(program, 1)?;

@@ -551,7 +551,7 @@ impl ContactSolver<'_> {
             }
             if pulse.is_linear() && !self.is_resting.contains(&true) {
                 // With linear equations, this iteration found the exact friction forces. The state channels follow from
-                // them. A fixed output changes the gains slightly, so that the iteration continues.
+                // them. If a body rests, its fixed output changes the gains, so that the iteration continues.
                 pulse.solve_with(&self.forces)?;
                 error = 0.0;
                 break;

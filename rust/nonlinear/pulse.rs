@@ -9,8 +9,8 @@ use crate::linalg::small;
 
 /// Maximum number of Newton iterations in a pulse. Two or three are usual.
 const MAX_NEWTON_ITERATIONS: usize = 50;
-/// Maximum number of times that a Newton step is halved if it does not reduce the residual. From the infinite slope of a
-/// square root at 0, which counts as 0, a solution may be smaller than the first step by many orders of magnitude.
+/// Maximum number of times that a Newton step is halved if it does not reduce the residual. The slope of a square root
+/// at 0 is set to 0, so that the first step may exceed the solution by many orders of magnitude.
 const MAX_STEP_HALVINGS: usize = 50;
 /// Newton step at which the iteration has converged, relative to the sum of the magnitudes of the channel's terms.
 /// Convergence is quadratic, so the next step would be below rounding error. The Jacobian is computed before this step

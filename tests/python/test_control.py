@@ -295,7 +295,7 @@ def test_models_that_cannot_be_designed_on_are_refused():
         (HUB, {"output": np.array(["theta", "theta"])}, "output = array"),
         (HUB, {"input": 10**5000}, "input = an integer of 16610 bits is not one"),
         (HUB, {"seed": -(10**5000)}, "seed = an integer of 16610 bits"),
-        ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains of one sign"),
+        ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains of the plant's sign"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             tuned(text, **options)

@@ -287,10 +287,18 @@ def test_initial_values_of_whole_orders_are_those_of_a_differential_equation():
     # The coefficients of 1 and t: the term D y adds its own.
     assert swing.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1.5}})["y"] == pytest.approx(free, abs=1e-6)
     for powers in ({0.0: 1.0}, {0.0: 1.0, 1.0: 0.0}):
-        with pytest.raises(ftlm.ModelError, match=r"imply the powers \{0: 1, 1: 1\}; give initial=\{'y': \[1\.0"):
+        with pytest.raises(
+            ftlm.ModelError, match=r"imply the powers \{0: 1, 1: 1\}; give initial=\{'y': \[1\.0"
+        ) as raised:
             swing.simulate(run, initial={"y": powers})
+        assert "[1.0, -1.0] for the given powers alone" in str(raised.value)
+    alone = swing.simulate(run, initial={"y": [1.0, -1.0]})["y"]
+    np.testing.assert_allclose(alone, swing.simulate(run, initial={"y": {0.0: 1.0, 1.0: 1e-12}})["y"], atol=1e-9)
     with pytest.raises(ftlm.ModelError, match="3 initial values of y, but its equation of order 2 has 2"):
         swing.simulate(run, initial={"y": [1.0, 0.0, 0.0]})
+    curved = ftlm.Model(ftlm.equation("D^2 y = -1 D y - 9 y + 1 D (y^3) + 1 f"))
+    with pytest.raises(ftlm.ModelError, match="initial values of y beside the derivative of y"):
+        curved.simulate(run, initial={"y": [1.0]})
     circle = ftlm.Model(ftlm.equation("D^2 y = 1 D y - 1 y^2*D y - 1 y + 1 f"))
     limit = solve_ivp(
         lambda _, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]], (0, 4), [2, 0], t_eval=t, rtol=1e-10, atol=1e-12
@@ -309,6 +317,8 @@ def test_initial_values_of_coupled_equations_act_on_each_other():
         return [x[1], -x[1] - 5 * x[0] + 2 * rate, rate]
 
     exact = solve_ivp(slope, (0, 3), [1, -0.5, 2], t_eval=t, rtol=1e-10, atol=1e-12).y
+    with pytest.raises(ftlm.ModelError, match="initial values of y and powers of t of z in coupled equations"):
+        model.simulate(run, initial={"y": [1.0, -0.5], "z": {0.0: 2.0}})
     found = model.simulate(run, initial={"y": [1.0, -0.5], "z": [2.0]})
     assert found["y"] == pytest.approx(exact[0], abs=1e-6)
     assert found["z"] == pytest.approx(exact[2], abs=1e-6)
@@ -694,7 +704,7 @@ def test_a_plant_that_rests_under_a_constant_input_is_not_said_to_have_moved():
     # The level belongs to an input of 0, far from the output at which the plant rests.
     assert found.parameters["level_y"].value == pytest.approx(48 - 1.5 * 20, abs=0.5)
     (said,) = [f for f in found.findings if f.code == "level_estimated"]
-    assert "the simulation starts from estimated initial terms relative to this level" in said.text
+    assert "the simulation starts with estimated initial terms about this level" in said.text
 
 
 def test_a_given_offset_of_none_prevents_a_level_and_a_constant():

@@ -443,8 +443,9 @@ def fractional_pid(
     ModelError
         If the model is unstable (an integrator is permitted), has friction, or is too uncertain. It is too uncertain if
         for more than 5 % of the parameter samples the loop is unstable or has less than half the requested phase
-        margin. Also if no gains with the sign of the plant's gain meet the requirements, or if all loops that meet them
-        are unstable, also at 0.7 or 1.4 times the plant gain, or have a second crossover above the requested one.
+        margin. Also if no gains with the sign of the plant's gain meet the requirements, or if the selected
+        loop is unstable at 0.7, 1 or 1.4 times the plant gain, or all loops have a second crossover above the requested
+        one.
 
     Notes
     -----
@@ -473,18 +474,17 @@ def fractional_pid(
     slope = float(
         np.diff(np.unwrap(np.angle(plant.response(crossover_pair))))[0] / (crossover_pair[1] - crossover_pair[0])
     )
-    # A derivative can bring the loop gain close to 1 far above the crossover.
+    # The derivative action may raise the loop gain close to 1 far above the crossover.
     w = np.geomspace(wc / 100, 0.999 * math.pi * plant.rate, COMPARISON_FREQUENCIES)
     plant_responses = np.array([plant_sample.response(w) for plant_sample in [plant, *samples_drawn[:50]]])
     find_controller = partial(_best_controller, target, slope, wc, w, plant_responses, plant.gain_sign())
     controller = find_controller()
     if controller is None:
         raise ModelError(
-            f"no fractional PID with gains of one sign and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
-            "margin of "
-            f"{margin:g} degrees at {wc:g} rad/s on this model, whose phase there is "
-            f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
-            "another phase margin"
+            "no fractional PID with gains of the plant's sign and orders from "
+            f"{MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase margin of {margin:g} degrees at {wc:g} rad/s on this "
+            f"model, whose phase there is {np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move "
+            "the crossover, or ask for another phase margin"
         )
     fine_frequencies = nyquist_frequencies(wc, plant.rate)
     is_above_crossover = fine_frequencies > LAST_CROSSOVER_TOLERANCE * wc
@@ -529,14 +529,14 @@ def fractional_pid(
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
-    varied = [loop_margins(plant, factor) for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1])]
-    if not all(m.stable for m in varied):
+    margins_by_gain = [loop_margins(plant, factor) for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1])]
+    if not all(m.stable for m in margins_by_gain):
         raise ModelError(
             f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s has a gain margin of only "
-            f"{nominal.gain:.3g}, whatever the orders: it is unstable at {GAIN_VARIATIONS[0]:g} or "
+            f"{nominal.gain:.3g}: it is unstable at {GAIN_VARIATIONS[0]:g} or "
             f"{GAIN_VARIATIONS[1]:g} times the gain of the plant; move the crossover, or ask for another phase margin"
         )
-    flat = tuple(m.phase for m in varied)
+    flat = tuple(m.phase for m in margins_by_gain)
     other_plants = [replace(plant, output=o) for o in model.outputs if o != plant.output]
     plants = (plant, *(p for p in other_plants if p.has_response()))
     return PidDesign(choice, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), plants)

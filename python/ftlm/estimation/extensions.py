@@ -144,7 +144,7 @@ class Extension:
     term_text
         Additional terms as text, for the message.
     runs
-        Runs with a load as an additional input, or with another intersample behavior; None for the measured runs.
+        Runs with an additional input or with another intersample behavior; None for the measured runs.
     load_time
         Time of the load step [s].
     positive_coefficient
@@ -194,7 +194,6 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     residuals distinguishes the two: only a missing response raises its innovation variance. An extension is reported
     only if its own residuals depend neither on an input nor on the direction of motion, or if it is a non-linear term.
     Residuals at the level of rounding and discretization errors are not tested.
-
     If a controller computes an input from the output of the same row, the input contains the noise of this row. An
     extension by which the input acts sooner would seem to improve the fit, because it reproduces this noise. Extensions
     of the dynamics of such inputs are therefore not tested.
@@ -206,8 +205,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     inexact = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
     colored = any(not o.whiteness.passed or o.follows_direction for o in inexact)
-    is_excluded = structure.has_friction or structure.limits or structure.free_input_parameters
-    if joint is None or not joint.names or not colored or is_excluded:
+    is_excluded = structure.has_friction or structure.limits or structure.free_input_parameters or not colored
+    if joint is None or not joint.names or is_excluded:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
     fed_back = _inputs_fed_back_within_row(fit.model, tests)
@@ -228,7 +227,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint.values_by_name, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
-        fits += fit_each(_nonlinear_extensions(structure, joint, runs, inputs)) if inputs else []
+        with contextlib.suppress(FtlmError):
+            fits += fit_each(_nonlinear_extensions(structure, joint, runs, inputs))
         best = _best_physical(fits, fitted_criterion)
         if best is not None and best.extension.code != "offset_missing":
             # The optimum with an offset or friction may be far from that without. Under an input of one sign or of two
@@ -310,7 +310,7 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 def _inputs_fed_back_within_row(model: Model, tests: Residuals) -> set[str]:
     """Return the inputs that, by the feedback tests, depend on an output of the same row.
 
-    There are none for a non-linear model, which has no static gain.
+    The set is empty for a non-linear model, which has no static gain.
     """
     loops = {(output, name): t for output, r in tests.outputs.items() for name, t in r.feedback_tests.items()}
     states = steady_states(model) if model.structure.is_linear else ()
@@ -702,11 +702,11 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
 
 def _nonlinear_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
     """Return extensions by the terms of :func:`nonlinear_term_inputs`."""
-    (equation,), samples = structure.equations, simulate_runs(fitted_model(joint, structure), runs)
     (signal,), (coefficient,) = (unused_names(base, 1, structure, runs[0].signals) for base in ("term", "k"))
-    extended = replace(structure, equations=(_with_terms(equation, [Term(signal, Order(0.0), coefficient)]),))
+    inputs = nonlinear_term_inputs(structure, runs, fitted_model(joint, structure), names, signal)
+    term = Term(signal, Order(0.0), coefficient)
+    extended = replace(structure, equations=(_with_terms(structure.equations[0], [term]),)) if inputs else structure
     base = Extension("nonlinear_term_fits", extended, 1, names, starts=[{**joint.values_by_name, coefficient: 0.0}])
-    inputs = nonlinear_term_inputs(equation, runs, [s.outputs[0] for s in samples], names, signal)
     return [replace(base, runs=as_runs(new), term_text=f"{coefficient} {text}") for text, new in inputs.items()]
 
 

@@ -343,7 +343,7 @@ def assess_fit(fit: Fit) -> Identification:
     if plant:
         findings = [*plant, *(f for f in findings if not f.kind.simulates_whole_run)]
     if any(f.code in SPLIT_CODES for f in plant):
-        # Residuals of simulations of the whole runs are no test of the model.
+        # Residuals over whole runs do not test a model that holds for pieces only.
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is None:

@@ -43,10 +43,10 @@ MIN_LEVEL_MEAN_RATIO = 3.0
 #: Minimum ratio of the RMS residual to the standard deviation of an output that suggests a level.
 MIN_LEVEL_RESIDUAL_RATIO = 0.5
 #: Maximum difference of the information criteria of two fits that explain the runs alike (Kass and Raftery 1995).
-MAX_EQUAL_SCORE_DIFFERENCE = 2.0
-#: Maximum ratio of a standard error to its value for an offset to be preferred. A larger ratio is due to collinear
+MAX_EQUIVALENT_SCORE_DIFFERENCE = 2.0
+#: Ratio of a standard error to its value above which a parameter counts as not identifiable. It is due to collinear
 #: sensitivities, whose covariance consists of rounding errors.
-MAX_ERROR_RATIO = 1e6
+MAX_RELATIVE_STANDARD_ERROR = 1e6
 #: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -182,9 +182,9 @@ def _fit_nonlinear(fit: Fit, structure: Structure, fits: InitialConditionFits) -
     """Return the fit of a non-linear structure, with initial values, a constant or a level if they are significant.
 
     All of them are compared by their fits, because the test of an offset assumes a linear model, and a constant also
-    moves the equilibrium of a non-linear one. Nothing is compared if the residuals are white, with one exception: where
-    an input is constant from the first row on, initial values and a level may explain the runs alike. The plant is then
-    assumed to have been at rest at a level, as for a linear structure, and a finding states this assumption.
+    moves the equilibrium of a non-linear one. Nothing is compared if residuals are white, with one exception: if all
+    inputs are constant from the second sample on, initial values and a level may explain the runs alike. The plant is
+    then assumed to have been at rest at a level, as for a linear structure, and a finding states this assumption.
     """
     is_automatic = structure.initial == "auto" and structure.offset == "none"
     if fit.joint is None or not is_automatic or fit.task.structure.offset != "none":
@@ -198,9 +198,9 @@ def _fit_nonlinear(fit: Fit, structure: Structure, fits: InitialConditionFits) -
     best_structure, best_fit = structure, fit
     if fit.joint.initial == "rest" and not _has_quiet_samples(fit):
         request = replace(structure, initial=conditions_in_motion(structure))
-        moving = _preferred_fit(request, fit.joint, fits)
-        if moving is not None:
-            best_structure, best_fit = request, moving
+        fit_in_motion = _preferred_fit(request, fit.joint, fits)
+        if fit_in_motion is not None:
+            best_structure, best_fit = request, fit_in_motion
     if fits.may_add_offset and not (best_fit.joint is not None and has_white_residuals(best_fit.joint)):
         with_offset, best_fit = _fit_nonlinear_with_offset(best_fit, structure, fits)
         if with_offset is not None:
@@ -212,7 +212,7 @@ def _fit_nonlinear(fit: Fit, structure: Structure, fits: InitialConditionFits) -
 
 
 def _preferred_fit(request: Structure, joint: JointFit, fits: InitialConditionFits) -> Fit | None:
-    """Return the fit of a non-linear structure from automatic initial guesses if it is preferred to `joint`, else None.
+    """Return the fit of a non-linear structure from automatic guesses; None if it is not clearly better than `joint`.
 
     A non-linear structure has several optima, so that a slightly lower criterion is no evidence of further terms.
     """
@@ -239,7 +239,8 @@ def _fit_nonlinear_with_offset(fit: Fit, structure: Structure, fits: InitialCond
     level = _fit_with_level(fit if constant is None else constant, structure, fits, is_suggested=True)
     if level is not None:
         fit, is_significant = _compare_with_offset(fit, level, structure, fits)
-        return level if is_significant else None, fit
+        if is_significant:
+            return level, fit
     if constant is None:
         return None, fit
     return _with_constant_finding(fits.with_intervals(request, constant)), fit
@@ -256,20 +257,26 @@ def _compare_with_offset(
     if fit.joint is None or with_offset.joint is None:
         return fit, False
     without_offset = replace(structure, initial=fit.joint.initial)
-    nearby = fits.refit(without_offset, with_offset, partial(fits_better, other=fit.joint))
-    best = fit.joint if nearby is None or nearby.joint is None else nearby.joint
+    try:
+        nearby_fit = fits.refit(without_offset, with_offset, partial(fits_better, other=fit.joint))
+    except FtlmError:
+        nearby_fit = None
+    best_fit, best = (
+        (fit, fit.joint) if nearby_fit is None or nearby_fit.joint is None else (nearby_fit, nearby_fit.joint)
+    )
     is_better = fits_better(with_offset.joint, best, -START_SETTINGS.history_margin)
-    return replace(fit, joint=best), is_better and _is_identifiable(with_offset.joint)
+    return best_fit, is_better and _is_identifiable(with_offset.joint)
 
 
 def _is_identifiable(joint: JointFit) -> bool:
     """Whether the runs determine every parameter: no sensitivity is collinear with the others within rounding."""
     errors, values = joint.standard_errors, joint.values_by_name
-    return all(errors[n] <= MAX_ERROR_RATIO * abs(values[n]) for n in joint.names)
+    limits = {n: MAX_RELATIVE_STANDARD_ERROR * abs(values[n]) if values[n] else math.inf for n in joint.names}
+    return all(math.isfinite(errors[n]) and errors[n] <= limits[n] for n in joint.names)
 
 
 def _fit_with_offset(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return the fit of a linear plant that integrates with a significant constant in the equations; None if not.
+    """Return the fit of an integrating linear plant with a constant; None if the constant is not significant.
 
     For other linear plants, the result is None, because a level suffices and is tried later. A level cannot describe
     the response of an integrating plant to the offset of an input sensor. The new fit starts from its own initial
@@ -368,12 +375,14 @@ def _fit_if_rest_rejected(fit: Fit, structure: Structure, fits: InitialCondition
     if candidate is None:
         return None
     if structure.offset == "constant" and fits.may_add_offset:
-        candidate = _without_needless_constant(*candidate, fits)
+        candidate = _without_insignificant_constant(*candidate, fits)
     return _with_start_findings(fits.with_intervals(*candidate), structure, is_rest_rejected=True)
 
 
-def _without_needless_constant(structure: Structure, fit: Fit, fits: InitialConditionFits) -> tuple[Structure, Fit]:
-    """Return the structure and its fit, without the constant if the information criterion is not higher without it.
+def _without_insignificant_constant(
+    structure: Structure, fit: Fit, fits: InitialConditionFits
+) -> tuple[Structure, Fit]:
+    """Return a structure and its fit, both without the constant if it does not lower the information criterion.
 
     A constant that improves a fit from rest may only stand for initial conditions.
     """
@@ -383,10 +392,12 @@ def _without_needless_constant(structure: Structure, fit: Fit, fits: InitialCond
         return joint is not None and not fits_better(joint, candidate)
 
     try:
-        simpler = fits.refit(request, fit, is_sufficient)
+        candidate = fits.refit(request, fit, is_sufficient)
     except FtlmError:
         return structure, fit
-    return (structure, fit) if simpler is None else (request, simpler)
+    if candidate is None or candidate.joint is None or candidate.joint.unstable_optimum is not None:
+        return structure, fit
+    return request, candidate
 
 
 def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, is_suggested: bool) -> Fit | None:
@@ -394,9 +405,9 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
 
     Both information criteria that are compared use the noise spectrum of the fit with the larger residuals. If
     `is_suggested` is True, the optimum may be far away, so automatic initial guesses are used. They are also used for
-    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level. A fit in
-    motion starts from a fit from rest with a level only if the residuals of that fit are white: otherwise its optimum
-    may be as far away.
+    integer orders, for which they cost little. Otherwise the fit starts from the optimum without a level. With
+    automatic guesses, the fit in motion starts from the fit at rest only if the residuals of the latter are white,
+    because its optimum may be as far away otherwise.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -406,12 +417,12 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
     if not structure.is_linear and fit.task.structure.offset == "none":
         # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a level.
-        margin = MAX_EQUAL_SCORE_DIFFERENCE if is_rest_assumed else -START_SETTINGS.history_margin
+        margin = MAX_EQUIVALENT_SCORE_DIFFERENCE if is_rest_assumed else -START_SETTINGS.history_margin
 
     def is_preferred(joint: JointFit) -> bool:
         return fits_better(joint, best, margin)
 
-    # From rest, motion has been judged before.
+    # Initial values without a level were rejected before, or quiet samples show rest.
     for initial in INITIAL_CONDITIONS_WITH_LEVEL[: 1 if best.initial == "rest" or is_rest_assumed else None]:
         request = replace(structure, initial=initial, offset="level")
         try:
@@ -449,7 +460,7 @@ def _with_start_findings(fit: Fit, structure: Structure, *, is_rest_rejected: bo
         findings.append(make_finding("rest_rejected", run=names))
     if fit.task.structure.offset == "level" and structure.offset != "level":
         # Initial terms are no evidence of motion: a plant may rest at the equilibrium of a constant input.
-        start = "at rest" if initial == "rest" else "from estimated initial terms"
+        start = "at rest" if initial == "rest" else "with estimated initial terms"
         findings.append(make_finding("level_estimated", run=names, output=", ".join(fit.model.outputs), start=start))
     if is_rest_rejected and initial != "rest":
         return replace(fit, findings=findings)

@@ -14,19 +14,21 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.findings import Finding, make_finding
 from ftlm.kernels import integrate
 from ftlm.model.model import Model
-from ftlm.simulation.discretization import apply_input_nonlinearity
+from ftlm.simulation.discretization import apply_input_nonlinearity, has_nonuniform_samples
 from ftlm.simulation.nonlinear_columns import differentiate
 from ftlm.simulation.output_samples import LEVEL_EXPONENT, OutputSamples, simulate_samples
 from ftlm.structure.equation import Equation, Term, derivative
 from ftlm.structure.expression import Channel, channel
 from ftlm.structure.order import Order
+from ftlm.structure.structure import Structure
 from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import simulate_runs
 
 #: Growth factor of a small change from the first to the second half of a run, above which the growth is exponential,
-#: and maximum growth factor of the output. Without chaos a change decays, or grows in proportion to t at most.
-EXPONENTIAL_GROWTH, MAX_OUTPUT_GROWTH = 16.0, 4.0
-#: Change of an initial output, relative to the largest output of the run.
-RELATIVE_CHANGE = 1e-7
+#: and maximum growth factor of the output. In bounded regular motion, a change grows at most in proportion to t.
+MIN_CHAOTIC_GROWTH, MAX_OUTPUT_GROWTH = 16.0, 4.0
+#: Change of an initial output, relative to the largest value of this output in the run.
+INITIAL_CHANGE_RATIO = 1e-7
 
 
 def nonlinear_findings(model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]) -> list[Finding]:
@@ -36,7 +38,7 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], simulations: Sequence[
         return []
     values = [_signal_values(model, run, samples) for run, samples in zip(runs, simulations, strict=True)]
     findings = [f for equation in model.equations for f in _term_findings(equation, runs, values)]
-    return [*findings, *_sensitivity_growth_findings(model, runs, simulations)]
+    return [*findings, *_chaos_findings(model, runs, simulations)]
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
@@ -106,9 +108,7 @@ def _rms(parts: Sequence[Floats]) -> float:
         return math.sqrt(float(np.mean(np.concatenate(parts) ** 2)))
 
 
-def _sensitivity_growth_findings(
-    model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]
-) -> list[Finding]:
+def _chaos_findings(model: Model, runs: Sequence[Run], simulations: Sequence[OutputSamples]) -> list[Finding]:
     """Return a finding if a small change of the initial outputs grows exponentially in the simulation.
 
     The output itself must not grow. As in chaotic motion, the end of the run then depends too strongly on the
@@ -118,29 +118,30 @@ def _sensitivity_growth_findings(
     worst: tuple[float, float, str] | None = None
     for run, samples in zip(runs, simulations, strict=True):
         half = run.length // 2
-        peak = float(np.abs(samples.outputs).max())
-        for output in model.outputs:
+        peaks = np.abs(samples.outputs).max(axis=1)
+        peaks[peaks == 0.0] = 1.0
+        for output, peak in zip(model.outputs, peaks, strict=True):
             terms = samples.initial[output]
-            perturbed = {**samples.initial, output: {**terms, 0.0: terms.get(0.0, 0.0) + RELATIVE_CHANGE * peak}}
+            perturbed = {**samples.initial, output: {**terms, 0.0: terms.get(0.0, 0.0) + INITIAL_CHANGE_RATIO * peak}}
             try:
                 y, perturbed_outputs = [
                     simulate_samples(model, run, 1, initial)[0] for initial in (samples.initial, perturbed)
                 ]
             except FtlmError:
                 continue
-            change = np.abs(perturbed_outputs - y)
+            change = np.abs(perturbed_outputs - y) / peaks[:, None]
             early_change, late_change = change[:, :half].max(), change[:, half:].max()
             is_growing = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
             if (
                 is_growing
                 or not early_change > 0
-                or not late_change > EXPONENTIAL_GROWTH * early_change
+                or not late_change > MIN_CHAOTIC_GROWTH * early_change
                 or not math.isfinite(late_change)
             ):
                 continue
             if worst is None or late_change / early_change > worst[0]:
                 initial_change = float(change[:, : max(half // 4, 1)].max())
-                at = int(np.argmax(change.max(axis=0) > EXPONENTIAL_GROWTH * initial_change))
+                at = int(np.argmax(change.max(axis=0) > MIN_CHAOTIC_GROWTH * initial_change))
                 worst = late_change / early_change, at * run.step, run.name
     if worst is None:
         return []
@@ -148,18 +149,25 @@ def _sensitivity_growth_findings(
 
 
 def nonlinear_term_inputs(
-    equation: Equation, runs: Sequence[Run], simulated: Sequence[Floats], names: Sequence[str], signal: str
+    structure: Structure, runs: Sequence[Run], model: Model, names: Sequence[str], signal: str
 ) -> dict[str, list[Run]]:
     """Return runs with non-linear terms of the output as an additional input `signal`, by the text of the term.
 
     The terms are the square and the cube of the output, and its product with each of the inputs `names`. In an equation
-    with non-linear terms but without the output itself, the output is one of them. They are computed from the outputs
-    `simulated` of a fit, one array per run, and divided by a power of the largest value. A coefficient of such an input
-    has the effect of a small non-linear term, to first order.
+    with non-linear terms but without the output itself, the output is one of them. Terms that the equation has are left
+    out. They are computed from simulations of `model` and divided by a power of the largest value. A coefficient of
+    such an input has the effect of a small non-linear term, to first order. The result is empty for several equations,
+    a coefficient law, and runs that are compared at nonuniform sample times.
     """
+    if len(structure.equations) > 1 or structure.coefficient_law:
+        return {}
+    if any(has_nonuniform_samples(run, structure) for run in runs):
+        return {}
+    (equation,) = structure.equations
+    name = equation.output
+    simulated = [simulation.outputs[0] for simulation in simulate_runs(model, runs)]
     scale = max(float(np.abs(y).max()) for y in simulated) or 1.0
     outputs = [y / scale for y in simulated]
-    name = equation.output
     factors: dict[str, Sequence[Floats]] = {f"{name}^2": outputs, f"{name}^3": [y**2 for y in outputs]}
     factors |= {f"{name}*{n}": [run[n] for run in runs] for n in names}
     if equation.nonlinear_terms and not any(t.signal == name and t.order == Order(0.0) for t in equation.terms):
@@ -168,7 +176,9 @@ def nonlinear_term_inputs(
     def with_term(run: Run, values: Floats) -> Run:
         return run_with_inputs(run, {signal: values}).with_intersample({signal: "foh"})
 
+    present = {t.column for t in equation.nonlinear_terms}
     return {
         text: [with_term(run, y * v) for run, y, v in zip(runs, outputs, values, strict=True)]
         for text, values in factors.items()
+        if text not in present and "*".join(reversed(text.split("*"))) not in present
     }

@@ -28,9 +28,11 @@ PIECE_TIME_CONSTANTS, MIN_PIECE_TIME_CONSTANTS, MIN_PIECE_SAMPLES = 5.0, 2.5, 20
 MAX_GROWTH_EXPONENT = 15.0
 #: Minimum number of pieces for a decision, and maximum number that are simulated, spread evenly.
 MIN_PIECES, MAX_PIECES = 5, 40
-#: Maximum residual of the pieces, relative to the standard deviations of their outputs, of an acceptable model.
+#: Maximum residual of an acceptable model, relative to the standard deviations of the outputs, in pieces. A model whose
+#: residual over whole runs is larger is compared with least squares in pieces.
 MAX_PIECE_RESIDUAL = 0.3
-#: Codes of findings on unstable plants whose runs are divided, because simulations of whole runs diverge.
+#: Codes of findings on unstable plants whose runs are divided, because simulations of whole runs diverge or
+#: explain less than those of the pieces.
 SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
 
 
@@ -113,7 +115,7 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
     """
     if not model.structure.is_linear:
         return []
-    residual = max((f.nr for f in comparison.output_error.values()), default=0.0)
+    residual = float(np.max([f.nr for f in comparison.output_error.values()]))
     is_explained = residual <= MAX_NORMALIZED_RESIDUAL
     is_unstable = any(f.code == "simulation_unbounded" for f in stability_findings(model))
     if is_unstable:

@@ -26,6 +26,7 @@ from ftlm.utils.statistics import (
     estimate_noise,
     huber_excess,
     is_rest,
+    quantization_step,
     variance_inflation,
     white_noise,
 )
@@ -190,13 +191,14 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
 
 
 def _is_tared(samples: Floats) -> bool:
-    """Whether the first value of a noisy signal was subtracted from all values, so that its noise remains as a level.
+    """Whether the first value of a noisy signal was subtracted from all values. Its noise is then a level.
 
-    The first value is then exactly 0. In a quantized signal, other values are 0 as well.
+    The first value is then exactly 0. Rounding errors of a quantized signal are no such noise.
     """
-    noise = white_noise(samples)
-    is_noisy = noise > START_SETTINGS.least_noise * float(np.nanstd(samples))
-    return bool(samples[0] == 0.0 and np.count_nonzero(samples == 0.0) == 1 and is_noisy)
+    if samples[0] != 0.0:
+        return False
+    rounding = max(START_SETTINGS.least_noise * float(np.nanstd(samples)), quantization_step(drop_missing(samples)))
+    return white_noise(samples) > rounding
 
 
 def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:

@@ -23,7 +23,6 @@ from ftlm.simulation.discretization import (
 from ftlm.simulation.initial_conditions import deviations
 from ftlm.simulation.output_samples import LEVEL_EXPONENT
 from ftlm.simulation.step_refinement import simulate_refined
-from ftlm.structure.equation import Equation
 from ftlm.structure.order import ORDER_RESOLUTION
 from ftlm.structure.structure import check_initial
 from ftlm.utils.arguments import check_arguments
@@ -133,15 +132,11 @@ def simulate(
         raise ModelError(
             f"initial terms of {unknown!r}, which is no output of the model; give those of {', '.join(model.outputs)}"
         )
+    for name, entry in (initial or {}).items():
+        exponents = entry if isinstance(entry, Mapping) else ()
+        has_transient = model.structure.has_filter_transient(name)
+        check_initial([e for e in exponents if e != LEVEL_EXPONENT and not (has_transient and e in impulses)])
     initial_terms = _initial_terms(model, initial or {})
-    for name, terms in initial_terms.items():
-        check_initial(
-            [
-                e
-                for e in terms
-                if e != LEVEL_EXPONENT and not (model.structure.has_filter_transient(name) and e in impulses)
-            ]
-        )
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
     # The equations are simulated for deviations from given levels, which are added to the result.
@@ -185,31 +180,40 @@ def simulate(
 def _initial_terms(
     model: Model, initial: Mapping[str, Mapping[float, float] | Sequence[float]]
 ) -> dict[str, dict[float, float]]:
-    """Return the coefficients of the powers of t by output and exponent, from these or from initial values.
+    """Return the coefficients of the powers of t by output and exponent; initial values are converted to them.
 
-    Raise ModelError if an output has more initial values than its order allows, or if given powers do not contain those
-    that initial values imply.
+    Raise ModelError if an output has more initial values than its order allows, if coupled equations have both initial
+    values and powers, or if powers that the given integer powers imply are missing.
     """
     values: dict[str, list[float]] = {}
+    powers: dict[str, dict[float, float]] = {}
     for equation in model.equations:
-        given = initial.get(equation.output)
-        if given is None or isinstance(given, Mapping):
+        output, order = equation.output, equation.order.constant
+        entry = initial.get(output, {})
+        if isinstance(entry, Mapping):
+            powers |= {output: dict(entry)} if output in initial else {}
             continue
-        count = math.ceil(equation.order.constant - ORDER_RESOLUTION)
-        values[equation.output] = [real_number(f"an initial value of {equation.output}", v) for v in given]
-        if len(values[equation.output]) > count:
+        values[output] = [real_number(f"an initial value of {output}", v) for v in entry]
+        count = math.ceil(order - ORDER_RESOLUTION)
+        if len(values[output]) > count:
             raise ModelError(
-                f"{len(values[equation.output])} initial values of {equation.output}, but its equation of order "
-                f"{equation.order.constant:g} has {count}; give y(0) and the derivatives of lower order than the "
-                "equation"
+                f"{len(values[output])} initial values of {output}, but its equation of order {order:g} has {count}; "
+                "give y(0) and the derivatives of lower order than the equation"
             )
-    terms = _powers_of_initial_values(model, values) if values else {}
-    for equation in model.equations:
-        given = initial.get(equation.output)
-        if isinstance(given, Mapping):
-            terms[equation.output] = dict(given)
-            _check_powers(model, equation, given)
-    return terms
+        term = next((t for t in equation.nonlinear_terms if t.order.constant > 0.0), None)
+        if term is not None and any(values[output]):
+            raise ModelError(
+                f"initial values of {output} beside the derivative of {term.column}, whose initial value they do not "
+                "give; give powers of t"
+            )
+    if values and powers and model.structure.coupling == "simulated":
+        raise ModelError(
+            f"initial values of {next(iter(values))} and powers of t of {next(iter(powers))} in coupled equations; "
+            "give initial values of all outputs, or powers of all"
+        )
+    for output, terms in powers.items():
+        _check_powers(model, output, terms)
+    return {**powers, **_powers_of_initial_values(model, values)}
 
 
 def _powers_of_initial_values(model: Model, values: Mapping[str, Sequence[float]]) -> dict[str, dict[float, float]]:
@@ -220,50 +224,66 @@ def _powers_of_initial_values(model: Model, values: Mapping[str, Sequence[float]
     """
     powers: dict[str, dict[float, float]] = {}
     for equation in model.equations:
-        alpha, own = equation.order.constant, values.get(equation.output, ())
-        coefficients = {float(i): v / math.factorial(i) for i, v in enumerate(own)}
+        alpha, own_values = equation.order.constant, values.get(equation.output, ())
+        coefficients = {float(i): v / math.factorial(i) for i, v in enumerate(own_values)}
         for term in equation.terms:
+            order = term.order.constant
             if term.column != equation.output and model.structure.coupling != "simulated":
                 continue
-            order = term.order.constant
             for i, value in enumerate(values.get(term.column, ())):
-                if value and i < math.ceil(order - ORDER_RESOLUTION):
-                    power = round(alpha - order + i, 9)
-                    change = float(term.fixed_value or 0.0) * value / math.gamma(power + 1.0)
-                    coefficients[power] = coefficients.get(power, 0.0) - change
+                if not value or i >= math.ceil(order - ORDER_RESOLUTION):
+                    continue
+                power = round(alpha - order + i, 9)
+                if power <= -1.0:
+                    raise ModelError(
+                        f"initial values of {term.column} make {equation.output} infinite at the start, because its "
+                        f"equation of order {alpha:g} contains D^{order:g} {term.column}; give powers of t"
+                    )
+                change = float(term.fixed_value or 0.0) * value / math.gamma(power + 1.0)
+                coefficients[power] = coefficients.get(power, 0.0) - change
         if coefficients:
             powers[equation.output] = coefficients
     return powers
 
 
-def _check_powers(model: Model, equation: Equation, terms: Mapping[float, float]) -> None:
-    """Raise ModelError if given whole powers of t are initial values that imply other powers.
+def _check_powers(model: Model, output: str, terms: Mapping[float, float]) -> None:
+    """Raise ModelError if powers of t that are implied by the given integer powers are missing.
 
-    A whole power is taken for an initial value if a power that it implies is missing, or if it is 0 although a
-    coefficient other than 0 is implied.
+    An integer power is taken for an initial value if a power that it implies is missing, or is given as 0 although it
+    is an integer power.
     """
+    equation = next(e for e in model.equations if e.output == output)
     count = math.ceil(equation.order.constant - ORDER_RESOLUTION)
-    given = {int(e): v for e, v in terms.items() if 0.0 <= e < count and e == int(e)}
-    if not any(given.values()):
+    integer_powers = {int(e): v for e, v in terms.items() if 0.0 <= e < count and e == int(e)}
+    if not any(integer_powers.values()):
         return
-    values = [math.factorial(i) * given.get(i, 0.0) for i in range(max(given) + 1)]
-    implied = _powers_of_initial_values(model, {equation.output: values})[equation.output]
+    values = [math.factorial(i) * integer_powers.get(i, 0.0) for i in range(max(integer_powers) + 1)]
+    implied_powers = _powers_of_initial_values(model, {output: values})[output]
 
     def is_missing(exponent: float) -> bool:
         value = next((v for e, v in terms.items() if abs(e - exponent) < EXPONENT_TOLERANCE), None)
         return value is None or (value == 0.0 and exponent == round(exponent))
 
-    missing = [e for e, v in implied.items() if v and is_missing(e)]
-    if missing:
-        shown = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(implied.items()))
-        fractional = next((e for e in missing if e != round(e)), None)
-        only = "" if fractional is None else f", or t^{fractional:g} as 0 if only the given powers are meant"
-        raise ModelError(
-            f"initial terms of {equation.output}: powers of t {', '.join(f'{e:g}' for e in sorted(given))}, but "
-            f"initial values by Caputo's definition imply the powers {{{shown}}}; give "
-            f"{parameter('initial')}{{{equation.output!r}: {[float(f'{v:.6g}') for v in values]}}} for these initial "
-            f"values{only}"
-        )
+    missing_exponents = [e for e, v in implied_powers.items() if v and is_missing(e)]
+    if not missing_exponents:
+        return
+    fractional = next((e for e in missing_exponents if e != round(e)), None)
+    if fractional is None:
+        # The initial values with which the given powers are all.
+        same_powers: list[float] = []
+        for i in range(count):
+            implied = _powers_of_initial_values(model, {output: [*same_powers, 0.0]})[output].get(float(i), 0.0)
+            same_powers.append(math.factorial(i) * (integer_powers.get(i, 0.0) - implied))
+        otherwise = f"{[float(f'{v:.6g}') for v in same_powers]} for the given powers alone"
+    else:
+        otherwise = f"t^{fractional:g} as 0 if only the given powers are meant"
+    powers_text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(implied_powers.items()))
+    raise ModelError(
+        f"initial terms of {output}: powers of t {', '.join(f'{e:g}' for e in sorted(integer_powers))}, but initial "
+        f"values by Caputo's definition imply the powers {{{powers_text}}}; give "
+        f"{parameter('initial')}{{{output!r}: {[float(f'{v:.6g}') for v in values]}}} for these initial values, or "
+        f"{otherwise}"
+    )
 
 
 def _units(model: Model, run: Run) -> dict[str, str]:

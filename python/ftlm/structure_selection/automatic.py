@@ -272,21 +272,19 @@ class AutomaticSelection:
     def _fit_probes(self, form: IntegerOrderForm) -> list[FittedForm]:
         """Return the fits of a form without and with an output level, and decide whether all forms start in motion.
 
-        An output that begins at zero may have been set to zero in motion. All forms then have initial values.
+        A sensor that is set to zero in motion also starts at 0. If initial values lower the criterion clearly, the
+        `problem` is changed so that all forms have them.
         """
         forms = [form, replace(form, offset="level")]
         probes = self._fit(forms)
         if self.problem.initial == "auto" and any(f.joint.initial == "rest" for f in probes):
             problem = replace(self.problem, initial="caputo")
-            in_motion = self._fit_structures([(f.structure(problem), f, []) for f in forms])
-            all_fits = _rank([*probes, *in_motion])
-            at_rest = min(f.bic for f in all_fits if f.joint.initial == "rest")
-            if (
-                min((f.bic for f in all_fits if f.joint.initial != "rest"), default=math.inf)
-                < at_rest - MIN_BIC_DECREASE
-            ):
+            all_fits = _rank([*probes, *self._fit_structures([(f.structure(problem), f, []) for f in forms])])
+            fits_in_motion = [f for f in all_fits if f.joint.initial != "rest"]
+            lowest_at_rest = min(f.bic for f in all_fits if f.joint.initial == "rest")
+            if fits_in_motion and fits_in_motion[0].bic < lowest_at_rest - MIN_BIC_DECREASE:
                 self.problem = problem
-                return in_motion
+                return fits_in_motion
         return probes
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:

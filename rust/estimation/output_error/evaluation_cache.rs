@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::experiment::Experiment;
-use super::kink_correction::Kink;
+use super::kink_correction::KinkCache;
 use super::parameterization::FreeModel;
 use super::system_inverse::{
     filtered_spectrum, InitialTerm, Operator, PulseMeans, SeriesFilter, SystemInverse, MAX_CACHED_PULSES,
@@ -76,8 +76,8 @@ pub(crate) struct EvaluationCache {
     input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
     /// The weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
     impulses: HashMap<(usize, u64), Vec<f64>>,
-    /// Most recently used kink of each input term and of each pass through an autoregressive term.
-    kinks: Vec<Rc<Kink>>,
+    /// Kinks of the outputs at nonuniform sample times.
+    pub(crate) kinks: KinkCache,
 }
 
 impl EvaluationCache {
@@ -126,7 +126,7 @@ impl EvaluationCache {
                 total,
                 input_spectra: HashMap::new(),
                 impulses: HashMap::new(),
-                kinks: Vec::new(),
+                kinks: KinkCache::default(),
             }
         };
         Ok(indexed_caches.into_iter().map(cache).collect())
@@ -283,24 +283,5 @@ impl EvaluationCache {
             experiment.weighted_samples(&means)
         };
         self.impulses.entry((output, exponent.to_bits())).or_insert_with(samples).clone()
-    }
-
-    /// Return the kink of an input term, or of its pass through an autoregressive term, at an integration order.
-    ///
-    /// `compute` computes it if the order differs from that of the last evaluation.
-    pub(crate) fn kink(
-        &mut self,
-        equation: usize,
-        terms: Vec<usize>,
-        integration_order: f64,
-        compute: impl FnOnce(Vec<usize>) -> Kink,
-    ) -> Rc<Kink> {
-        if let Some(kink) = self.kinks.iter().find(|kink| kink.matches(equation, &terms, integration_order)) {
-            return kink.clone();
-        }
-        self.kinks.retain(|kink| !kink.is_of(equation, &terms));
-        let kink = Rc::new(compute(terms));
-        self.kinks.push(kink.clone());
-        kink
     }
 }

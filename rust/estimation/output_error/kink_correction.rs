@@ -8,7 +8,6 @@
 use std::cell::OnceCell;
 use std::rc::Rc;
 
-use super::evaluation_cache::EvaluationCache;
 use super::experiment::Experiment;
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
 use super::parameterization::{FreeModel, ParameterPoint};
@@ -20,8 +19,35 @@ const ORDER_DIFFERENCE_STEP: f64 = 1e-5;
 /// Integration order from which block pulses represent a kink accurately.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 
+/// Most recently used kink of each input term and of each pass through an autoregressive term.
+#[derive(Default)]
+pub(crate) struct KinkCache(Vec<Rc<Kink>>);
+
+impl KinkCache {
+    /// Return the kink of the given terms of an equation at an integration order. `compute` computes it if the order
+    /// differs from that of the last evaluation.
+    fn kink(
+        &mut self,
+        equation: usize,
+        terms: Vec<usize>,
+        integration_order: f64,
+        compute: impl FnOnce(Vec<usize>) -> Kink,
+    ) -> Rc<Kink> {
+        let has_terms = |kink: &Rc<Kink>| kink.equation == equation && kink.terms == terms;
+        if let Some(kink) = self.0.iter().find(|kink| has_terms(kink)) {
+            if kink.integration_order.to_bits() == integration_order.to_bits() {
+                return kink.clone();
+            }
+        }
+        self.0.retain(|kink| !has_terms(kink));
+        let kink = Rc::new(compute(terms));
+        self.0.push(kink.clone());
+        kink
+    }
+}
+
 /// Kink of one input term, either alone or after one pass through an autoregressive term.
-pub(crate) struct Kink {
+struct Kink {
     /// Index of the equation.
     equation: usize,
     /// Indices of the input term and, if there is one, of the autoregressive term.
@@ -37,21 +63,12 @@ pub(crate) struct Kink {
 }
 
 impl Kink {
-    /// Return true if this is the kink of the given terms at the given integration order.
-    pub(crate) fn matches(&self, equation: usize, terms: &[usize], integration_order: f64) -> bool {
-        self.is_of(equation, terms) && self.integration_order.to_bits() == integration_order.to_bits()
-    }
-
-    /// Return true if this is the kink of the given terms of an equation.
-    pub(crate) fn is_of(&self, equation: usize, terms: &[usize]) -> bool {
-        self.equation == equation && self.terms == terms
-    }
-
-    /// Return the corrections of the samples for the integration order `order` of the input `signal`.
+    /// Return the corrections of the samples for the integration order `order` of the input `signal`; empty if the
+    /// signal has no jumps.
     fn corrections(experiment: &Experiment, signal: usize, order: f64) -> Vec<f64> {
         let samples = experiment.nonuniform.as_ref();
-        let of_samples = samples.and_then(|n| Some((n, n.jumps.get(signal)?.as_ref()?)));
-        of_samples.map_or_else(Vec::new, |(n, jumps)| {
+        let samples_and_jumps = samples.and_then(|n| Some((n, n.jumps.get(signal)?.as_ref()?)));
+        samples_and_jumps.map_or_else(Vec::new, |(n, jumps)| {
             n.interpolation.kink_corrections(jumps, order, experiment.record.step())
         })
     }
@@ -79,7 +96,7 @@ impl KinkCorrection {
         model: &FreeModel,
         experiment: &Experiment,
         structures: &[Structure],
-        cache: &mut EvaluationCache,
+        cache: &mut KinkCache,
     ) -> Option<Self> {
         let jumps = &experiment.nonuniform.as_ref()?.jumps;
         let mut kinks = Vec::new();

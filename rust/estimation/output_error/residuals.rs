@@ -120,7 +120,7 @@ impl FreeModel {
         if let Some(feedthrough) = &feedthrough {
             residuals.iter_mut().zip(feedthrough.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
         }
-        let kink_correction = KinkCorrection::new(self, experiment, structures, cache);
+        let kink_correction = KinkCorrection::new(self, experiment, structures, &mut cache.kinks);
         if let Some(kink_correction) = &kink_correction {
             let correction = kink_correction.weighted_correction(self, experiment, point, feedthrough.as_ref());
             residuals.iter_mut().zip(correction).for_each(|(e, v)| *e -= v);

@@ -375,8 +375,9 @@ impl<'a> CostSurface<'a> {
     ) -> Result<Self> {
         let objective = fit.objective((parameter_set, source, stop), fit.pulses_per_sample)?;
         let optimum = minimize(parameter_set, &objective, &fit.estimate, &[], (evaluations, RELATIVE_COST_TOLERANCE))?;
-        let others = optimum.jacobian.iter().enumerate().filter(|(j, _)| refit && !pair.contains(j));
-        let basis = orthonormal_basis(others.map(|(_, row)| row.clone()).collect(), SINGULAR_VALUE_TOLERANCE, stop)?;
+        let other_rows = optimum.jacobian.iter().enumerate().filter(|(j, _)| refit && !pair.contains(j));
+        let basis =
+            orthonormal_basis(other_rows.map(|(_, row)| row.clone()).collect(), SINGULAR_VALUE_TOLERANCE, stop)?;
         Ok(Self { parameter_set, objective, optimum, pair, basis })
     }
 
@@ -456,7 +457,7 @@ fn none_if_failed<T>(outcome: Result<T>) -> Result<Option<T>> {
 
 /// Approximate a vector by the sensitivities of all parameters but parameter `i`, by least squares.
 ///
-/// Combinations of parameters that have almost no effect are left unchanged.
+/// Directions in parameter space with negligible effect get the coefficient 0.
 fn fit_other_sensitivities(result: &OptimizationResult, i: usize, target: &[f64]) -> Result<MinimumNormSolution> {
     let rows: Vec<&[f64]> =
         result.jacobian.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, row)| row.as_slice()).collect();
