@@ -198,7 +198,7 @@ def _fit_nonlinear(fit: Fit, structure: Structure, fits: InitialConditionFits) -
     best_structure, best_fit = structure, fit
     if fit.joint.initial == "rest" and not _has_quiet_samples(fit):
         request = replace(structure, initial=conditions_in_motion(structure))
-        fit_in_motion = _preferred_fit(request, fit.joint, fits)
+        fit_in_motion = _preferred_fit(request, fit.joint, fits) if _improves_nearby(request, fit, fits) else None
         if fit_in_motion is not None:
             best_structure, best_fit = request, fit_in_motion
     if fits.may_add_offset and not (best_fit.joint is not None and has_white_residuals(best_fit.joint)):
@@ -231,7 +231,14 @@ def _fit_nonlinear_with_offset(fit: Fit, structure: Structure, fits: InitialCond
     The fit without offset is that of `fit`, or a better one from the optimum with an offset.
     """
     constant, request = None, replace(structure, offset="constant")
-    if fit.joint is not None and constant_input(fit.task.runs, structure) is None:
+    if fit.joint is None:
+        return None, fit
+    has_constant_input = constant_input(fit.task.runs, structure) is not None
+    nearby = replace(request, initial=fit.joint.initial)
+    offsets = [replace(nearby, offset="level")] if has_constant_input else [nearby, replace(nearby, offset="level")]
+    if not any(_improves_nearby(offset, fit, fits) for offset in offsets):
+        return None, fit
+    if not has_constant_input:
         constant = _preferred_fit(request, fit.joint, fits)
     if constant is not None:
         fit, is_significant = _compare_with_offset(fit, constant, structure, fits)
@@ -244,6 +251,20 @@ def _fit_nonlinear_with_offset(fit: Fit, structure: Structure, fits: InitialCond
     if constant is None:
         return None, fit
     return _with_constant_finding(fits.with_intervals(request, constant)), fit
+
+
+def _improves_nearby(request: Structure, fit: Fit, fits: InitialConditionFits) -> bool:
+    """Whether other initial conditions or an offset clearly improve a non-linear fit near its optimum.
+
+    If they are missing, they improve the fit near any optimum, so that automatic initial guesses can wait for this.
+    """
+    if fit.joint is None or fits.complete_fit is None:
+        return True
+    is_better = partial(fits_better, other=fit.joint, margin=-START_SETTINGS.history_margin)
+    try:
+        return fits.refit(request, fit, is_better) is not None
+    except FtlmError:
+        return False
 
 
 def _compare_with_offset(
