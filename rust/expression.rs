@@ -342,7 +342,7 @@ mod tests {
         let program = vec![Channel(0), Constant(293.0), Add, Power(4.0), Constant(293.0), Power(4.0), Negate, Add];
         let radiation = Expression::new(program, 1)?;
         let mut values = Values::default();
-        for x in [0.0, 1e-15, 3e-9, -2e-4, 1.0, 50.0, -280.0] {
+        for x in [0.0_f64, 1e-15, 3e-9, -2e-4, 1.0, 50.0, -280.0] {
             let exact = x * (x + 586.0) * ((x + 293.0).powi(2) + 293.0_f64.powi(2));
             let error = (radiation.evaluate(&[x], &mut values) - exact).abs();
             let bound = 2.0 * f64::EPSILON * values.rounding_scale();
