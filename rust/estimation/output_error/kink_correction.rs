@@ -34,10 +34,9 @@ impl KinkCache {
         compute: impl FnOnce(Vec<usize>) -> Kink,
     ) -> Rc<Kink> {
         let has_terms = |kink: &Rc<Kink>| kink.equation == equation && kink.terms == terms;
-        if let Some(kink) = self.0.iter().find(|kink| has_terms(kink)) {
-            if kink.integration_order.to_bits() == integration_order.to_bits() {
-                return kink.clone();
-            }
+        let is_current = |kink: &&Rc<Kink>| kink.integration_order.to_bits() == integration_order.to_bits();
+        if let Some(kink) = self.0.iter().find(|kink| has_terms(kink)).filter(is_current) {
+            return kink.clone();
         }
         self.0.retain(|kink| !has_terms(kink));
         let kink = Rc::new(compute(terms));
