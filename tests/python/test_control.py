@@ -507,3 +507,15 @@ def test_a_loop_is_stable_where_its_design_says_so(order, pole, gain, crossover)
     assert all(50 < margin < 70 for margin in design.phase_margin_at_gains)
     for factor in (0.7, 1.0, 1.4):
         assert closed_loop_peak(design.pid, factor * gain, order, pole) < 1.5
+
+
+def test_a_controller_of_negative_gains_is_the_mirrored_one_also_at_its_limit():
+    errors = np.r_[np.full(400, 1.0), np.full(400, -0.7), np.random.default_rng(2).standard_normal(200)]
+    for orders in ((1.0, 1.0), (0.8, 0.6)):
+        positive = control.DiscretePid(control.FractionalPid(0.5, 3.0, 0.02, *orders), 100.0, limit=1.0)
+        negative = control.DiscretePid(control.FractionalPid(-0.5, -3.0, -0.02, *orders), 100.0, limit=1.0)
+        output = np.array([positive(e) for e in errors])
+        np.testing.assert_allclose([negative(e) for e in errors], -output, atol=1e-12)
+        # It leaves its limit soon after the error has changed its sign: the integral has not wound up.
+        assert 0.9 < output[399] <= 1.0
+        assert output[420] < 0.5

@@ -236,7 +236,8 @@ class DiscretePid:
             self.pid.kp * error + self._derivative.direct * error + float(self._lags @ self._derivative.weights)
         )
         output = proportional_part + self._integral.direct * error + float(sums @ self._integral.weights)
-        if abs(output) > self.limit and output * error > 0:
+        # The integral of an error moves the output in the direction of error times gain.
+        if abs(output) > self.limit and output * error * self.pid.ki > 0:
             sums = self._sums
             output = proportional_part + self._integral.direct * error + float(sums @ self._integral.weights)
         self._sums, self._error = sums, error
@@ -529,17 +530,17 @@ def fractional_pid(
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
-    margins_by_gain = [loop_margins(plant, factor) for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1])]
-    if not all(m.stable for m in margins_by_gain):
+    low_gain, high_gain = (loop_margins(plant, factor) for factor in GAIN_VARIATIONS)
+    if not (low_gain.stable and high_gain.stable):
         raise ModelError(
             f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s has a gain margin of only "
             f"{nominal.gain:.3g}: it is unstable at {GAIN_VARIATIONS[0]:g} or "
             f"{GAIN_VARIATIONS[1]:g} times the gain of the plant; move the crossover, or ask for another phase margin"
         )
-    flat = tuple(m.phase for m in margins_by_gain)
     other_plants = [replace(plant, output=o) for o in model.outputs if o != plant.output]
     plants = (plant, *(p for p in other_plants if p.has_response()))
-    return PidDesign(choice, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), plants)
+    phases = (low_gain.phase, nominal.phase, high_gain.phase)
+    return PidDesign(choice, plant.rate, nominal, margins, phases, plants)
 
 
 def plant_of(

@@ -234,9 +234,9 @@ def _fit_nonlinear_with_offset(fit: Fit, structure: Structure, fits: InitialCond
     if fit.joint is None:
         return None, fit
     has_constant_input = constant_input(fit.task.runs, structure) is not None
-    nearby = replace(request, initial=fit.joint.initial)
-    offsets = [replace(nearby, offset="level")] if has_constant_input else [nearby, replace(nearby, offset="level")]
-    if not any(_improves_nearby(offset, fit, fits) for offset in offsets):
+    offsets: list[Offset] = ["level"] if has_constant_input else ["constant", "level"]
+    nearby = [replace(structure, initial=fit.joint.initial, offset=offset) for offset in offsets]
+    if not any(_improves_nearby(offset_request, fit, fits) for offset_request in nearby):
         return None, fit
     if not has_constant_input:
         constant = _preferred_fit(request, fit.joint, fits)
@@ -282,10 +282,9 @@ def _compare_with_offset(
         nearby_fit = fits.refit(without_offset, with_offset, partial(fits_better, other=fit.joint))
     except FtlmError:
         nearby_fit = None
-    best_fit, best = (
-        (fit, fit.joint) if nearby_fit is None or nearby_fit.joint is None else (nearby_fit, nearby_fit.joint)
-    )
-    is_better = fits_better(with_offset.joint, best, -START_SETTINGS.history_margin)
+    best_fit = nearby_fit or fit
+    assert best_fit.joint is not None
+    is_better = fits_better(with_offset.joint, best_fit.joint, -START_SETTINGS.history_margin)
     return best_fit, is_better and _is_identifiable(with_offset.joint)
 
 

@@ -118,31 +118,27 @@ def _chaos_findings(model: Model, runs: Sequence[Run], simulations: Sequence[Out
     worst: tuple[float, float, str] | None = None
     for run, samples in zip(runs, simulations, strict=True):
         half = run.length // 2
-        peaks = np.abs(samples.outputs).max(axis=1)
+        peaks = np.abs(samples.outputs).max(axis=1, keepdims=True)
         peaks[peaks == 0.0] = 1.0
-        for output, peak in zip(model.outputs, peaks, strict=True):
+        try:
+            y = simulate_samples(model, run, 1, samples.initial)[0] / peaks
+        except FtlmError:
+            continue
+        if (np.abs(y[:, half:]).max(axis=1) > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max(axis=1)).any():
+            continue
+        for output, peak in zip(model.outputs, peaks[:, 0], strict=True):
             terms = samples.initial[output]
             perturbed = {**samples.initial, output: {**terms, 0.0: terms.get(0.0, 0.0) + INITIAL_CHANGE_RATIO * peak}}
             try:
-                y, perturbed_outputs = [
-                    simulate_samples(model, run, 1, initial)[0] for initial in (samples.initial, perturbed)
-                ]
+                change = np.abs(simulate_samples(model, run, 1, perturbed)[0] / peaks - y)
             except FtlmError:
                 continue
-            change = np.abs(perturbed_outputs - y) / peaks[:, None]
             early_change, late_change = change[:, :half].max(), change[:, half:].max()
-            is_growing = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
-            if (
-                is_growing
-                or not early_change > 0
-                or not late_change > MIN_CHAOTIC_GROWTH * early_change
-                or not math.isfinite(late_change)
-            ):
-                continue
-            if worst is None or late_change / early_change > worst[0]:
+            growth = late_change / early_change if early_change > 0.0 else 0.0
+            if math.isfinite(growth) and growth > (MIN_CHAOTIC_GROWTH if worst is None else worst[0]):
                 initial_change = float(change[:, : max(half // 4, 1)].max())
                 at = int(np.argmax(change.max(axis=0) > MIN_CHAOTIC_GROWTH * initial_change))
-                worst = late_change / early_change, at * run.step, run.name
+                worst = growth, at * run.step, run.name
     if worst is None:
         return []
     return [make_finding("simulation_chaotic", run=worst[2], growth=worst[0], seconds=worst[1])]
@@ -153,15 +149,14 @@ def nonlinear_term_inputs(
 ) -> dict[str, list[Run]]:
     """Return runs with non-linear terms of the output as an additional input `signal`, by the text of the term.
 
-    The terms are the square and the cube of the output, and its product with each of the inputs `names`. In an equation
-    with non-linear terms but without the output itself, the output is one of them. Terms that the equation has are left
-    out. They are computed from simulations of `model` and divided by a power of the largest value. A coefficient of
-    such an input has the effect of a small non-linear term, to first order. The result is empty for several equations,
-    a coefficient law, and runs that are compared at nonuniform sample times.
+    The terms are the square and the cube of the output, and its product with each of the inputs `names` that is not
+    delayed. In an equation with non-linear terms but without the output itself, the output is one of them. Terms that
+    the equation has are left out. All are computed from simulations of `model` and divided by a power of the largest
+    value. A coefficient of such an input has the effect of a small non-linear term, to first order. The result is empty
+    for several equations, a coefficient law, and runs that are compared at nonuniform sample times.
     """
-    if len(structure.equations) > 1 or structure.coefficient_law:
-        return {}
-    if any(has_nonuniform_samples(run, structure) for run in runs):
+    is_single = len(structure.equations) == 1 and not structure.coefficient_law
+    if not is_single or any(has_nonuniform_samples(run, structure) for run in runs):
         return {}
     (equation,) = structure.equations
     name = equation.output
@@ -169,7 +164,7 @@ def nonlinear_term_inputs(
     scale = max(float(np.abs(y).max()) for y in simulated) or 1.0
     outputs = [y / scale for y in simulated]
     factors: dict[str, Sequence[Floats]] = {f"{name}^2": outputs, f"{name}^3": [y**2 for y in outputs]}
-    factors |= {f"{name}*{n}": [run[n] for run in runs] for n in names}
+    factors |= {f"{name}*{n}": [run[n] for run in runs] for n in names if n not in structure.delay}
     if equation.nonlinear_terms and not any(t.signal == name and t.order == Order(0.0) for t in equation.terms):
         factors[name] = [np.ones_like(y) for y in outputs]
 

@@ -23,6 +23,7 @@ from ftlm.simulation.discretization import (
 from ftlm.simulation.initial_conditions import deviations
 from ftlm.simulation.output_samples import LEVEL_EXPONENT
 from ftlm.simulation.step_refinement import simulate_refined
+from ftlm.structure.equation import Equation
 from ftlm.structure.order import ORDER_RESOLUTION
 from ftlm.structure.structure import check_initial
 from ftlm.utils.arguments import check_arguments
@@ -211,54 +212,54 @@ def _initial_terms(
             f"initial values of {next(iter(values))} and powers of t of {next(iter(powers))} in coupled equations; "
             "give initial values of all outputs, or powers of all"
         )
-    for output, terms in powers.items():
-        _check_powers(model, output, terms)
-    return {**powers, **_powers_of_initial_values(model, values)}
+    for equation in model.equations:
+        _check_powers(equation, powers.get(equation.output, {}))
+    for equation in model.equations if values else ():
+        output = equation.output
+        acting = values if model.structure.coupling == "simulated" else {output: values.get(output, [])}
+        implied = _powers_of_initial_values(equation, acting)
+        if implied:
+            powers[output] = implied
+    return powers
 
 
-def _powers_of_initial_values(model: Model, values: Mapping[str, Sequence[float]]) -> dict[str, dict[float, float]]:
-    """Return the coefficients of the powers of t that initial values imply, by output and exponent.
+def _powers_of_initial_values(equation: Equation, values: Mapping[str, Sequence[float]]) -> dict[float, float]:
+    """Return the coefficients of the powers of t in an equation by exponent, for initial values of outputs.
 
     In an equation of order alpha, integrated alpha times, a term with Caputo's derivative D^nu y becomes
     I^(alpha - nu) (y - sum of y_i t^i / i!), where y_i are the initial values. This contains powers alpha - nu + i.
     """
-    powers: dict[str, dict[float, float]] = {}
-    for equation in model.equations:
-        alpha, own_values = equation.order.constant, values.get(equation.output, ())
-        coefficients = {float(i): v / math.factorial(i) for i, v in enumerate(own_values)}
-        for term in equation.terms:
-            order = term.order.constant
-            if term.column != equation.output and model.structure.coupling != "simulated":
+    alpha = equation.order.constant
+    coefficients = {float(i): v / math.factorial(i) for i, v in enumerate(values.get(equation.output, ()))}
+    for term in equation.terms:
+        order = term.order.constant
+        for i, value in enumerate(values.get(term.column, ())):
+            if not value or i >= math.ceil(order - ORDER_RESOLUTION):
                 continue
-            for i, value in enumerate(values.get(term.column, ())):
-                if not value or i >= math.ceil(order - ORDER_RESOLUTION):
-                    continue
-                power = round(alpha - order + i, 9)
-                if power <= -1.0:
-                    raise ModelError(
-                        f"initial values of {term.column} make {equation.output} infinite at the start, because its "
-                        f"equation of order {alpha:g} contains D^{order:g} {term.column}; give powers of t"
-                    )
-                change = float(term.fixed_value or 0.0) * value / math.gamma(power + 1.0)
-                coefficients[power] = coefficients.get(power, 0.0) - change
-        if coefficients:
-            powers[equation.output] = coefficients
-    return powers
+            power = round(alpha - order + i, 9)
+            if power <= -1.0:
+                raise ModelError(
+                    f"initial values of {term.column} make {equation.output} infinite at the start, because its "
+                    f"equation of order {alpha:g} contains D^{order:g} {term.column}; give powers of t"
+                )
+            change = float(term.fixed_value or 0.0) * value / math.gamma(power + 1.0)
+            coefficients[power] = coefficients.get(power, 0.0) - change
+    return coefficients
 
 
-def _check_powers(model: Model, output: str, terms: Mapping[float, float]) -> None:
+def _check_powers(equation: Equation, terms: Mapping[float, float]) -> None:
     """Raise ModelError if powers of t that are implied by the given integer powers are missing.
 
-    An integer power is taken for an initial value if a power that it implies is missing, or is given as 0 although it
-    is an integer power.
+    An integer power is taken for an initial value if a fractional power that it implies is missing, or if an integer
+    power that it implies is missing or 0.
     """
-    equation = next(e for e in model.equations if e.output == output)
+    output = equation.output
     count = math.ceil(equation.order.constant - ORDER_RESOLUTION)
     integer_powers = {int(e): v for e, v in terms.items() if 0.0 <= e < count and e == int(e)}
     if not any(integer_powers.values()):
         return
     values = [math.factorial(i) * integer_powers.get(i, 0.0) for i in range(max(integer_powers) + 1)]
-    implied_powers = _powers_of_initial_values(model, {output: values})[output]
+    implied_powers = _powers_of_initial_values(equation, {output: values})
 
     def is_missing(exponent: float) -> bool:
         value = next((v for e, v in terms.items() if abs(e - exponent) < EXPONENT_TOLERANCE), None)
@@ -269,10 +270,10 @@ def _check_powers(model: Model, output: str, terms: Mapping[float, float]) -> No
         return
     fractional = next((e for e in missing_exponents if e != round(e)), None)
     if fractional is None:
-        # The initial values with which the given powers are all.
+        # Initial values that imply the given powers and no others.
         same_powers: list[float] = []
         for i in range(count):
-            implied = _powers_of_initial_values(model, {output: [*same_powers, 0.0]})[output].get(float(i), 0.0)
+            implied = _powers_of_initial_values(equation, {output: same_powers}).get(float(i), 0.0)
             same_powers.append(math.factorial(i) * (integer_powers.get(i, 0.0) - implied))
         otherwise = f"{[float(f'{v:.6g}') for v in same_powers]} for the given powers alone"
     else:
