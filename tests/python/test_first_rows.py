@@ -259,6 +259,25 @@ def test_an_output_counted_from_its_first_sample_in_motion_has_the_pole_of_the_p
     assert found.fit["y"] > 98.5
 
 
+@pytest.mark.parametrize("quiet", [0, 20])
+def test_the_noise_of_a_first_reading_that_was_subtracted_is_a_level(quiet):
+    """The angle of a servo, an integrator with a lag, minus its first reading."""
+    b, a, _ = cont2discrete(([0.05], [8, 1, 0]), 1.0)[:3]
+    u = np.where(np.arange(400) < quiet, 0.0, 1.0)
+    angle = lfilter(np.ravel(b), a, u)
+    for seed in (101, 102, 103):
+        y = angle + 0.01 * np.std(angle) * np.random.default_rng(seed).standard_normal(u.size)
+        run = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": y - y[0]})
+        found = ftlm.identify(run, ftlm.equation("D^2 y = a1 D y + b0 u"), threads=1)
+        for name, truth in (("a1", -0.125), ("b0", 0.05 / 8), ("level_y", -y[0])):
+            assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].standard_error
+    # A counter that begins at 0 has no such noise.
+    counts = np.round(angle / 0.01) * 0.01
+    counter = ftlm.Run.from_arrays(step=1.0, inputs={"u": u}, outputs={"y": counts})
+    found = ftlm.identify(counter, ftlm.equation("D^2 y = a1 D y + b0 u"), threads=1)
+    assert "level_y" not in found.parameters
+
+
 def blank_run(u, step=0.05, kind="foh"):
     return ftlm.Run.from_arrays(step=step, inputs={"f": u}, outputs={"y": 0 * u}, intersample={"f": kind})
 
